@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -40,17 +41,23 @@ def track(
         str | None,
         typer.Option(help="Track only the first frames, for a first look: 0:500 [all]."),
     ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(help="Detect bubbles on a Dask cluster; its scheduler, tcp://host:port."),
+    ] = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
     """Find the bubbles of a run, match them across the two views, and follow them in space.
 
     Writes detections.csv, tracks.csv, events.csv, tracking.json, run.json and report.html. The
-    same command, given again, continues an interrupted run.
+    same command, given again, continues an interrupted run. With --cluster the workers detect the
+    bubbles, in batches of frames; they must see the run and the results at the same paths.
 
     Exit code 0: tracked. 2: the input cannot be used; the message says what, where and what to do.
     130: interrupted.
     """
+    from telerig.estimator.batch.batch import dask_executor
     from telerig.estimator.batch.jobs import check_run_name
     from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.tracking.results_folder import write_tracking
@@ -61,22 +68,25 @@ def track(
     if out is None:
         check_run_name(run)
     begun = time.perf_counter()
+    folder = out or default_folder(run)
+    if cluster is not None:
+        run, folder = run.resolve(), folder.resolve()
     calibrated, files = calibration_for(run, calibration)
     chosen = options.chosen("--from", source, ("images", "detections"))
     data = load_run(run, source=chosen, **cameras_without_rig(run, calibrated))
     if frames is not None:
         data = data.first(first_frames(frames))
-    folder = out or default_folder(run)
     record = {
         "command": "track",
         "options": {"from": source, "min_diameter_px": min_diameter, "frames": frames},
         "inputs": files,
         "again": typed_command(),
     }
-    with progress(quiet) as stage:
+    chosen_cluster = nullcontext() if cluster is None else dask_executor(cluster, "--cluster")
+    with chosen_cluster as executor, progress(quiet) as stage:
         summary = write_tracking(
             data, calibrated, folder, options=TrackOptions(min_diameter_px=min_diameter),
-            record=record, report=report, stage=stage,
+            record=record, report=report, stage=stage, executor=executor,
         )  # fmt: skip
     say(tracking_words(summary, time.perf_counter() - begun, stage.words()))
     say_written(folder, report)

@@ -448,14 +448,14 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 
 
 @contextmanager
-def dask_executor(address: str) -> Iterator[Executor]:
+def dask_executor(address: str, option: str = "--scheduler") -> Iterator[Executor]:
     """Give an executor that uses the workers of a running Dask cluster.
 
     The datasets must be at the same paths on every worker, because only the descriptions of the
     jobs and their results are sent. If a worker dies, its job is done again by another one, as
     often as the cluster's setting allowed-failures permits (3 by default).
 
-    address : tcp://host:port of the scheduler.
+    address : tcp://host:port of the scheduler; option : the one that named it, for messages.
 
     Raises InputError if Dask is not installed, if no scheduler answers, or if it has no workers.
     """
@@ -463,21 +463,21 @@ def dask_executor(address: str) -> Iterator[Executor]:
         from distributed import Client
     except ImportError as error:
         raise InputError(
-            "Dask is not installed", where=f"--scheduler {address}",
+            "Dask is not installed", where=f"{option} {address}",
             todo="pip install 'telerig[cluster]'",
         ) from error  # fmt: skip
     try:
         client = Client(address, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"no Dask scheduler answers: {error}", where=f"--scheduler {address}",
+            f"no Dask scheduler answers: {error}", where=f"{option} {address}",
             todo="start one with `dask scheduler` and workers with `dask worker ADDRESS "
             "--nthreads 1`, and give the address that it prints",
         ) from error  # fmt: skip
     with client:
         if not client.scheduler_info()["workers"]:
             raise InputError(
-                "the scheduler has no workers", where=f"--scheduler {address}",
+                "the scheduler has no workers", where=f"{option} {address}",
                 todo="start some with `dask worker ADDRESS --nthreads 1`",
             )  # fmt: skip
         yield client.get_executor(pure=False)

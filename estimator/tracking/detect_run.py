@@ -9,10 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import pickle
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +29,7 @@ from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.detect import detect_bubbles
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
-from telerig.io.files.atomic import write_json_atomic
+from telerig.io.files.atomic import atomic_path, write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores, keep_freed_memory, ordered_map, quick_workers
 from telerig.rig.camera import Camera
@@ -170,21 +172,28 @@ class DetectionStore:
         table_of: Callable[[Batch], pd.DataFrame],
         progress: Progress | None,
         name: str,
+        executor: Executor | None = None,
     ) -> None:
         """Compute the missing tables of one kind in parallel and write them.
 
         table_of : function that returns the table of a batch; it has to work in another process.
         progress : function that is called with ``name``, the number of frames done and the total;
             or None.
+        executor : runs the batches, on computers that see the same folders at the same paths; None
+            for processes of this computer.
         """
         missing = self.missing(kind)
         frames = sum(last - first for first, last in missing)
         done = self.frame_count - frames
         if progress is not None:
             progress(name, done, self.frame_count)
-        large = frames >= FRAMES_FOR_WORKERS
-        workers = min(cores(), len(missing)) if large else quick_workers(len(missing))
-        for first, last in ordered_map(partial(_write, self, kind, table_of), missing, workers):
+        if executor is not None:
+            finished = _elsewhere(self, kind, table_of, missing, executor)
+        else:
+            large = frames >= FRAMES_FOR_WORKERS
+            workers = min(cores(), len(missing)) if large else quick_workers(len(missing))
+            finished = ordered_map(partial(_write, self, kind, table_of), missing, workers)
+        for first, last in finished:
             done += last - first
             if progress is not None:
                 progress(name, done, self.frame_count)
@@ -195,6 +204,44 @@ def _write(
 ) -> Batch:
     write_table(table_of(batch), store.path(batch, kind))
     return batch
+
+
+def _elsewhere(
+    store: DetectionStore,
+    kind: str,
+    table_of: Callable[[Batch], pd.DataFrame],
+    batches: Sequence[Batch],
+    executor: Executor,
+) -> Iterator[Batch]:
+    """Batches in the order in which an executor has written them.
+
+    The scene is too large to be sent with every batch: it is a file in the store's folder, which a
+    worker that takes the place of a dead one finds as well.
+    """
+    shared = pickle.dumps((store, kind, table_of))
+    path = store.folder / f"{kind}-{hashlib.sha256(shared).hexdigest()[:16]}.pickle"
+    with atomic_path(path) as staged:
+        staged.write_bytes(shared)
+    futures = [executor.submit(_write_shared, str(path), batch) for batch in batches]
+    try:
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        for future in futures:
+            future.cancel()
+        path.unlink(missing_ok=True)
+
+
+def _write_shared(path: str, batch: Batch) -> Batch:
+    keep_freed_memory()
+    return _write(*_shared(path), batch)
+
+
+@lru_cache(maxsize=1)
+def _shared(path: str) -> tuple[DetectionStore, str, Callable[[Batch], pd.DataFrame]]:
+    found: tuple[DetectionStore, str, Callable[[Batch], pd.DataFrame]]
+    found = pickle.loads(Path(path).read_bytes())
+    return found
 
 
 def read_batch(path: Path) -> pd.DataFrame:
@@ -223,9 +270,18 @@ def fingerprint(run: RunData, options: dict[str, Any]) -> str:
     return found.hexdigest()
 
 
-def detect_missing(scene: Scene, store: DetectionStore, progress: Progress | None) -> None:
-    """Detect bubbles in every frame that the store lacks."""
-    store.fill("detections", partial(_detect_batch, scene), progress, "detection")
+def detect_missing(
+    scene: Scene,
+    store: DetectionStore,
+    progress: Progress | None,
+    executor: Executor | None = None,
+) -> None:
+    """Detect bubbles in every frame that the store lacks.
+
+    executor : see `DetectionStore.fill`.
+    """
+    table_of = partial(_detect_batch, scene)
+    store.fill("detections", table_of, progress, "detection", executor)
 
 
 def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -54,12 +55,14 @@ def follow_references(
     strip: ReferencesDescription,
     store: DetectionStore,
     progress: Progress | None = None,
+    executor: Executor | None = None,
 ) -> FollowedMarks:
     """Follow the dots of a strip through the images of a run.
 
     strip : as rig.toml describes it.
     axis_rig : (3,) unit vector of the stage's travel in the rig frame.
     store : files of dots; those found before are read, the others are computed and written.
+    executor : see `DetectionStore.fill`.
     progress : as for `make_scene`.
 
     Raises GeometryError for a camera that looks along the travel.
@@ -78,7 +81,7 @@ def follow_references(
         for name, look in looks.items()
     }
     if looks:
-        store.fill("dots", partial(_find_dots, run, looks), progress, "references")
+        store.fill("dots", partial(_find_dots, run, looks), progress, "references", executor)
     sightings = _sightings(run, followers, store)
     held = _held_positions(run)
     kept = {name: f.kept(moved=_moved(f, held)) for name, f in followers.items()}

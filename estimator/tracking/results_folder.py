@@ -6,6 +6,7 @@ import heapq
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -91,6 +92,7 @@ def write_tracking(
     record: Mapping[str, Any],
     report: bool = True,
     stage: Progress | None = None,
+    executor: Executor | None = None,
 ) -> dict[str, Any]:
     """Track a run, write the results into a folder, and return the content of tracking.json.
 
@@ -103,6 +105,8 @@ def write_tracking(
     stage : function that is called with the name of the step, the number done and the total; or
         None.
 
+    executor : see `tracking_stream`.
+
     Raises InputError if a report is wanted and the bubbles were given ids that are no whole
     numbers.
     """
@@ -112,7 +116,7 @@ def write_tracking(
     again = str(record.get("again") or f"telerig track {shlex.quote(str(run.path))}")
     inputs = fingerprints(folder, [*_sources(run), *record.get("inputs", [])])
     with replaced_results(folder, "track", again=again, inputs=inputs) as staged:
-        stream = tracking_stream(run, calibration, work, options, stage)
+        stream = tracking_stream(run, calibration, work, options, stage, executor)
         worst = _write_rows(stream, staged)
         summary = stream.summary()
         summary["worst_frames"] = worst.frames()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -192,10 +193,13 @@ def tracking_stream(
     work: Path,
     options: TrackOptions | None = None,
     stage: Progress | None = None,
+    executor: Executor | None = None,
 ) -> TrackingStream:
     """Detect the bubbles, learn the model for pairing them, and return a stream that tracks them.
 
     work : folder into which the detections are written, so that an interrupted run can continue.
+    executor : runs the detection in batches of frames, on computers that see the run and ``work``
+        at the same paths; None for processes of this computer.
 
     The other arguments and the errors are those of `track`. Tracks are computed while the stream's
     rows are read.
@@ -221,13 +225,13 @@ def tracking_stream(
         if strip is not None:
             from telerig.estimator.tracking.follow_marks import follow_references
 
-            marks = follow_references(run, cameras, axis, strip, store, stage)
+            marks = follow_references(run, cameras, axis, strip, store, stage, executor)
         if store.missing():
             strips = marks.strips if marks is not None else None
             scene = make_scene(
                 run, cameras, axis, chosen.min_diameter_px, stage, strips, chosen.background
             )
-            detect_missing(scene, store, stage)
+            detect_missing(scene, store, stage, executor)
         batches = store.tables
     without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
     if stage is not None:

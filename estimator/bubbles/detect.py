@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -40,7 +41,14 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
 )
 from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, close_pairs, fit_outlines
 
-__all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
+__all__ = [
+    "Bubbles",
+    "detect_bubbles",
+    "find_bubbles",
+    "load_compiled_loops",
+    "outline_centroid",
+    "outline_points",
+]
 
 _MAX_AXIS_RATIO, _LEAST_AXIS_PX = 3.0, 1.0
 _DEFOCUS_FACTOR = 2.0
@@ -170,6 +178,15 @@ def _found(
     whole = [parts[i] for i in np.flatnonzero(kept)]
     clusters = {i: blobs[p.blob].contour_px for i, p in enumerate(whole) if p.merged}
     return replace(_bubbles(kept_columns, rejected, sigma, reason), clusters=clusters)
+
+
+def load_compiled_loops() -> None:
+    """Load or compile what detection runs, once for all copies of this process that are yet to be
+    made; the first time on a computer takes some 10 s."""
+    image = np.full((64, 96), 200, np.uint8)
+    for u in (36, 56):
+        cv2.circle(image, (u, 32), 14, (20,), cv2.FILLED)
+    find_bubbles(cv2.GaussianBlur(image, (0, 0), 1.0))
 
 
 def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background import methods
-from telerig.estimator.bubbles.detect import detect_bubbles
+from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import atomic_path, write_json_atomic
@@ -280,6 +280,8 @@ def detect_missing(
 
     executor : see `DetectionStore.fill`.
     """
+    if executor is None:
+        load_compiled_loops()
     table_of = partial(_detect_batch, scene)
     store.fill("detections", table_of, progress, "detection", executor)
 

@@ -37,7 +37,7 @@ import pandas as pd
 import telerig
 from telerig.arrays import Array
 from telerig.estimator.bubbles.background import methods
-from telerig.estimator.bubbles.detect import detect_bubbles
+from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.rig_drift import PairCollector
@@ -45,6 +45,7 @@ from telerig.estimator.tracking.detect_run import lab_shift_px
 from telerig.estimator.tracking.filter import TrackerSettings, transition
 from telerig.estimator.tracking.frames_to_rows import RowMaker
 from telerig.estimator.tracking.tracker import Tracker
+from telerig.io.machine.parallel import keep_freed_memory
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
@@ -171,6 +172,8 @@ def detection(found: Study) -> None:
         ]
 
     many = 2 * found.frames
+    load_compiled_loops()
+    keep_freed_memory()  # as the processes of `telerig track` do
     spent, found.tables = cpu_s(ours, 2)
     plain, centres = cpu_s(peer, 2)
     found.row("detection", "an image", spent / many, "threshold and contours", plain / many)
@@ -191,7 +194,7 @@ def linking(found: Study) -> None:
         )
     )
     calibration = calibration_from_cameras(list(found.cameras), name="truth")
-    model_s, model = cpu_s(lambda: estimate_pair_model(pairs, found.cameras))
+    model_s, model = cpu_s(lambda: estimate_pair_model(pairs, found.cameras), 2)
     parts = []
 
     def ours() -> None:

@@ -57,6 +57,7 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
     """Grey over background, and whether the screen is clipped at the sensor's white."""
     if background is None:
         screen = screen_level(image.astype(np.float32, copy=False))
+        lowest = float(screen.min())
     else:
         screen = np.asarray(background)
         if screen.shape != image.shape:
@@ -66,13 +67,16 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
                 todo="estimate the background from images of this camera",
             )
         screen = screen.astype(np.float32, copy=False)
-        if not float(screen.min()) > 0.0:
+        lowest = float(screen.min())
+        if not lowest > 0.0:
             raise InputError(
                 "has pixels that are not positive",
                 where="background",
                 todo="give the level of the lit screen at every pixel",
             )
-    screen = np.maximum(screen, np.float32(1e-6 * float(image.max()) + 1e-12))
+    floor = 1e-6 * float(image.max()) + 1e-12
+    if lowest < floor:
+        screen = np.maximum(screen, floor)
     ratio = np.asarray(cv2.divide(_divisible(image), screen, dtype=cv2.CV_32F), np.float32)
     sample = image[::8, ::8]
     clipped = bool(

@@ -57,7 +57,9 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
     gains : (n,) log brightness of the frames.
     """
     height, width = stack.shape[1:]
-    log = np.stack([log_cells(image, _CELL_PX) - gain for image, gain in zip(stack, gains)])
+    log = np.stack(
+        [log_cells(image, _CELL_PX) - np.float32(gain) for image, gain in zip(stack, gains)]
+    )
     surface = bright_surface(_linear_quantile(_ordered(log.copy()), 0.8), 4)
     dark = np.stack([compact_things(surface - frame > DEEP) for frame in log])
     keep = dark & ~_still(dark.mean(0), np.ones(dark.shape[1:], bool), 2)
@@ -85,10 +87,12 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
     A bubble's own border moves, if only by a pixel, and parts its still inside from the outside.
     """
     never = masks.mean(0) > 1 - 1.5 / len(masks)
-    values = np.log(np.maximum(stack[:, never].astype(np.float32), 0.5)) - gains[:, None]
+    values = np.log(np.maximum(stack[:, never].astype(np.float32), 0.5))
+    values -= gains.astype(np.float32)[:, None]
     _ordered(values)
     steady = ~never
-    steady[never] = _linear_quantile(values, 0.9) - _linear_quantile(values, 0.1) < _CHANGES
+    low, high = (_linear_quantile(values, share) for share in (0.1, 0.9))
+    steady[never] = np.subtract(high, low) < _CHANGES
     _, labels = cv2.connectedComponents(steady.astype(np.uint8), connectivity=4)
     outside = np.unique(labels[~never])
     return np.asarray(never & np.isin(labels, outside[outside > 0]), bool)

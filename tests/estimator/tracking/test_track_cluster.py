@@ -1,4 +1,4 @@
-"""Detection of one run over a Dask cluster: a real scheduler, two workers, one killed on the way."""
+"""Detection of a run over a Dask cluster: a real scheduler, two workers, one killed on the way."""
 
 import os
 import signal
@@ -40,9 +40,7 @@ def cluster(tmp_path: Path) -> Any:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cluster") / "data"
-    telerig.simulate(
-        run_preset("rise", frames=FRAMES), rng=np.random.default_rng(3), out=folder
-    )
+    telerig.simulate(run_preset("rise", frames=FRAMES), rng=np.random.default_rng(3), out=folder)
     return folder
 
 

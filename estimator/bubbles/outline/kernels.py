@@ -33,7 +33,7 @@ HELD = 1e-7
 """Prior standard deviation, as a share of the radius, of harmonics that are not fitted."""
 
 MIN_SIGMA_PX = 0.3
-_OCTANTS = 8
+_OCTANTS, _LAST_RING = 8, 1000
 _UNLIKE_SHARE, _UNLIKE_SIGMA, _UNLIKE_FROM, _MARGIN_SIGMA = 0.015, 3.0, 1.3, 0.9
 _REACH_SIGMA, _REACH_PX = 3.2, 1.2
 _THIN_ABOVE_PX = 10.0
@@ -45,6 +45,9 @@ _LEVEL_SPREAD = 0.3
 _CONVERGED_PX = 0.01
 _BINS = 32
 _FOOT_ROUNDS = 2
+_OFF_CENTRE = 1e-9
+"""The centre of a circle is nearest to no point of it: that much beside it, in units of a."""
+
 _POINT_SIGMA_PX, _FAR_PX = 0.2, 0.6
 _ROUND_SHARE, _ARC_ROUNDS, _ARC_CONVERGED_PX = 0.12, 8, 0.01
 _TILE = 4
@@ -175,18 +178,18 @@ def feet(ellipse: Array, u: Array, v: Array, foot: Array) -> None:
     for k in range(u.size):
         x = (u[k] - u0) * turn_cos + (v[k] - v0) * turn_sin
         y = (v[k] - v0) * turn_cos - (u[k] - u0) * turn_sin
-        x_unit, y_unit = x * per_a, y * per_b
-        scale = 1.0 / np.sqrt(x_unit * x_unit + y_unit * y_unit + 1e-12)
+        x_unit, y_unit = x * per_a + _OFF_CENTRE, y * per_b
+        scale = 1.0 / np.sqrt(x_unit * x_unit + y_unit * y_unit + 1e-30)
         cos, sin = x_unit * scale, y_unit * scale
         for _ in range(_FOOT_ROUNDS):
             # In units of a along x and of b along y.
             evolute_x, evolute_y = focal_a * cos * cos * cos, -focal_b * sin * sin * sin
             ahead_x, ahead_y = (cos - evolute_x) * a, (sin - evolute_y) * b
             away_x, away_y = x_unit - evolute_x, y_unit - evolute_y
-            far = (away_x * a) * (away_x * a) + (away_y * b) * (away_y * b) + 1e-12
+            far = (away_x * a) * (away_x * a) + (away_y * b) * (away_y * b) + 1e-30
             scale = np.sqrt((ahead_x * ahead_x + ahead_y * ahead_y) / far)
             cos, sin = away_x * scale + evolute_x, away_y * scale + evolute_y
-            scale = 1.0 / np.sqrt(cos * cos + sin * sin + 1e-12)
+            scale = 1.0 / np.sqrt(cos * cos + sin * sin + 1e-30)
             cos, sin = cos * scale, sin * scale
         speed = np.sqrt(b * cos * b * cos + a * sin * a * sin)
         per_speed = 1.0 / speed
@@ -360,6 +363,12 @@ def profiles(table: Array, distance: Array, curvature: Array) -> Array:
 
 
 @compiled
+def _ring(distance: float) -> int:
+    """Return the number of a ring of 1 px; NaN and what is very far share the last one."""
+    return int(abs(distance)) if abs(distance) < _LAST_RING else _LAST_RING
+
+
+@compiled
 def _unlike_rim(
     foot: Array, distance: Array, residual: Array, sigma: float, contrast: float
 ) -> Bools:
@@ -378,14 +387,14 @@ def _unlike_rim(
     """
     rings = 2
     for k in range(distance.size):
-        rings = max(rings, int(abs(distance[k])) + 2)
+        rings = max(rings, _ring(distance[k]) + 2)
     count, total = np.zeros((2 * _OCTANTS, rings)), np.zeros((2 * _OCTANTS, rings))
     sector = np.empty(distance.size, dtype=np.int64)
     for k in range(distance.size):
         cos, sin = foot[0, k], foot[1, k]
         octant = 4 * (cos > 0.0) + 2 * (sin > 0.0) + (abs(cos) > abs(sin))
         sector[k] = 2 * octant + (distance[k] > 0.0)
-        ring = int(abs(distance[k]))
+        ring = _ring(distance[k])
         count[sector[k], ring] += 1.0
         total[sector[k], ring] += residual[k]
     cut = np.full(2 * _OCTANTS, rings * 1.0)
@@ -451,15 +460,16 @@ def _window(
     reach = _WINDOW_SIGMA * sigma + _WINDOW_PX
     sizes, many = np.empty(distance.size), 0
     for k in range(distance.size):
-        if abs(distance[k]) >= reach or hidden[k] or unlike[k]:
-            inverse[k] = 0.0
-        else:
+        near = abs(distance[k]) < reach and np.isfinite(residual[k])
+        if near and not (hidden[k] or unlike[k]):
             sizes[many] = abs(residual[k])
             many += 1
+        else:
+            inverse[k] = 0.0
     typical = NORMAL_FROM_MEDIAN * _middle(sizes, many) if many > _FEW else 1.0
     limit = _OUTLIER_SIGMA * max(typical, 1.0)
     for k in range(distance.size):
-        if abs(residual[k]) >= limit:
+        if not abs(residual[k]) < limit:
             inverse[k] = 0.0
     return inverse
 
@@ -646,6 +656,9 @@ def fitted(
     fits = _no_fits(rims.sigma.size)
     for b in range(rims.sigma.size):
         ellipse, sigma, first_look = rims.ellipse[b], rims.sigma[b], steps < STEPS
+        fits.sigma[b], fits.outer[b], fits.inner[b] = sigma, rims.outer[b], rims.inner[b]
+        if not np.isfinite(_reach(ellipse) + sigma):
+            continue
         held = rims.spread[b] <= HELD
         shifts, levels = fits.shifts[b], np.empty(3)
         levels[0], levels[1], levels[2] = sigma, rims.outer[b], rims.inner[b]

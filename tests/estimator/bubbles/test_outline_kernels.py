@@ -48,6 +48,12 @@ def test_feet_are_the_nearest_points() -> None:
     np.testing.assert_allclose(foot[4], 20.0 * 12.0 / speed[nearest] ** 3, rtol=6e-3)
 
 
+def test_the_centre_of_a_circle_has_a_foot() -> None:
+    foot = np.empty((7, 1))
+    kernels.feet(np.array([7.0, 8.0, 3.0, 3.0, 0.4]), np.array([7.0]), np.array([8.0]), foot)
+    np.testing.assert_allclose(foot[2:5, 0], [-3.0, 3.0, 1 / 3], rtol=1e-6)
+
+
 def test_profile_is_that_of_a_blurred_disc_and_survives_nan() -> None:
     rng = np.random.default_rng(7)
     distance, curvature = rng.uniform(-4.0, 4.0, 300), rng.uniform(0.02, 1.3, 300)
@@ -60,6 +66,22 @@ def test_profile_is_that_of_a_blurred_disc_and_survives_nan() -> None:
     np.testing.assert_allclose(straight, ndtr(-distance), atol=1e-4)
     assert np.isfinite(by_curvature).all()
     assert kernels.profiles(profile_table(), np.full(3, np.nan), np.full(3, np.nan)).shape == (3, 3)
+
+
+def test_impossible_starts_end_without_a_covariance() -> None:
+    starts = np.array(
+        [[np.nan] * 5, [50.0, 50, 1e9, 1e-3, 0], [1e15, 0, 5, 5, 0], [50, 50, 9, 8, 0]]
+    )
+    ones = np.ones(4)
+    rims = kernels.Rims(
+        starts, np.zeros((4, 8)), np.array([1.0, 1, 1, np.nan]), ones, ones, ones, ones, ones,
+        np.full(4, 0.2),
+    )  # fmt: skip
+    image = np.ones((100, 100), np.float32)
+    found = kernels.fitted(
+        image, profile_table(), rims, np.arange(4), rims.ellipse, rims.sigma, kernels.STEPS
+    )
+    assert not found.covariance[[0, 3]].any() and not found.coverage[[0, 2, 3]].any()
 
 
 def test_ellipses_along_arcs_are_found_again() -> None:

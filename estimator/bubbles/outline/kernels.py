@@ -460,7 +460,7 @@ def _window(
     reach = _WINDOW_SIGMA * sigma + _WINDOW_PX
     sizes, many = np.empty(distance.size), 0
     for k in range(distance.size):
-        near = abs(distance[k]) < reach and np.isfinite(residual[k])
+        near = abs(distance[k]) < reach and abs(residual[k]) < np.inf
         if near and not (hidden[k] or unlike[k]):
             sizes[many] = abs(residual[k])
             many += 1
@@ -559,7 +559,7 @@ def _reach(values: Array) -> float:
     """Return the largest absolute value; NaN if one of them is not finite."""
     reach: float = 0.0
     for value in values:
-        if not np.isfinite(value):
+        if not abs(value) < np.inf:
             return np.nan
         if abs(value) > reach:
             reach = abs(value)
@@ -657,7 +657,7 @@ def fitted(
     for b in range(rims.sigma.size):
         ellipse, sigma, first_look = rims.ellipse[b], rims.sigma[b], steps < STEPS
         fits.sigma[b], fits.outer[b], fits.inner[b] = sigma, rims.outer[b], rims.inner[b]
-        if not np.isfinite(_reach(ellipse) + sigma):
+        if not (_reach(ellipse) < np.inf and abs(sigma) < np.inf):
             continue
         held = rims.spread[b] <= HELD
         shifts, levels = fits.shifts[b], np.empty(3)
@@ -715,7 +715,7 @@ def fitted(
             products(rows, used.size, total)
             _with_prior(total, rims, b, levels, shifts)
             _solved(total, step, covariance)
-            if not np.isfinite(_reach(step)):
+            if not _reach(step) < np.inf:
                 covariance[:] = 0.0
                 break
             reach = _limited(step, ellipse[3], levels[0])

@@ -202,7 +202,7 @@ def ratio_log_odds(
             for k in range(many):
                 apart = own = 0.0
                 for c in range(many):
-                    known = known and np.isfinite(ratio[i, j, c])
+                    known = known and abs(ratio[i, j, c]) < np.inf
                     apart += ratio[i, j, c] * axes[c, k]
                     own += (first[i, c] + second[j, c]) * axes[c, k]
                 own = min(max(0.5 * own, -rare), rare)
@@ -254,7 +254,7 @@ def track_density(
                 off = (log_size[i, j] - log_expected[k]) / size_sd
                 factor = 1.0
                 exponent = min(distance2, LARGEST_MAHALANOBIS2)
-                if np.isfinite(off):
+                if abs(off) < np.inf:
                     exponent += off * off
                     factor = size_factor
                 out[i, j] += factor * np.exp(-0.5 * exponent) / np.sqrt(determinant)

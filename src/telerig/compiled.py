@@ -15,8 +15,10 @@ def compiled(function: _Function) -> _Function:
 
     The machine code is kept for later processes, beside the source file or in the user's cache
     folder; ``NUMBA_CACHE_DIR`` names another one. If none of these can be written, each process
-    compiles for itself. Sums may be reordered. NaN and infinity keep their meaning in comparisons, so
-    write ``abs(x) < np.inf``: ``np.isfinite`` of a sum may be simplified to True.
+    compiles for itself.
+
+    Sums may be reordered. NaN and infinity keep their meaning in comparisons, so write
+    ``abs(x) < np.inf``: ``np.isfinite`` of a sum may be simplified to True.
     """
     options = {"fastmath": {"reassoc", "contract", "nsz", "arcp"}, "error_model": "numpy"}
     try:

@@ -37,7 +37,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     columns,
     flag_words,
 )
-from telerig.estimator.bubbles.pairing import kernels
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import cross, midpoint, stacked_jacobian
@@ -310,6 +309,8 @@ def marginals(log_odds: Array, negligible: float = NEGLIGIBLE) -> Array:
     component the least likely pairs are left out, one unit of log odds after the other, until it
     falls apart.
     """
+    from telerig.estimator.bubbles.pairing import kernels
+
     return kernels.marginals(np.asarray(log_odds, float), negligible)
 
 
@@ -573,6 +574,8 @@ def common_shift(
     starts as unknown within ``model.frame_px`` and is then the mean over the pairs by their
     probabilities, with that scatter as its prior.
     """
+    from telerig.estimator.bubbles.pairing import kernels
+
     bias, bias_variance = model.bias(geometry.points_mm)
     raw = geometry.gap_px - bias
     own = geometry.variance_px2 + bias_variance + (model.scatter_px * geometry.scatter_factor) ** 2
@@ -590,6 +593,8 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
     more than any measurement error, the pair is excluded; for flagged detections this limit is
     twice as large.
     """
+    from telerig.estimator.bubbles.pairing import kernels
+
     first, second = geometry.views
     odds = np.full(
         geometry.gap_px.shape, _prior_log_odds(len(first), len(second), model.unmatched_share)
@@ -625,6 +630,8 @@ def _ratio_log_odds(
     rare a bubble is counts to ``_RARE`` standard deviations.
     wrong : chance that one of the measurements says nothing about the bubble.
     """
+    from telerig.estimator.bubbles.pairing import kernels
+
     axes, alike = expected.uncorrelated
     known = np.broadcast_to(np.asarray(wrong, float), ratio.shape[:2])
     return kernels.ratio_log_odds(
@@ -657,6 +664,8 @@ def track_log_odds(
 
 def _track_density(geometry: PairGeometry, model: PairModel, predicted: Prediction) -> Array:
     """(N1, N2) density of a pair's point and size at the tracks, relative to anywhere."""
+    from telerig.estimator.bubbles.pairing import kernels
+
     first, second = geometry.views
     pixel = model.scatter_px**2 + 0.25 * (
         np.trace(first.covariance_px2, axis1=1, axis2=2)[:, None]
@@ -691,6 +700,8 @@ def _unmatched_density(
 
     seen : the tracks' pixels (K, 4) in both cameras, and their derivatives (K, 4, 3).
     """
+    from telerig.estimator.bubbles.pairing import kernels
+
     view, (pixels, jacobian) = geometry.views[c], seen
     rows = jacobian[:, 2 * c : 2 * c + 2]
     spread = rows @ predicted.covariance_mm2 @ np.swapaxes(rows, 1, 2)

@@ -186,7 +186,8 @@ def load_compiled_loops() -> None:
     image = np.full((64, 96), 200, np.uint8)
     for u in (36, 56):
         cv2.circle(image, (u, 32), 14, (20,), cv2.FILLED)
-    find_bubbles(cv2.GaussianBlur(image, (0, 0), 1.0))
+    blurred = cv2.GaussianBlur(image, (0, 0), 1.0)
+    find_bubbles(blurred, background=np.full(image.shape, 200.0, np.float32))
 
 
 def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:

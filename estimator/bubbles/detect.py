@@ -278,7 +278,8 @@ def _flags(
     beyond |= (rim[..., 1] < reach - 0.5) | (rim[..., 1] > shape[0] - 0.5 - reach)
     if field is not None:
         column, row = (np.round(rim[..., i]).astype(int) for i in (0, 1))
-        beyond |= ~field[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)]
+        within = cv2.erode(field.astype(np.uint8), np.ones((5, 5), np.uint8))
+        beyond |= within[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)] == 0
     border = np.any(beyond, axis=1)
     hidden = np.zeros(len(parts), dtype=np.bool_)
     blur, own = outlines.blur_px, np.arange(len(parts))

@@ -26,7 +26,8 @@ from telerig.io.dataset.tables import (
     read_stage_csv,
 )
 from telerig.io.files.names import check_name
-from telerig.io.images.frames import PAGE_EXTENSIONS, VIDEO_EXTENSIONS, FrameSource, open_frames
+from telerig.io.images.frames import FILE_EXTENSIONS, FrameSource, open_frames
+from telerig.io.images.high_speed import HighSpeedFrames
 from telerig.io.images.read import Image, check_size, list_images
 from telerig.io.rig_file.description import RigDescription, camera_named
 from telerig.io.rig_file.rig_file import read_rig_toml
@@ -193,7 +194,8 @@ def load_run(
     sizes |= {n: _size(s) for n, s in sources.items() if n not in sizes}
     count = len(positions[names[0]]) if images else None
     detections = None if images else _detections(folder, names, every, sizes, notes)
-    t_s = _times(folder, every, count, detections, notes)
+    recorded = _recorded_times(sources, positions)
+    t_s = _times(folder, every, count, detections, notes, recorded)
     stage = _table(folder / "stage.csv", read_stage_csv)
     sensors = list(rig.accelerometers) if rig else None
     run = RunData(
@@ -292,7 +294,7 @@ def recordings(folder: Path) -> dict[str, Path]:
     """
     found = {}
     for entry in sorted(folder.iterdir()):
-        frames = entry.suffix.lower() in PAGE_EXTENSIONS + VIDEO_EXTENSIONS and entry.is_file()
+        frames = entry.suffix.lower() in FILE_EXTENSIONS and entry.is_file()
         if not entry.name.startswith(".") and (frames or (entry.is_dir() and list_images(entry))):
             found[entry.name if entry.is_dir() else entry.stem] = entry
     return found
@@ -386,10 +388,12 @@ def _times(
     count: int | None,
     detections: pd.DataFrame | None,
     notes: list[str],
+    recorded: tuple[Path, Array] | None = None,
 ) -> Array:
-    """Return the (F,) times in s of the frames from frames.csv, or else from run.toml.
+    """Return the (F,) times in s of the frames from frames.csv, else from run.toml, else recorded.
 
     count : number of frames of the images; None when the detections decide.
+    recorded : a high-speed camera's file and the times in it.
     Appends sentences to ``notes``. Raises InputError when neither file gives the times.
     """
     file, settings = folder / "frames.csv", folder / "run.toml"
@@ -403,6 +407,9 @@ def _times(
     if settings.is_file():
         rate, start = read_run_toml(settings)
         return start + np.arange(count) / rate
+    if recorded is not None:
+        notes.append(f"the frames' times are those of {recorded[0].name}, from 0 s")
+        return recorded[1]
     if count == 1:
         notes.append("neither frames.csv nor run.toml: the only frame is taken at 0 s")
         return np.zeros(1)
@@ -411,6 +418,17 @@ def _times(
         where=str(folder),
         todo="write run.toml with frame_rate_hz = 500.0, or frames.csv with frame,t_s",
     )
+
+
+def _recorded_times(
+    sources: Mapping[str, FrameSource], positions: Mapping[str, Ints]
+) -> tuple[Path, Array] | None:
+    """Return a high-speed camera's file that has all frames, and their (F,) times in s from 0."""
+    for name, source in sources.items():
+        if isinstance(source, HighSpeedFrames) and np.all(positions[name] >= 0):
+            t_s = source.t_s[positions[name]]
+            return source.path, t_s - t_s[:1]
+    return None
 
 
 def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array:

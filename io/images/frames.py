@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Ints
 from telerig.errors import InputError
+from telerig.io.images.high_speed import HIGH_SPEED_EXTENSIONS, open_high_speed
 from telerig.io.images.read import (
     Image,
     damaged,
@@ -233,7 +234,7 @@ def open_frames(folder: Path, camera: str) -> FrameSource | None:
     """Open the frames of one camera in a run's folder; none is decoded.
 
     They are `<camera>/*.tif|png|bmp|jpg`, or `<camera>.tif` (multi-page), or a video
-    `<camera>.avi|mp4|mov|mkv`.
+    `<camera>.avi|mp4|mov|mkv`, or a high-speed camera's `<camera>.cine` or `<camera>.mraw`.
     Returns None when the camera has no frames.
     Raises InputError when there is more than one of these, or when a file cannot be opened.
     """
@@ -263,12 +264,14 @@ def open_frames(folder: Path, camera: str) -> FrameSource | None:
         return ImageFiles(path, tuple(file.name for file in files))
     if path.suffix.lower() in PAGE_EXTENSIONS:
         return PageFrames(path)
+    if path.suffix.lower() in HIGH_SPEED_EXTENSIONS:
+        return open_high_speed(path)
     return VideoFrames(path)
 
 
 def camera_entries(folder: Path, camera: str) -> list[Path]:
     """Return the folder and the files in a run's folder that may hold this camera's frames."""
-    known = PAGE_EXTENSIONS + VIDEO_EXTENSIONS
+    known = FILE_EXTENSIONS
     files = (p for p in folder.iterdir() if p.suffix.lower() in known and p.stem == camera)
     found = sorted(p for p in files if p.is_file())
     inner = folder / camera
@@ -290,6 +293,8 @@ def _refuse_pages(file: Path, folder: Path) -> None:
 
 
 VIDEO_EXTENSIONS = (".avi", ".mp4", ".mov", ".mkv")
+FILE_EXTENSIONS = PAGE_EXTENSIONS + VIDEO_EXTENSIONS + HIGH_SPEED_EXTENSIONS
+"""Of files that hold all frames of a camera."""
 
 _COPY = "copy or record it again; a video that plays elsewhere may be converted to a TIFF sequence"
 _WIDE_GREY = {"gray9", "gray10", "gray12", "gray14", "gray16"}

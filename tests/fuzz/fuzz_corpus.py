@@ -14,6 +14,7 @@ import imageio.v3 as iio
 import numpy as np
 import pandas as pd
 import tifffile
+from high_speed_files import write_cine, write_mraw
 from scipy.io import savemat, wavfile
 from simulated_log import simulated_log
 
@@ -131,6 +132,9 @@ def _run_of_images(folder: Path, rng: np.random.Generator) -> None:
     _video(folder / "raw.avi", pages, "rawvideo", "gray")
     _video(folder / "film.mp4", pages, "mpeg4", "yuv420p")
     _video(folder / "wide.mkv", pages, "ffv1", "gray")
+    write_cine(folder / "phantom.cine", pages, np.arange(4) / 1000)
+    write_mraw(folder / "photron.mraw", pages, bits=8)
+    write_mraw(folder / "older.mraw", pages, bits=8, xml=False)
 
 
 def _video(file: Path, frames: Any, codec: str, pixels: str) -> None:

@@ -17,9 +17,9 @@ from telerig.estimator.smoothing.learning.learn import Learning, free_names, gro
 from telerig.estimator.smoothing.learning.likelihood import laplace_covariance, maximise
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.learning.parameters import value_of
-from telerig.estimator.smoothing.learning.window import learning_window, other_windows
+from telerig.estimator.smoothing.learning.window import learning_parts, other_windows
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
-from telerig.estimator.smoothing.problem.window import Window
+from telerig.estimator.smoothing.problem.window import Window, cut_out
 
 _MOST_WINDOWS = 3
 _STEPS = 5
@@ -54,9 +54,17 @@ class HeldOut:
 
 def held_out(problem: SmoothingProblem, model: ShakeModel) -> list[HeldOut]:
     """Return the comparison with up to three windows that a model was not learned from."""
-    used = learning_window(problem)
+    used = _used(problem)
     found = [_compared(w, model) for w in other_windows(problem, used, _MOST_WINDOWS)]
     return [one for one in found if one is not None]
+
+
+def _used(problem: SmoothingProblem) -> Window:
+    """The frames from the first to the last that a model is learned from."""
+    parts = learning_parts(problem)
+    if len(parts) == 1:
+        return parts[0]
+    return cut_out(problem, parts[0].first, parts[-1].first + len(parts[-1].problem.t_s))
 
 
 def _compared(window: Window, model: ShakeModel) -> HeldOut | None:
@@ -84,10 +92,10 @@ def learning_record(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return from what a model was learned and how it holds elsewhere, and warnings where it does
     not."""
-    window = learning_window(problem)
-    t = window.problem.t_s
+    t = _used(problem).problem.t_s
+    frames = sum(len(part.problem.t_s) for part in learning_parts(problem))
     record: dict[str, Any] = {
-        "from_s": float(t[0]), "to_s": float(t[-1]), "frames": len(t), "held_out": [],
+        "from_s": float(t[0]), "to_s": float(t[-1]), "frames": frames, "held_out": [],
     }  # fmt: skip
     warnings: list[str] = []
     drifts: dict[str, tuple[float, HeldOut]] = {}

@@ -30,19 +30,28 @@ much the steps of frames may differ then."""
 def learning_signals(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
 ) -> tuple[Signal, ...]:
-    """Return the signals that hyper-parameters are learned from: those of `learning_window`.
-
-    Of tracks that come and go those of short pieces of the run in which some bubbles are seen all
-    the time, as replicates of each other.
+    """Return the signals of `learning_parts`, those of several parts as replicates of each other.
 
     weights : as for `learning_window`.  fixed : as for `signals_of`.
     """
+    parts = [part.problem for part in learning_parts(problem, weights, fixed=fixed)]
+    if len(parts) > 1:
+        return tuple(stacked(some) for some in zip(*map(signals_of, parts)))
+    return tuple(c for c in signals_of(parts[0], fixed=fixed) if c.samples)
+
+
+def learning_parts(
+    problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
+) -> list[Window]:
+    """Return the parts of a run that hyper-parameters are learned from, in their order.
+
+    That is `learning_window`, or, of tracks that come and go, short pieces of the run in which
+    some bubbles are seen all the time.
+
+    weights, fixed : as for `learning_signals`.
+    """
     window = learning_window(problem, weights)
-    pieces = [] if fixed else _pieces(problem, weights, window)
-    if pieces:
-        each = zip(*(signals_of(piece.problem) for piece in pieces))
-        return tuple(stacked(some) for some in each)
-    return tuple(c for c in signals_of(window.problem, fixed=fixed) if c.samples)
+    return ([] if fixed else _pieces(problem, weights, window)) or [window]
 
 
 def _pieces(
@@ -77,7 +86,7 @@ def _pieces(
                     continue
             first += max(size // _PLACES, 1)
         least = min(len(f.problem.bubbles) for f in found) if found else 0
-        if len(found) * size >= min(MOST_FRAMES, length) / 2:
+        if len(found) * size >= min(MOST_FRAMES, len(problem.t_s) // 2):
             return [_with_fewer(piece, least) for piece in found]
     return []
 
@@ -136,10 +145,11 @@ def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tup
 
 
 def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Window]:
-    """Return up to ``most`` windows of the same length, spread over the rest of the run."""
-    length, count = len(used.problem.t_s), len(problem.t_s)
-    before = _spread(0, used.first, length)
-    after = _spread(used.first + length, count, length)
+    """Return up to ``most`` windows, spread over the rest of the run, as long as the one used, or
+    as `MOST_FRAMES`."""
+    end = used.first + len(used.problem.t_s)
+    length = min(end - used.first, MOST_FRAMES)
+    before, after = _spread(0, used.first, length), _spread(end, len(problem.t_s), length)
     firsts = np.array(before + after, np.int64)
     if not len(firsts):
         return []

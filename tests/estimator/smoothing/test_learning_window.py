@@ -10,10 +10,12 @@ from shake_learning_data import run, true_model, with_comings_and_goings
 
 from telerig.estimator.smoothing.graph.solve import solve
 from telerig.estimator.smoothing.learning.evidence import signal_evidence
+from telerig.estimator.smoothing.learning.held_out import learning_record
 from telerig.estimator.smoothing.learning.likelihood import with_hyperparameter_uncertainty
 from telerig.estimator.smoothing.learning.lines_of_sight import pooled
 from telerig.estimator.smoothing.learning.window import (
     MOST_FRAMES,
+    learning_parts,
     learning_signals,
     learning_window,
     other_windows,
@@ -52,9 +54,9 @@ def test_a_long_run_is_learned_from_where_the_bubbles_are_seen_most() -> None:
     assert [w.first for w in other_windows(fewer, window, 5)] == [0, MOST_FRAMES]
 
 
-def _coming_and_going(frames: int, track: int) -> SmoothingProblem:
+def _coming_and_going(frames: int, track: int, bubbles: int = 8) -> SmoothingProblem:
     rng = np.random.default_rng(5)
-    problem, _, _ = run(rng, bubbles=8, seconds=frames / 200.0)
+    problem, _, _ = run(rng, bubbles=bubbles, seconds=frames / 200.0)
     return with_comings_and_goings(problem, rng, track)
 
 
@@ -82,6 +84,18 @@ def test_the_evidence_of_pieces_is_the_sum_of_theirs() -> None:
         assert signal_evidence(signal, model) == pytest.approx(each[-1], rel=1e-9)
         apart.append(sum(signal_evidence(part, model) for part in pooled(signal)))
     assert apart[1] - apart[0] == pytest.approx(each[1] - each[0], rel=0.02)
+
+
+def test_the_record_states_the_pieces_and_holds_the_rest_of_the_run_against_them() -> None:
+    problem = _coming_and_going(4 * MOST_FRAMES, 200, bubbles=20)
+    parts = learning_parts(problem)
+    assert [p.first for p in parts] == sorted(p.first for p in parts)
+    record, _ = learning_record(problem, replace(true_model(), learned={}))
+    assert record["frames"] == sum(len(p.problem.t_s) for p in parts)
+    assert record["from_s"] == parts[0].problem.t_s[0]
+    assert record["to_s"] == parts[-1].problem.t_s[-1]
+    assert record["held_out"]
+    assert all(one["from_s"] > record["to_s"] for one in record["held_out"])
 
 
 def test_short_runs_marks_and_lasting_bubbles_are_learned_from_as_before() -> None:

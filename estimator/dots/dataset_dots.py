@@ -314,10 +314,23 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
     hands = {(i.view, i.camera): i.handedness for i in found if not i.failure}
     check_handedness(hands, dataset.target.two_sided)
     notes = [f"view {i.view}, camera {i.camera} is left out: {i.failure}" for i in failures]
-    notes += [f"view {i.view}, camera {i.camera}: {n}" for i in found for n in i.notes]
+    notes += _notes_once(found)
     return DatasetDots(
         _joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(notes)
     )
+
+
+def _notes_once(found: list[ImageDots]) -> list[str]:
+    """Return the notes of the images; one that several images share is said once."""
+    images: dict[str, list[ImageDots]] = {}
+    for image in found:
+        for note in image.notes:
+            images.setdefault(note, []).append(image)
+    return [
+        f"view {of[0].view}, camera {of[0].camera}: {note}" if len(of) == 1 else
+        f"{note} (in {len(of)} of {len(found)} images)"
+        for note, of in images.items()
+    ]  # fmt: skip
 
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:

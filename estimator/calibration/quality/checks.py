@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
@@ -20,6 +21,8 @@ RECOMMENDED_VIEWS = 6
 MINIMUM_DOTS = 4
 PARALLEL_DEG = 3.0
 SMALL_TILT_DEG = 10.0
+TOLD_APART = 0.98
+"""Correlation beyond which two parameters can hardly be told apart."""
 NEAR_PARALLEL_DEG = 10.0
 """Below this angle, where two optical axes come closest is too uncertain to be the origin of lenses
 with perspective: the solver would need hundreds of iterations."""
@@ -327,7 +330,7 @@ def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:
     """Return sentences about parameters of the rig that the views determine poorly.
 
     A parameter is named if its standard deviation exceeds half of its prior's, or if its
-    correlation with another one exceeds 0.98.
+    correlation with another one exceeds `TOLD_APART`.
     """
     names, covariance = joint.rig_block()
     sd = np.sqrt(np.diag(covariance))
@@ -346,21 +349,34 @@ def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:
 
 
 def _correlated(names: tuple[str, ...], covariance: Array) -> list[str]:
-    sd = np.sqrt(np.diag(covariance))
+    """Return a sentence for each group of parameters that are linked by such correlations."""
+    sd = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
     correlation = covariance / np.outer(sd, sd)
+    linked = np.abs(correlation) > TOLD_APART
+    count, group = connected_components(linked, directed=False)
     out = []
-    for i, j in zip(*np.triu_indices(len(names), 1)):
-        if abs(correlation[i, j]) > 0.98:
-            a, b = (
-                f"{_parameter_words(parameter)} of camera {camera!r}"
-                for camera, _, parameter in (names[k].partition(".") for k in (i, j))
-            )
-            together = "both" if correlation[i, j] > 0 else "one and a fall of the other"
+    for k in range(count):
+        members = np.flatnonzero(group == k).tolist()
+        words = [_full_words(names[i]) for i in members]
+        if len(members) == 2:
+            size = correlation[members[0], members[1]]
+            together = "both" if size > 0 else "one and a fall of the other"
             out.append(
-                f"{a} and {b} can hardly be told apart (correlation {correlation[i, j]:+.3f}): "
+                f"{words[0]} and {words[1]} can hardly be told apart (correlation {size:+.3f}): "
                 f"a rise of {together} hardly changes the images"
             )
+        elif len(members) > 2:
+            largest = np.max(np.abs(correlation[np.ix_(members, members)] - np.eye(len(members))))
+            out.append(
+                f"{', '.join(words[:-1])} and {words[-1]} can hardly be told apart (correlations "
+                f"up to {largest:.3f}): they can change together with hardly a change of the images"
+            )
     return out
+
+
+def _full_words(name: str) -> str:
+    camera, _, parameter = name.partition(".")
+    return f"{_parameter_words(parameter)} of camera {camera!r}"
 
 
 _PARAMETER_WORDS = {

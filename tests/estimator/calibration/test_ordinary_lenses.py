@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.io.results.telecentricity_words import telecentricity_words
@@ -100,3 +101,16 @@ def test_words_of_lenses_that_are_telecentric_and_not_quite() -> None:
         "views' 20 mm of depth",
     ]
     assert telecentricity_words({}) == []
+
+
+def test_linked_parameters_make_one_sentence_a_group() -> None:
+    names = ("left.k1", "left.k2", "left.kappa_per_mm", "right.k1", "right.k2", "right.skew")
+    direction = np.array([[1.0, -2.0, 0.5, 0, 0, 0], [0, 0, 0, 1.0, -1.0, 0], [0, 0, 0, 0, 0, 1.0]])
+    covariance = direction.T @ direction + 1e-4 * np.eye(6)
+    words = checks._correlated(names, covariance)
+    assert len(words) == 2
+    assert words[0].startswith(
+        "the distortion coefficient k1 of camera 'left', the distortion coefficient k2 of camera "
+        "'left' and the residual perspective kappa of camera 'left' can hardly be told apart"
+    )
+    assert "a rise of one and a fall of the other" in words[1]

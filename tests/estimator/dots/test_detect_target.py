@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from places import REAL
@@ -13,7 +14,9 @@ from target_pictures import draw, pixel_from_mm
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.dataset_dots import (
     MEASURED,
+    ImageDots,
     TargetDetection,
+    _notes_once,
     detect_target,
     numbered,
 )
@@ -123,3 +126,18 @@ def test_real_printed_grid_is_numbered_from_its_rings(camera: int) -> None:
     for axis in ("u_px", "v_px"):
         fit = np.linalg.lstsq(bilinear, table[axis], rcond=None)[0]
         assert np.abs(bilinear @ fit - table[axis]).max() < 4
+
+
+def test_a_note_that_images_share_is_said_once() -> None:
+    empty = DESIGN.ids()[:0]
+    table = pd.DataFrame({"dot": empty})
+    symmetric, other = "the target is symmetric", "something else"
+    images = [
+        ImageDots(
+            f"{k}", "left", table, table, 1, notes=(symmetric, other) if k == 1 else (symmetric,)
+        )
+        for k in range(3)
+    ]
+    assert _notes_once(images) == [
+        "the target is symmetric (in 3 of 3 images)", "view 1, camera left: something else",
+    ]  # fmt: skip

@@ -165,6 +165,7 @@ def test_a_clipped_background_costs_no_dot(
     gap, table = errors(locate_dots(grey.clip(0, 255).round().astype(np.uint8)), plate.centres_px)
     sd = np.sqrt(table[["suu_px2", "svv_px2"]].to_numpy())
     assert np.abs(gap / sd).max() < 5.0
+    assert 0.5 < normalised(gap, table) < 1.25
 
 
 def test_columns_and_conventions() -> None:

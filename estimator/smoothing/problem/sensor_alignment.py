@@ -64,11 +64,12 @@ _FRAME_FACTORS = {
     0.5: "the stated frame rate is half the true one",
     2.0: "the stated frame rate is twice the true one",
 }
-_CLEAR_GAIN = 5.0
+_CLEAR_GAIN, _CLEAR_UNIT = 5.0, 4.0
 _CORRELATED = 10.0
 """So many neighbouring pixels of a mark count as one, because the shake moves them alike."""
 
 _USUAL_GAIN, _KNOWN_GAIN = (0.75, 1.35), 0.01
+_LEAST_TRAVEL_MM = 0.3
 _FASTEST_MM_S = 3000.0
 _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
@@ -795,8 +796,10 @@ def _encoder(
         gain = float(np.sum(weights * [g for g, _ in gains]) / weights.sum())
         sd = float(weights.sum() ** -0.5)
         usual = _USUAL_GAIN[0] < gain < _USUAL_GAIN[1]
-        if abs(gain) > _CLEAR_GAIN * sd and not usual and abs(gain - 1) > _CLEAR_GAIN * sd:
-            return [_gain_finding(gain, sd, where)]
+        finding = _gain_finding(gain, sd, where)
+        clear = _CLEAR_GAIN if finding.code == Code.ENCODER_SCALE else _CLEAR_UNIT
+        if min(abs(gain), abs(gain - 1)) > clear * sd and not usual:
+            return [finding]
     if clock is not None and clock.clear and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
         return [
             Finding(
@@ -841,7 +844,7 @@ def _gains(
 def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
     """Return how far the marks move in the images over how far the encoder moves, and its sd."""
     seen = problem.references
-    if not len(seen) or problem.stage is None or not np.ptp(problem.encoder_mm) > 1.0:
+    if not len(seen) or problem.stage is None or not np.ptp(problem.encoder_mm) > 0:
         return None
     square = product = rest = 0.0
     count = 0
@@ -858,7 +861,7 @@ def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
         x = moved - (np.bincount(item, moved) / size)[item]
         square, product = square + float(x @ x), product - float(x @ y)
         rest, count = rest + float(y @ y), count + len(y)
-    if square <= 0:
+    if square <= 0 or max(square, rest) < _LEAST_TRAVEL_MM**2 * count:
         return None
     gain = product / square
     spread = max(rest - gain**2 * square, 0.0) / max(count, 1)

@@ -102,6 +102,22 @@ def test_a_scale_that_is_roughly_known_is_taken_for_the_nearest_unit(
     assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": proposed}]
 
 
+@pytest.mark.parametrize("seed", [906, 907])
+def test_a_turned_encoder_is_told_from_one_that_is_right_by_four_standard_deviations(
+    seed: int,
+) -> None:
+    _, said = placed(seed, "one", scenario="S2", encoder=-1.0)
+    assert [f.code for f in said if f.code is not None] == ["ENCODER_SIGN"]
+    _, said = placed(seed, "one", scenario="S2")
+    assert all(f.code is None for f in said)
+
+
+def test_marks_show_the_unit_of_an_encoder_that_seems_to_stand() -> None:
+    """In metres it moves by 0.4."""
+    _, said = placed(906, "references", scenario="S2", encoder=1e-3)
+    assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": 1e3}]
+
+
 @pytest.mark.parametrize(("information", "known"), [("one", False), ("references", True)])
 def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
     information: str, known: bool

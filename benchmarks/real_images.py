@@ -2,7 +2,8 @@
 
 python benchmarks/real_images.py FOLDER [--out benchmarks/results/real_images.md]
 
-FOLDER holds CalB-sys2-00NN_0.jpeg (left) and _1.jpeg (right).
+FOLDER holds CalB-sys2-00NN_0.jpeg (left) and _1.jpeg (right), or dic_stereo_dots with these, and
+plates_discorpy and plates_boofcv, which `plates.real` measures.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
+
+from plates import real
 
 import telerig
 from telerig.estimator.calibration.calibrate import nominal_cameras
@@ -70,8 +73,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    pairs = options.folder / "dic_stereo_dots"
+    whole = pairs.is_dir()
     with tempfile.TemporaryDirectory() as temporary:
-        data = telerig.load_dataset(make_dataset(options.folder, Path(temporary) / "set"))
+        data = telerig.load_dataset(
+            make_dataset(pairs if whole else options.folder, Path(temporary) / "set")
+        )
         begun = time.perf_counter()
         found = detect_dataset(data)
         lines = [
@@ -85,6 +92,8 @@ def main() -> None:
         for dots_free, model, limit in CASES:
             lines.append(case(data, found.dots, dots_free, model, limit))
             print(lines[-1], flush=True)
+    if whole:
+        lines += ["", "Plates of other laboratories:", "", *real(options.folder)]
     text = "\n".join([*lines, ""])
     print(text)
     if options.out is not None:

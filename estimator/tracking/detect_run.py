@@ -23,14 +23,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background import methods
-from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
+from telerig.estimator.bubbles.detect import find_bubbles, load_compiled_loops
+from telerig.estimator.bubbles.field import mask_field, region_field
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import atomic_path, write_json_atomic
 from telerig.io.files.csv_table import write_table
+from telerig.io.images.read import read_image
 from telerig.io.machine.parallel import cores, keep_freed_memory, ordered_map, quick_workers
 from telerig.rig.camera import Camera
 
@@ -55,12 +57,14 @@ class Scene:
     backgrounds : background of each camera, by name.
     min_diameter_px : dark spots that are smaller count as dirt.
     strips : by camera name, the dots fixed to the tank, which are erased from the images.
+    fields : by camera name, where bubbles are looked for (rows, columns); absent for everywhere.
     """
 
     run: RunData
     backgrounds: dict[str, methods.RunBackground]
     min_diameter_px: float
     strips: Mapping[str, StripInImages] = field(default_factory=dict)
+    fields: Mapping[str, Bools] = field(default_factory=dict)
 
     def image(self, camera: str, frame: int) -> NDArray[Any] | None:
         """Return an image (height, width) without the strip's dots; None if the image is
@@ -85,6 +89,7 @@ def make_scene(
     strips : dots to erase, by camera name; None for none.
     method : a name in `METHODS` of `bubbles.background.methods`.
     """
+    fields = described_fields(run)
     estimator = methods.method(method)
     shifts = {c.name: lab_shift_px(c, axis_rig, run.position_mm, run.frame_count) for c in cameras}
     names = [c.name for c in cameras]
@@ -96,7 +101,27 @@ def make_scene(
         backgrounds[name] = found
         if progress is not None:
             progress("background", len(backgrounds), len(names))
-    return Scene(run, backgrounds, min_diameter_px, strips or {})
+    return Scene(run, backgrounds, min_diameter_px, strips or {}, fields)
+
+
+def described_fields(run: RunData) -> dict[str, Bools]:
+    """Return by camera where rig.toml says that bubbles are to be looked for (rows, columns).
+
+    Raises InputError for a region or a mask that does not fit the camera's images.
+    """
+    out = {}
+    for name, described in ({} if run.rig is None else run.rig.bubbles).items():
+        if name not in run.cameras or run.rig is None:
+            continue
+        width, height = run.rig.cameras[name].image_size_px
+        parts = []
+        if described.region is not None:
+            parts.append(region_field((height, width), described.region, f"[bubbles.{name}]"))
+        if described.mask is not None:
+            file = run.path.parent.parent / described.mask
+            parts.append(mask_field((height, width), read_image(file), str(file)))
+        out[name] = np.logical_and.reduce(parts)
+    return out
 
 
 def _image(
@@ -302,7 +327,10 @@ def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
     else:
         level = scene.backgrounds[camera].of_frame(frame)
         try:
-            found = detect_bubbles(image, background=level, min_diameter_px=scene.min_diameter_px)
+            found = find_bubbles(
+                image, background=level, field=scene.fields.get(camera),
+                min_diameter_px=scene.min_diameter_px,
+            ).accepted  # fmt: skip
         except InputError as error:
             raise InputError(
                 error.what, where=f"camera {camera}, frame {frame}", todo=error.todo

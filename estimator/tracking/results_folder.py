@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 WORST_FRAMES = 8
 _OUTLINE_POINTS = 72
-_RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking")
+_RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "bubbles")
 """The tables of rig.toml on which tracking depends."""
 _GREEN, _ORANGE = (40, 200, 70), (255, 140, 40)
 
@@ -223,7 +223,10 @@ def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> No
     if image is None or plain is None:
         return
     level = scene.backgrounds[camera].of_frame(frame)
-    bubbles = find_bubbles(plain, background=level, min_diameter_px=scene.min_diameter_px)
+    bubbles = find_bubbles(
+        plain, background=level, field=scene.fields.get(camera),
+        min_diameter_px=scene.min_diameter_px,
+    )  # fmt: skip
     found, rejected = bubbles.accepted, bubbles.rejected
     outlines = [outline_points(row, _OUTLINE_POINTS) for _, row in found.iterrows()]
     named = [_particle(labels, row) for _, row in found.iterrows()]

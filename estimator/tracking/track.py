@@ -218,6 +218,8 @@ def tracking_stream(
         inputs = {
             "options": repr(chosen), "cameras": repr(cameras), "frames": str(run.frame_count)
         }  # fmt: skip
+        if run.rig is not None and run.rig.bubbles:
+            inputs["bubbles"] = repr(run.rig.bubbles)
         strip = described_strip(run)
         if strip is not None:
             inputs |= {"references": repr(strip), "axis": repr(axis)}

@@ -138,6 +138,22 @@ class ReferencesDescription(Table):
 
 
 @dataclass(frozen=True)
+class FieldDescription(Table):
+    """Describe where in a camera's images bubbles are looked for; without both, everywhere.
+
+    region : corners (u, v) of a polygon, in px.
+    mask : path, from the folder of rig.toml, of an image that is not black there.
+    """
+
+    camera: str
+    region: Annotated[
+        tuple[tuple[float, float], ...] | None,
+        Field(description="corners in px, like [[100, 50], [900, 50], [900, 700]]"),
+    ] = None
+    mask: Annotated[Text | None, Field(description='a file, like "mask.png"')] = None
+
+
+@dataclass(frozen=True)
 class WallDescription(Table):
     """Describe the plane glass between a camera and the water, in that camera's frame.
 
@@ -229,6 +245,7 @@ class RigDescription:
     tracking : the two cameras whose images of bubbles are paired, in the rig's order; None when the
     file does not state them, which means the first two.
     stage, references : None when the file has no such table.
+    bubbles : by camera, where in its images bubbles are looked for.
     """
 
     name: str
@@ -241,6 +258,7 @@ class RigDescription:
     references: ReferencesDescription | None = None
     walls: Mapping[str, WallDescription] = field(default_factory=dict)
     devices: Mapping[str, DeviceDescription] = field(default_factory=dict)
+    bubbles: Mapping[str, FieldDescription] = field(default_factory=dict)
 
     @property
     def first(self) -> str:

@@ -21,6 +21,7 @@ from telerig.io.rig_file.description import (
     SCHEMA,
     AccelerometerDescription,
     CameraDescription,
+    FieldDescription,
     ReferencesDescription,
     RigDescription,
     StageDescription,
@@ -37,7 +38,7 @@ from telerig.rig.target import Target
 
 TOP_LEVEL = [
     *("schema", "name", "cameras", "stereo", "target"),
-    *("stage", "accelerometers", "devices", "references", "walls", "tracking"),
+    *("stage", "accelerometers", "devices", "references", "walls", "tracking", "bubbles"),
 ]
 
 _CORRECT = "correct that line: strings need quotes, each key stands once, keys follow their [table]"
@@ -165,6 +166,7 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
     accelerometers = _accelerometers(raw, names, problems)
     references = _references(raw, problems)
     walls = _walls(raw, cameras, problems)
+    bubbles = _bubbles(raw, names, problems)
     devices = devices_from_tables(raw, names, problems)
     if problems or target is None:
         return None
@@ -179,6 +181,7 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
         references=references,
         walls=walls,
         devices=devices,
+        bubbles=bubbles,
     )
 
 
@@ -314,6 +317,32 @@ def _references(raw: dict[str, Any], problems: Problems) -> ReferencesDescriptio
     return read_table(
         ReferencesDescription, raw["references"], "references", problems, homes=_HOMES
     )
+
+
+def _bubbles(
+    raw: dict[str, Any], names: list[str], problems: Problems
+) -> dict[str, FieldDescription]:
+    """`[bubbles]` holds for every camera, `[bubbles.<camera>]` for one."""
+    content = raw.get("bubbles", {})
+    if not isinstance(content, dict):
+        problems.add("", "bubbles", f"is {content!r:.80}, must be a table", "write [bubbles]")
+        return {}
+    own = {key: value for key, value in content.items() if isinstance(value, dict)}
+    common = {key: value for key, value in content.items() if key not in own}
+    for key in sorted(set(own) - set(names)):
+        problems.add(f"bubbles.{key}", "", f"there is no camera {key!r}", suggestion(key, names))
+    whole = read_table(FieldDescription, common, "bubbles", problems, homes=_HOMES, camera="")
+    out = {}
+    for name in names:
+        found = None if whole is None else replace(whole, camera=name)
+        if name in own:
+            place = f"bubbles.{name}"
+            found = read_table(
+                FieldDescription, own[name], place, problems, homes=_HOMES, camera=name
+            )
+        if found is not None and (found.region, found.mask) != (None, None):
+            out[name] = found
+    return out
 
 
 def _walls(

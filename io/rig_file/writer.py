@@ -62,6 +62,9 @@ def rig_toml(rig: RigDescription) -> str:
         blocks.append(_block("references", _all_fields(rig.references)))
     if rig.tracking is not None:
         blocks.append(_block("tracking", [("cameras", rig.tracking, "whose images are paired")]))
+    blocks += [
+        _block(f"bubbles.{toml_key(f.camera)}", _all_fields(f)) for f in rig.bubbles.values()
+    ]
     for wall in rig.walls.values():
         lines = [line for line in _all_fields(wall) if line[:2] != ("normal_sigma_deg", 0.0)]
         blocks.append(_block(f"walls.{toml_key(wall.camera)}", lines))

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,6 +21,7 @@ from telerig.estimator.tracking import detect_run
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions
 from telerig.estimator.tracking.tracks import Tracks
+from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.scripts.main import app
@@ -248,3 +250,60 @@ def test_frames_that_are_no_first_frames_are_refused(rise: Path, frames: str) ->
     answer = CliRunner().invoke(app, command)
     assert answer.exit_code == 2 and "->" in answer.stderr
     assert frames in answer.stderr or "first 0 frames" in answer.stderr
+
+
+def test_bubbles_are_looked_for_where_rig_toml_says(
+    rise: Path, whole: Tracks, tmp_path: Path
+) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(rise, data)
+    run = data / "runs" / "rise"
+    rig = (data / "rig.toml").read_text(encoding="utf-8")
+    left = whole.detections[whole.detections["camera"] == "left"]
+    reach = 3 * float(left["a_px"].max())
+    u, v = (np.array([left[n].min() - reach, left[n].max() + reach]) for n in ("u_px", "v_px"))
+
+    def found(rows: np.ndarray) -> pd.DataFrame:
+        corners = [[u[0], rows[0]], [u[1], rows[0]], [u[1], rows[1]], [u[0], rows[1]]]
+        region = [[float(x) for x in corner] for corner in corners]
+        (data / "rig.toml").write_text(f"{rig}\n[bubbles.left]\nregion = {region}\n")
+        return telerig.track(telerig.load_run(run), truth_calibration()).detections
+
+    columns = ["camera", "u_px", "v_px", "flags"]
+    pd.testing.assert_frame_equal(found(v)[columns], whole.detections[columns])
+    cut = found(np.array([v[0], float(left["v_px"].min())]))
+    flags = cut[(cut["camera"] == "left") & cut["u_px"].notna()]["flags"]
+    assert len(flags) and flags.str.contains("border").all()
+    beside = found(v[0] - np.array([4.0, 2.0]) * reach)
+    assert beside[beside["camera"] == "left"]["u_px"].isna().all()
+    assert beside[beside["camera"] == "right"]["u_px"].notna().all()
+
+    width, height = telerig.load_run(run).rig.cameras["left"].image_size_px
+    mask = np.zeros((height, width), np.uint8)
+    cv2.imwrite(str(data / "mask.png"), mask)
+    (data / "rig.toml").write_text(f'{rig}\n[bubbles]\nmask = "mask.png"\n')
+    with pytest.raises(InputError, match=r"mask\.png.*is black|is black"):
+        telerig.track(telerig.load_run(run), truth_calibration())
+
+
+def test_where_bubbles_are_looked_for_is_read_and_written(rise: Path, tmp_path: Path) -> None:
+    text = (rise / "rig.toml").read_text(encoding="utf-8")
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        text + '\n[bubbles]\nmask = "m.png"\n[bubbles.left]\nregion = [[1, 2], [3, 4], [5.5, 0]]\n'
+    )
+    rig = read_rig_toml(file)
+    assert rig.bubbles["left"].region == ((1, 2), (3, 4), (5.5, 0))
+    assert rig.bubbles["left"].mask is None and rig.bubbles["right"].mask == "m.png"
+    write_rig_toml(rig, tmp_path / "again.toml")
+    assert read_rig_toml(tmp_path / "again.toml").bubbles == rig.bubbles
+    for wrong, words in (
+        ("[bubbles]\nregoin = [[1, 2]]", "region"),
+        ("[bubbles.lefd]\nmask = 'm.png'", "no camera 'lefd'"),
+        ("[bubbles]\nregion = [[1], [2, 3]]", "corners in px"),
+        ("[bubbles]\nmask = 3", 'a file, like "mask.png"'),
+    ):
+        file.write_text(f"{text}\n{wrong}\n")
+        with pytest.raises(InputError) as caught:
+            read_rig_toml(file)
+        assert words in str(caught.value) and str(caught.value).count("[bubbles") == 1

@@ -139,7 +139,9 @@ def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
         outlines += [np.asarray(edge[:, 0], float) for edge in edges]
         words += ["the field"] * len(edges)
         colours += [(90, 160, 250)] * len(edges)
-    picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks)
+    single, clusters = len(bubbles.accepted) - len(bubbles.clusters), len(bubbles.clusters)
+    found = f"{_count(single, 'bubble')}, {_count(clusters, 'cluster')}"
+    picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks, found=found)
     path.parent.mkdir(parents=True, exist_ok=True)
     written, encoded = cv2.imencode(path.suffix, picture[..., ::-1])
     if not written:

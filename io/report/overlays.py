@@ -92,6 +92,7 @@ def draw_bubble_overlay(
     colours: Sequence[Colour] | Colour = GREEN,
     *,
     rejected: Sequence[Rejected] = (),
+    found: str | None = None,
     max_width_px: int = 900,
 ) -> Picture:
     """The image, not wider than max_width_px, with its bubbles: an RGB picture (h, w, 3).
@@ -100,7 +101,8 @@ def draw_bubble_overlay(
     points that are not finite are passed over. labels : one each, "" for none; a label stands in
     the outline's middle, or beside it where other text is, or nowhere. colours : RGB, one each or
     one for all. rejected : (u, v, radius, reason) is circled in red with the number of its reason,
-    which the legend underneath spells out with its count.
+    which the legend underneath spells out with its count. found : what the outlines are, for the
+    legend; None for bubbles.
 
     Raises InputError for what is no grey image, and for labels or colours that do not fit.
     """
@@ -117,7 +119,8 @@ def draw_bubble_overlay(
         size = max(radius, finest_px) if np.isfinite(radius) else 4 * finest_px
         circles.append(np.stack([u + size * np.cos(_TURN), v + size * np.sin(_TURN)], -1))
     reasons = [reason for *_, reason in rejected]
-    return _overlay(image, outlines, labels, shades, circles, reasons, f"{len(outlines)} bubbles",
+    found = f"{len(outlines)} bubbles" if found is None else found
+    return _overlay(image, outlines, labels, shades, circles, reasons, found,
                     max_width_px, _LEAST_CONTRAST)  # fmt: skip
 
 

@@ -47,7 +47,7 @@ def bubbles(
     corners = _corners(region)
     again = typed_command() or f"telerig bubbles {images[0]} --out {out}"
     with progress(quiet) as stage:
-        inputs = fingerprints(out, files)
+        inputs = fingerprints(out, files if mask is None else [*files, mask])
         with replaced_results(out, "bubbles", again=again, inputs=inputs) as staged:
             words = write_bubbles(
                 files, staged, min_diameter_px=min_diameter, region_px=corners, mask=mask,

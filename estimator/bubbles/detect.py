@@ -97,7 +97,7 @@ def detect_bubbles(
 
     image : (rows, columns) grey levels.
     background : (rows, columns) grey levels of the lit screen without bubbles; None estimates them
-        from the image itself.
+        from the image itself, of which a dark surround of the screen is then left out.
     min_diameter_px : least equivalent diameter of a bubble, in px; at least 4.
     min_contrast : least depth of a bubble's shadow, as a share of the background.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Bools
 from telerig.errors import InputError
+from telerig.io.images.read import read_image
 
 _CELL_PX = 8
 _LARGEST_BUBBLE = 10
@@ -56,6 +58,30 @@ def _largest_part(lit: NDArray[np.uint8]) -> NDArray[np.uint8]:
     filled = np.zeros_like(lit)
     cv2.drawContours(filled, [max(outlines, key=cv2.contourArea)], -1, 1, cv2.FILLED)
     return filled
+
+
+def described_field(
+    shape: tuple[int, int],
+    region_px: ArrayLike | None,
+    mask: Path | None,
+    where: str,
+) -> Bools | None:
+    """Return the pixels (H, W) inside a polygon and in which a mask is not 0; None without both.
+
+    where : what gives the region, for errors.
+    Raises InputError for what `region_field` and `mask_field` refuse, and where nothing is left.
+    """
+    parts = [] if region_px is None else [region_field(shape, region_px, where)]
+    if mask is not None:
+        parts.append(mask_field(shape, read_image(mask), str(mask)))
+    if not parts:
+        return None
+    field = np.logical_and.reduce(parts)
+    if not field.any():
+        raise InputError(
+            f"and {mask} have no pixel in common", where=where, todo="give one of them"
+        )
+    return np.asarray(field)
 
 
 def region_field(shape: tuple[int, int], corners_px: ArrayLike, where: str) -> Bools:

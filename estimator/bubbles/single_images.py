@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import Bubbles, find_bubbles, outline_points
-from telerig.estimator.bubbles.field import mask_field, region_field
+from telerig.estimator.bubbles.field import described_field
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.files.csv_table import write_table
 from telerig.io.images.read import Image, read_image
@@ -65,7 +65,8 @@ def write_bubbles(
     for index, file in enumerate(files):
         progress(index, len(files))
         image = read_image(file)
-        field = _field(image, region_px, mask)
+        shape = (image.shape[0], image.shape[1])
+        field = described_field(shape, region_px, mask, f"--region, {file.name}")
         bubbles = find_bubbles(image, field=field, min_diameter_px=min_diameter_px)
         _draw(image, bubbles, folder / "overlays" / f"{file.stem}.jpg")
         found.append(_found(file.stem, bubbles))
@@ -75,17 +76,6 @@ def write_bubbles(
         table = pd.concat([getattr(one, name) for one in found], ignore_index=True)
         write_table(table, folder / f"{name}.csv")
     return words
-
-
-def _field(
-    image: Image, region_px: Sequence[Sequence[float]] | None, mask: Path | None
-) -> Bools | None:
-    shape = (image.shape[0], image.shape[1])
-    field = None if region_px is None else region_field(shape, region_px, "--region")
-    if mask is None:
-        return field
-    painted = mask_field(shape, read_image(mask), str(mask))
-    return painted if field is None else field & painted
 
 
 def _found(name: str, bubbles: Bubbles) -> Found:

@@ -27,12 +27,11 @@ from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.detect import find_bubbles, load_compiled_loops
-from telerig.estimator.bubbles.field import mask_field, region_field
+from telerig.estimator.bubbles.field import described_field
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import atomic_path, write_json_atomic
 from telerig.io.files.csv_table import write_table
-from telerig.io.images.read import read_image
 from telerig.io.machine.parallel import cores, keep_freed_memory, ordered_map, quick_workers
 from telerig.rig.camera import Camera
 
@@ -109,19 +108,24 @@ def described_fields(run: RunData) -> dict[str, Bools]:
 
     Raises InputError for a region or a mask that does not fit the camera's images.
     """
-    out = {}
-    for name, described in ({} if run.rig is None else run.rig.bubbles).items():
-        if name not in run.cameras or run.rig is None:
-            continue
+    if run.rig is None:
+        return {}
+    masks, out = mask_files(run), {}
+    for name in set(run.cameras) & set(run.rig.bubbles):
         width, height = run.rig.cameras[name].image_size_px
-        parts = []
-        if described.region is not None:
-            parts.append(region_field((height, width), described.region, f"[bubbles.{name}]"))
-        if described.mask is not None:
-            file = run.path.parent.parent / described.mask
-            parts.append(mask_field((height, width), read_image(file), str(file)))
-        out[name] = np.logical_and.reduce(parts)
+        region = run.rig.bubbles[name].region
+        where = f"rig.toml [bubbles.{name}] region"
+        field = described_field((height, width), region, masks.get(name), where)
+        if field is not None:
+            out[name] = field
     return out
+
+
+def mask_files(run: RunData) -> dict[str, Path]:
+    """Return by camera the image that says where bubbles are looked for."""
+    described = {} if run.rig is None else run.rig.bubbles
+    folder = run.path.parent.parent
+    return {name: folder / one.mask for name, one in described.items() if one.mask is not None}
 
 
 def _image(

@@ -19,7 +19,7 @@ import pandas as pd
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import find_bubbles, outline_points
 from telerig.estimator.calibration.result.calibration import pair_of_run
-from telerig.estimator.tracking.detect_run import Progress, Scene, make_scene
+from telerig.estimator.tracking.detect_run import Progress, Scene, make_scene, mask_files
 from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.track import (
     TrackingStream,
@@ -150,6 +150,7 @@ def _sources(run: RunData) -> list[Path | Source]:
     images = Source(run.path, cameras=run.cameras)
     return [
         *([] if run.rig is None else [Source(rig, tables=_RIG_TABLES)]),
+        *sorted(set(mask_files(run).values())),
         *(run.path / name for name in ("frames.csv", "run.toml", "stage.csv", "references.csv")),
         run.path / "detections.csv" if run.detections is not None else images,
     ]

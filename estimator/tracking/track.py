@@ -32,12 +32,14 @@ from telerig.estimator.tracking.detect_run import (
     detect_missing,
     fingerprint,
     make_scene,
+    mask_files,
 )
 from telerig.estimator.tracking.filter import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracking.frames_to_rows import Linked, RowMaker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
+from telerig.io.files.hashing import hash_if_there
 from telerig.io.machine.parallel import cores
 from telerig.rig.camera import Camera
 
@@ -219,7 +221,8 @@ def tracking_stream(
             "options": repr(chosen), "cameras": repr(cameras), "frames": str(run.frame_count)
         }  # fmt: skip
         if run.rig is not None and run.rig.bubbles:
-            inputs["bubbles"] = repr(run.rig.bubbles)
+            hashes = {name: hash_if_there(file) for name, file in mask_files(run).items()}
+            inputs["bubbles"] = repr((run.rig.bubbles, hashes))
         strip = described_strip(run)
         if strip is not None:
             inputs |= {"references": repr(strip), "axis": repr(axis)}

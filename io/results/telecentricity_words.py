@@ -30,17 +30,17 @@ def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
             "depth"
         )
         if abs(change) < 100 * TELECENTRIC:
-            words.append(f"camera {name}: telecentric: {amount}")
+            words.append(f"camera {name} is telecentric: {amount}")
         else:
-            words.append(f"camera {name}: not quite telecentric: {amount}")
+            words.append(f"camera {name} is not quite telecentric: {amount}")
     return words
 
 
 def _ordinary(names: list[str], of: Mapping[str, Mapping[str, float]]) -> str:
     changes = " and ".join(f"{100 * of[name]['change_per_mm']:.2g}" for name in names)
-    kind = "an ordinary lens" if len(names) == 1 else "ordinary lenses"
+    kind = "has an ordinary lens" if len(names) == 1 else "have ordinary lenses"
     return (
-        f"camera{'s' if len(names) > 1 else ''} {' and '.join(names)}: {kind}, not telecentric: "
+        f"camera{'s' if len(names) > 1 else ''} {' and '.join(names)} {kind}, not telecentric: "
         f"the scale changes by {changes} % per mm of depth. telerig's model covers "
         "ordinary lenses as a limit only; for richer lens models use OpenCV or mrcal, or go on if "
         "the residuals are at the images' noise"

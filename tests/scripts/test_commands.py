@@ -306,6 +306,6 @@ def test_bubbles_of_single_images(tmp_path: Path) -> None:
     far = "--region=200,20 250,20 250,180"
     assert "one: 0 bubbles" in run("bubbles", tmp_path, far, "--out", tmp_path / "far", "--quiet")
     text = run("bubbles", tmp_path, "--region=1,2,3 4", "--out", tmp_path / "bad", code=2)
-    assert "--region: is no polygon" in text and not (tmp_path / "bad").exists()
+    assert "--region, one.tif: is no polygon" in text and not (tmp_path / "bad").exists()
     (tmp_path / "none").mkdir()
     assert "holds no image" in run("bubbles", tmp_path / "none", code=2)

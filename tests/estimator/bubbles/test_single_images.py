@@ -76,6 +76,18 @@ def test_regions_and_masks_that_do_not_fit_are_refused() -> None:
         mask_field((440, 440), np.zeros((440, 440)), "mask.png")
 
 
+def test_a_region_and_a_mask_that_have_nothing_in_common_are_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "one.png"), picture(framed=False))
+    mask = np.zeros((440, 440), np.uint8)
+    mask[300:] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    corners = [[0, 0], [200, 0], [200, 200]]
+    with pytest.raises(InputError, match="have no pixel in common"):
+        write_bubbles(
+            [tmp_path / "one.png"], tmp_path, region_px=corners, mask=tmp_path / "mask.png"
+        )
+
+
 def test_tables_clusters_and_overlays_are_written(tmp_path: Path) -> None:
     image = picture(framed=False)
     image[300:360, 60:120] = 4000

@@ -337,6 +337,41 @@ def test_samples_that_the_images_contradict_lose_their_weight() -> None:
     assert weight is None and not changed
 
 
+def test_samples_in_a_row_that_two_sensors_contradict_are_used_by_neither() -> None:
+    """Of what the fit rejects in one sensor, the other one may be the cause."""
+    rng = np.random.default_rng(4)
+    t_s = np.arange(2000) / 2000
+    first, second = 0.02 * rng.standard_normal((2, 2000, 3))
+    first[[1000, 1020, 1040], 0] += 1.0
+    rejection = SampleRejection(True, (t_s, t_s))
+    weights, changed = rejection.update((None, None), (first, second))
+    assert changed
+    for weight in weights:
+        assert weight is not None
+        assert np.flatnonzero(weight == 0).tolist() == list(range(992, 1049))
+    alone = 0.02 * rng.standard_normal((2000, 3))
+    alone[[300, 1000], 0] += 1.0
+    weights, _ = SampleRejection(True, (t_s, t_s)).update((None, None), (alone, second))
+    assert weights[1] is None and weights[0] is not None
+    assert np.flatnonzero(weights[0] == 0).tolist() == [300, 1000]
+
+
+def test_a_sensor_that_is_touched_for_ten_milliseconds_is_said(run: Run) -> None:
+    spoilt = simulated(1)
+    table = spoilt.accelerometers["arm_left"]
+    inside = (table["t_s"] > 0.3) & (table["t_s"] < 0.31)
+    sensors = dict(spoilt.accelerometers)
+    reading = np.array(table["a_m_s2"])
+    reading[np.asarray(inside)] += 3.0
+    sensors["arm_left"] = {**table, "a_m_s2": reading}
+    found = smooth(
+        spoilt.tracks, spoilt.calibration, stage=spoilt.stage, accelerometers=sensors, rig=RIG
+    )
+    assert rms_um(found.trajectories, spoilt.truth_mm) < 80
+    said = [w for w in found.summary["warnings"] if "contradict each other" in w]
+    assert len(said) == 2, found.summary["warnings"]
+
+
 def test_outliers_cost_little(run: Run) -> None:
     """5 % of the pixels 20 px off; the true hyper-parameters are given."""
     rng = np.random.default_rng(3)

@@ -20,7 +20,3 @@ def run() -> None:
             run_command()
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-if __name__ == "__main__":
-    run()

@@ -116,7 +116,7 @@ def test_an_error_of_reading_is_not_taken_for_one_of_writing(tmp_path: Path) -> 
 
 def interrupted(arguments: list[str], after_s: float) -> tuple[int, str]:
     """Exit code and output of a command whose process group gets Ctrl-C."""
-    command = [sys.executable, "-m", "telerig.scripts.start", *arguments]
+    command = [sys.executable, "-m", "telerig", *arguments]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:

@@ -85,7 +85,7 @@ def measured(frames: int, bubbles: int, track: int) -> dict[str, Any]:
     seconds: dict[str, float] = {}
     before, first_line, begun = {"at": time.process_time()}, [0.0], time.perf_counter()
 
-    def progress(what: str, share: float) -> None:
+    def progress(what: str, share: float, _: int) -> None:
         first_line[0] = first_line[0] or time.perf_counter() - begun
         now, name = time.process_time(), what.split(":")[0]
         seconds[name] = seconds.get(name, 0.0) + now - before["at"]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.rig import projection, windows
-from telerig.rig.lens_parameters import INDEX, PARAMETERS, Scales
+from telerig.rig.lens_parameters import COEFFICIENTS, INDEX, PARAMETERS, Scales
 from telerig.rig.pose import Pose
 from telerig.rig.windows import Wall
 
@@ -87,6 +87,20 @@ class Camera:
         for name, value in parameters.items():
             intrinsics[INDEX[name]] = value
         return replace(self, intrinsics=intrinsics)
+
+    def undistorted(self) -> Camera:
+        """Return this camera without the distortion of its lens.
+
+        Its pose, scale, aspect ratio, skew, residual perspective and tilt of the sensor remain.
+        """
+        return self.with_parameters(**dict.fromkeys(COEFFICIENTS, 0.0))
+
+    def distorted_pixel(self, uv_px: ArrayLike) -> Array:
+        """Return the pixels (..., 2) in this camera of pixels (..., 2) of `undistorted`."""
+        intrinsics = self.undistorted().intrinsics
+        ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), intrinsics, self.rho_mm)
+        at_depth_0 = np.concatenate([ideal, np.zeros_like(ideal[..., :1])], -1)
+        return projection.pixel_from_camera(at_depth_0, self.intrinsics, self.rho_mm)
 
     @property
     def scales(self) -> Scales:

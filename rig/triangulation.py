@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +25,10 @@ from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import hat
 from telerig.rig.windows import affine_map
+from telerig.short_text import ShortText, counted
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 VOLUME_SHARE = 0.6
@@ -34,8 +39,8 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ROWS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
-@dataclass(frozen=True)
-class Triangulation:
+@dataclass(frozen=True, repr=False)
+class Triangulation(ShortText):
     """Holds triangulated points with their covariance.
 
     points_mm : (..., 3) in the rig frame.
@@ -60,6 +65,48 @@ class Triangulation:
     def unplaced(self) -> int:
         """The number of points that fewer than two cameras saw, so that they have no position."""
         return 0 if self.seen_by is None else int((self.seen_by < 2).sum())
+
+    def title(self) -> str:
+        """Return the number of points."""
+        return f"Triangulation of {counted(self.points_mm[..., 0].size, 'point')}"
+
+    def facts(self) -> dict[str, str]:
+        """Return the medians of the standard deviations and of the ray miss, in words."""
+        placed = np.isfinite(self.points_mm).all(-1)
+        if not placed.any():
+            return {"placed": "none" if placed.size else ""}
+        facts = {}
+        for name, covariance in (
+            ("sd", self.covariance_mm2), ("of the pixels", self.measurement_covariance_mm2)
+        ):  # fmt: skip
+            variance = np.diagonal(covariance, axis1=-2, axis2=-1)[placed]
+            x, y, z = 1e3 * np.sqrt(np.median(variance, axis=0))
+            facts[name] = f"x {x:.3g}, y {y:.3g}, z {z:.3g} um (median)"
+        miss = 1e3 * np.nanmedian(np.abs(self.ray_miss_mm))
+        facts["ray miss"] = f"{miss:.3g} um (median)"
+        facts["not placed"] = str(self.unplaced or "")
+        return facts
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table with one row per point: position in mm, covariance in mm^2, ray miss in
+        mm.
+
+        The columns have the names of tracks.csv. With a ray miss for each of C cameras there are
+        columns ray_miss_0_mm to ray_miss_(C-1)_mm in its place, and ``seen_by``.
+        """
+        import pandas as pd
+
+        points, covariance = self.points_mm.reshape(-1, 3), self.covariance_mm2.reshape(-1, 3, 3)
+        columns: dict[str, NDArray[Any]] = {f"{a}_mm": points[:, i] for i, a in enumerate("xyz")}
+        columns |= {f"s{'xyz'[i]}{'xyz'[j]}_mm2": covariance[:, i, j] for i, j in _UPPER}
+        if self.ray_miss_mm.shape == self.points_mm.shape[:-1]:
+            columns["ray_miss_mm"] = self.ray_miss_mm.reshape(-1)
+        else:
+            misses = self.ray_miss_mm.reshape(len(points), -1).T
+            columns |= {f"ray_miss_{c}_mm": miss for c, miss in enumerate(misses)}
+        if self.seen_by is not None:
+            columns["seen_by"] = self.seen_by.reshape(-1)
+        return pd.DataFrame(columns)
 
 
 def midpoint(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import _thread
+import contextlib
 import errno
 import os
 import shlex
 import signal
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import typer
 
 from telerig.errors import TelerigError, TelerigWarning
+from telerig.progress import Steps, steps_shown
 
 EXIT_REJECTED = 1
 EXIT_BAD_INPUT = 2
@@ -197,99 +198,8 @@ def stopped_by_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-class Steps:
-    """Show how far a command is: call it with the name of a step, the number done and the total.
-
-    A number with a point is the share that is done, of 1.
-    seconds : how long each step has taken so far, by name.
-    """
-
-    def __init__(self, show: Callable[[str, float, int, float, float], None] | None) -> None:
-        self._show = show
-        self._begun: dict[str, tuple[float, float]] = {}
-        self._now = ""
-        self.seconds: dict[str, float] = {}
-
-    def __call__(self, what: str, done: float, of: int) -> None:
-        now = time.monotonic()
-        if self._now:
-            self.seconds[self._now] = now - self._begun[self._now][0]
-        self._now = what
-        begun_s, first = self._begun.setdefault(what, (now, done))
-        self.seconds[what] = now - begun_s
-        if self._show is not None:
-            self._show(what, done, of, now - begun_s, done - first)
-
-    def words(self) -> str:
-        """Return the steps that took a second or longer, in words; "" for none."""
-        return ", ".join(f"{what} {s:.0f} s" for what, s in self.seconds.items() if s >= 1)
-
-
 @contextmanager
 def progress(quiet: bool) -> Iterator[Steps]:
     """A callback (what, done, of): a progress bar on a terminal, plain lines elsewhere."""
-    if quiet:
-        yield Steps(None)
-    elif sys.stderr.isatty():
-        yield from _bar()
-    else:
-        yield Steps(_plain_lines())
-
-
-def _bar() -> Iterator[Steps]:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
-    # no refreshing thread: worker processes are copies of this one, which must have one thread
-    with Progress(
-        *columns, console=Console(stderr=True), transient=True, auto_refresh=False
-    ) as bar:
-        tasks: dict[str, Any] = {}
-
-        def update(what: str, done: float, of: int, seconds: float, here: float) -> None:
-            words = _how_far(done, of, seconds, here)
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=of or None, words=words)
-            bar.update(tasks[what], completed=done, words=words, refresh=True)
-
-        yield Steps(update)
-
-
-_PLAIN_S = 2.0
-
-
-def _plain_lines() -> Callable[[str, float, int, float, float], None]:
-    last: dict[str, Any] = {"time": 0.0, "what": ""}
-
-    def update(what: str, done: float, of: int, seconds: float, here: float) -> None:
-        now = time.monotonic()
-        if what != last["what"] or (of and done == of) or now - last["time"] > _PLAIN_S:
-            last.update(time=now, what=what)
-            words = _how_far(done, of, seconds, here)
-            typer.echo(f"{what}: {words}" if words else what, err=True)
-
-    return update
-
-
-def _how_far(done: float, of: int, seconds: float, here: float) -> str:
-    """Return in words how far a step is, how fast, and how long it will take.
-
-    here : how many of those that are done were done in these ``seconds``.
-    """
-    share = isinstance(done, float)
-    words = [f"{100 * done:.0f} %" if share else f"{done} of {of}" if of else f"{done or ''}"]
-    if here and seconds >= 1:
-        rate = here / seconds
-        words += [] if share else [f"{rate:.3g} a second"]
-        words.append(f"{_duration(seconds)} so far")
-        if of > done:
-            words.append(f"{_duration((of - done) / rate)} left")
-    return ", ".join(word for word in words if word)
-
-
-def _duration(seconds: float) -> str:
-    whole = round(seconds)
-    if whole < 120:
-        return f"{whole} s"
-    return f"{whole // 60} min" if whole < 7200 else f"{whole / 3600:.1f} h"
+    with contextlib.nullcontext(Steps(None)) if quiet else steps_shown() as steps:
+        yield steps

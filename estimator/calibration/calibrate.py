@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ from telerig.estimator.calibration.solver.problem import (
     SOLVERS,
     checked_outlier_sd,
 )
+from telerig.progress import Progress, showing_progress
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import AUTO, Model, checked_model, models_by_camera
 
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
     from telerig.estimator.dots.dataset_dots import DatasetDots
     from telerig.io.dataset.dataset import Dataset
     from telerig.io.rig_file.description import RigDescription
-
-Stage = Callable[[str, int, int], None]
-"""Function that reports progress. Its arguments: name of the step, parts done, parts in all."""
-
 
 MEDIA = ("air", "water")
 
@@ -90,6 +87,7 @@ def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
     )  # fmt: skip
 
 
+@showing_progress
 def calibrate(
     dataset: Dataset,
     *,
@@ -98,6 +96,7 @@ def calibrate(
     medium: str = "air",
     outlier_sd: float = OUTLIER_SD,
     seed: int = 0,
+    progress: Progress | bool = False,
 ) -> Calibration:
     """Calibrate a rig from the images or the dots of a dataset.
 
@@ -110,14 +109,17 @@ def calibrate(
     outlier_sd : a dot that is further from the model than this is left out, in standard
         deviations.
     seed : number that is written with the result; the calibration itself uses no random numbers.
+    progress : True to show a progress bar; or a function that is called with the name of the step,
+        the number done and the total, 0 if it is not known.
 
     Returns the calibration; no file is written.
     Raises InputError, DetectionError or CalibrationError; each says what happened, where, and what
     to do.
     """
     run = run_calibration(
-        dataset, model=model, solver=solver, medium=medium, outlier_sd=outlier_sd, seed=seed
-    )
+        dataset, model=model, solver=solver, medium=medium, outlier_sd=outlier_sd, seed=seed,
+        stage=None if isinstance(progress, bool) else progress,
+    )  # fmt: skip
     return run.calibration
 
 
@@ -130,7 +132,7 @@ def run_calibration(
     seed: int = 0,
     dots_free: str = "3d",
     outlier_sd: float = OUTLIER_SD,
-    stage: Stage | None = None,
+    stage: Progress | None = None,
     pictures: bool = False,
     detected: DatasetDots | None = None,
 ) -> CalibrationRun:
@@ -139,7 +141,8 @@ def run_calibration(
     dataset, model, solver, medium, seed, outlier_sd : as for `calibrate`.
     dots_free : how far the target's dots may move from their nominal positions; "3d" lets them
         move in all three directions. `DOTS_FREE` lists the allowed values.
-    stage : function that is called with the progress, see `Stage`; None for none.
+    stage : function that is called with the name of the step, the number done and the
+        total; None for none.
     pictures : whether to draw the detections over each image, as `write_results` needs.
     detected : dots that `detect` or `telerig.estimator.calibration.watch` found before; None
         detects them now.
@@ -179,7 +182,7 @@ def solve_dots(
     medium: str,
     dots_free: str,
     outlier_sd: float = OUTLIER_SD,
-    stage: Stage | None = None,
+    stage: Progress | None = None,
     notes: Sequence[str] = (),
 ) -> Calibration:
     """Calibrate the rig from a table of dots, without the stage's axis and the runs' windows.
@@ -212,7 +215,7 @@ def solve_dots(
 
 
 def detect(
-    dataset: Dataset, *, stage: Stage | None = None, pictures: bool = False
+    dataset: Dataset, *, stage: Progress | None = None, pictures: bool = False
 ) -> DatasetDots | None:
     """Detect the dots in all images of a dataset.
 
@@ -237,7 +240,7 @@ def _load_libraries() -> None:
     import gtsam  # noqa: F401
 
 
-def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:
+def _stage(dataset: Dataset, calibration: Calibration, stage: Progress | None) -> dict[str, Any]:
     """Return the travel axis and encoder scale that the folder `stage_axis/` gives.
 
     The result is empty if there is no such folder or if the calibration was rejected.

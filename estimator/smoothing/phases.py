@@ -7,14 +7,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from telerig.estimator.smoothing.graph.solve import Progress
+from telerig.progress import Progress as Steps
 
 
 class Phases:
-    """Report phases to a callback and keep their wall time in ``seconds``, by name."""
+    """Report phases to a callback and keep their wall time in ``seconds``, by name.
 
-    def __init__(self, progress: Progress | None) -> None:
-        self.progress: Progress = progress or (lambda _what, _share: None)
+    steps : function that is called with the words of the phase, the share that is done, and 1;
+        none for True and False.
+    """
+
+    def __init__(self, steps: Steps | bool) -> None:
+        self.steps = None if isinstance(steps, bool) else steps
         self.seconds: dict[str, float] = {}
+
+    def progress(self, what: str, share: float) -> None:
+        """Report the share that is done."""
+        if self.steps is not None:
+            self.steps(what, float(share), 1)
 
     @contextmanager
     def phase(self, name: str, words: str = "") -> Iterator[Progress]:

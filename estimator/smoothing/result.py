@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.arrays import Array, Ints
+from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     carriage,
@@ -22,14 +23,16 @@ from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
 from telerig.factors.bubble_motion import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
+from telerig.short_text import ShortText, counted, first_of
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
 
 
-@dataclass(frozen=True)
-class Smoothing:
-    """Hold what `telerig.smooth` returns.
+@dataclass(frozen=True, repr=False)
+class Smoothing(ShortText):
+    """Hold what `telerig.smooth` returns, or what `telerig.load_smoothing` reads from a folder.
 
     trajectories : table of positions and velocities of the bubbles; `docs/files.md` describes it.
     shake : table of the cameras' shake in each frame; `docs/files.md` describes it.
@@ -37,7 +40,12 @@ class Smoothing:
         from the shake; empty if this was not judged.
     summary : the rest of smoothing.json.
     model : the hyper-parameters that were used.
-    solution : the estimated states and their covariances.
+    states : the estimated states of the bubbles, one row for each row of ``trajectories``, and of
+        the shake, one row for each frame, with their covariances and with the rows that give
+        positions and velocities from them: the group "states" of results.h5. Empty if a folder has
+        no results.h5.
+    solution : the solution of the graph; None if the smoothing was read from a folder.
+    name : name of the run; "" if it is not known.
     """
 
     trajectories: pd.DataFrame
@@ -45,7 +53,68 @@ class Smoothing:
     verdict: Mapping[str, Any]
     summary: Mapping[str, Any]
     model: ShakeModel
-    solution: Solution = field(repr=False)
+    states: Mapping[str, Array] = field(default_factory=dict)
+    solution: Solution | None = None
+    name: str = ""
+
+    def title(self) -> str:
+        """Return the name of the run and the verdict."""
+        flags = ", ".join(self.verdict.get("flags", ()))
+        words = str(self.verdict.get("verdict", "not judged")) + (f" ({flags})" if flags else "")
+        return f"Smoothing{self.name and f' of run {self.name!r}'}: {words}"
+
+    def facts(self) -> dict[str, str]:
+        """Return the size, the verdict along each axis, the accuracy and the warnings, in words."""
+        table, axes = self.trajectories, self.verdict.get("axes", {})
+        bubbles = counted(int(table["particle"].nunique()), "bubble")
+        facts = {"bubbles": f"{bubbles} in {counted(len(self.shake), 'frame')}"}
+        facts["axes"] = ", ".join(f"{name} {axis['verdict']}" for name, axis in axes.items())
+        for name, pattern, factor, unit in (
+            ("position sd", "s{}_mm", 1e3, "um"), ("velocity sd", "sv{}_mm_s", 1.0, "mm/s")
+        ):  # fmt: skip
+            columns = [pattern.format(axis) for axis in AXES]
+            if len(table) and set(columns) <= set(table):
+                x, y, z = factor * table[columns].median()
+                facts[name] = f"x {x:.3g}, y {y:.3g}, z {z:.3g} {unit} (median)"
+        facts["remedy"] = str(self.verdict.get("remedy", ""))
+        facts["warnings"] = first_of(list(self.summary.get("warnings", ())))
+        return facts
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return ``trajectories`` indexed by particle and frame: ``.loc[3]`` is one bubble."""
+        return self.trajectories.set_index(["particle", "frame"]).sort_index()
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the trajectories as an `xarray.Dataset` with the names and units of the CF
+        conventions.
+
+        Its dimension ``obs`` has the rows of ``trajectories``, sorted by particle and frame;
+        ``trajectory`` has the bubbles, with the number of their rows in ``rowSize``.
+        ``covariance`` (obs, axis, axis_of) in mm^2 is missing if there are no states. Raises
+        InputError if xarray is not installed.
+        """
+        from telerig.io.exchange.export.netcdf import to_xarray
+        from telerig.io.exchange.export.run_results import LAB, RunResults
+
+        verdict = self.title().partition(": ")[2]
+        results = RunResults(self.name, LAB, self.trajectories, self.shake, verdict, "smoothed")
+        return to_xarray(results, self.covariance_mm2())
+
+    def covariance_mm2(self) -> Array | None:
+        """Return the covariances (N, 3, 3) in mm^2 of the N positions of ``trajectories``.
+
+        The correlations are those of the states; what the encoder's scale, the travel axis and
+        contradictions add to the variances is added here, too, so the diagonal has the squares of
+        sx_mm, sy_mm and sz_mm. Returns None without states or standard deviations.
+        """
+        columns = [f"s{axis}_mm" for axis in AXES]
+        if "bubble_covariance" not in self.states or not set(columns) <= set(self.trajectories):
+            return None
+        rows, covariance = self.states["bubble_position_rows"], self.states["bubble_covariance"]
+        inflation = np.asarray(self.verdict.get("inflation") or (1.0, 1.0, 1.0))
+        out = rows @ covariance @ np.swapaxes(rows, -1, -2) * np.outer(inflation, inflation)
+        out[:, range(3), range(3)] = self.trajectories[columns].to_numpy(float) ** 2
+        return np.asarray(out)
 
     def save(self, folder: str | Path) -> None:
         """Write trajectories.csv, shake.csv, smoothing.json and results.h5 (HDF5) into a folder.
@@ -211,6 +280,58 @@ def _with_sd(names: list[str], values: Array, covariance: Array | None) -> dict[
     return out
 
 
+def states_of(solution: Solution) -> dict[str, Array]:
+    """Return the ``states`` of a `Smoothing`."""
+    layout, found = solution.graph, solution.covariances
+    arrays = {
+        "shake": layout.shake_at_frames(solution.state.shake),
+        "bubbles": solution.state.bubbles,
+        "shake_offset_rows": np.asarray(layout.shake.offset),
+        "bubble_position_rows": np.asarray(layout.bubble.position),
+        "bubble_velocity_rows": np.asarray(layout.bubble.velocity),
+    }
+    if found is not None:
+        arrays |= {"shake_covariance": found.shake, "bubble_covariance": found.bubbles}
+    return arrays
+
+
+def load_smoothing(folder: str | Path) -> Smoothing:
+    """Read the files that `telerig smooth` or `Smoothing.save` wrote into a folder.
+
+    Returns a `Smoothing` without ``solution``; its name is that of the folder. Without results.h5,
+    ``states`` is empty.
+    Raises InputError when trajectories.csv, shake.csv or smoothing.json is missing, when a file
+    cannot be read, or when the files belong to different results.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    from telerig.io.files.csv_table import read_table
+    from telerig.io.files.hdf5 import read_arrays
+    from telerig.io.results.manifest import reading
+    from telerig.io.results.smoothing import TRAJECTORIES, SmoothingFile, shake_columns
+
+    place = Path(folder)
+    names = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
+    with reading(place, names):
+        record = SmoothingFile.read(place / "smoothing.json")
+        paths = read_table(place / names[0], TRAJECTORIES, extra=True, empty=True)
+        offsets = read_table(place / names[1], shake_columns(record.cameras), extra=True)
+        file = place / "results.h5"
+        states = read_arrays(file, "states") if file.is_file() else {}
+    content = record.content()
+    verdict = {name: content.pop(name) for name in record.VERDICT if name in content}
+    try:
+        model = TypeAdapter(ShakeModel).validate_python(content.get("model", {}))
+    except ValidationError as error:
+        raise InputError(
+            f"garbles 'model': {error.errors()[0]['msg']}",
+            where=str(place / "smoothing.json"),
+            todo=SmoothingFile.AGAIN,
+        ) from error
+    paths, offsets = paths.reset_index(drop=True), offsets.reset_index(drop=True)
+    return Smoothing(paths, offsets, verdict, content, model, states, name=place.resolve().name)
+
+
 def write_hdf5(smoothing: Smoothing, path: Path) -> None:
     """Write both tables, the states and their covariances into an HDF5 file.
 
@@ -221,25 +342,13 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
     from telerig.io.files.hdf5 import hdf5_file
     from telerig.io.results.smoothing import SmoothingFile
 
-    solution = smoothing.solution
-    layout = solution.graph
     with hdf5_file(path) as file:
         for name, table in (("trajectories", smoothing.trajectories), ("shake", smoothing.shake)):
             group = file.create_group(name)
             for column in table.columns:
                 group.create_dataset(column, data=table[column].to_numpy(), compression="gzip")
         states = file.create_group("states")
-        arrays = {
-            "shake": layout.shake_at_frames(solution.state.shake),
-            "bubbles": solution.state.bubbles,
-            "shake_offset_rows": layout.shake.offset,
-            "bubble_position_rows": layout.bubble.position,
-            "bubble_velocity_rows": layout.bubble.velocity,
-        }
-        found = solution.covariances
-        if found is not None:
-            arrays |= {"shake_covariance": found.shake, "bubble_covariance": found.bubbles}
-        for name, array in arrays.items():
+        for name, array in smoothing.states.items():
             # level 1 of shuffled bytes is three times as fast as the default, and not larger
             states.create_dataset(
                 name, data=array, compression="gzip", compression_opts=1, shuffle=True

@@ -73,10 +73,9 @@ def smooth_run(
         *window_warnings(run.rig, calibration),
         *([] if refine_rig else _moved(followed)),
     ]
-    shares = None if stage is None else lambda what, share: stage(what, float(share), 1)
     found = smooth(
-        followed, calibration, stage=run, model=model, progress=shares, refine_rig=refine_rig,
-        accept=accept,
+        followed, calibration, stage=run, model=model, progress=stage or False,
+        refine_rig=refine_rig, accept=accept,
     )  # fmt: skip
     found = replace(
         found, summary={**found.summary, "warnings": [*warnings, *found.summary["warnings"]]}

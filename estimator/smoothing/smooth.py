@@ -50,8 +50,10 @@ from telerig.estimator.smoothing.refined_pose import (
     refinement_of,
     with_wander,
 )
-from telerig.estimator.smoothing.result import Smoothing, summary_of, trajectories
+from telerig.estimator.smoothing.result import Smoothing, states_of, summary_of, trajectories
 from telerig.estimator.smoothing.result import shake as shake_table
+from telerig.progress import Progress as Steps
+from telerig.progress import showing_progress
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,6 +74,7 @@ and learning would find no shake.
 """
 
 
+@showing_progress
 def smooth(
     tracks: Any,
     calibration: Calibration,
@@ -83,7 +86,7 @@ def smooth(
     rig: RigDescription | None = None,
     t_s: ArrayLike | None = None,
     options: Options | None = None,
-    progress: Progress | None = None,
+    progress: Steps | bool = False,
     refine_rig: bool | DriftPrior = False,
     accept: Iterable[str] = (),
 ) -> Smoothing:
@@ -117,8 +120,8 @@ def smooth(
         description; then up is upwards in the first camera's image.
     t_s : (F,) times of the frames, which increase; None to take those of the tracks or of the run.
     options : settings of the solver; None for the defaults.
-    progress : function that is called with the name of the step and the share (0 to 1) that is
-        done.
+    progress : True to show a progress bar; or a function that is called with the name of the step,
+        the share that is done (0 to 1), and 1.
     refine_rig : whether to estimate also how the cameras have moved relative to each other since
         the calibration (``summary["rig_change"]``); a `DriftPrior` states how far they may have
         moved.
@@ -184,7 +187,10 @@ def smooth(
         paths = trajectories(solution, None if tracked is None else tracked.table, inflation)
         offsets = shake_table(solution, inflation)
     summary["learning"], summary["seconds"] = learned, phases.seconds
-    return Smoothing(paths, offsets, verdict, summary, chosen, solution)
+    return Smoothing(
+        paths, offsets, verdict, summary, chosen, states_of(solution), solution,
+        name=getattr(tracks, "name", ""),
+    )  # fmt: skip
 
 
 def _smoothing_words(problem: SmoothingProblem) -> str:

@@ -22,6 +22,7 @@ from numpy.random import Generator
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import pair_of_run
+from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.results_folder import run_sources, with_followed_references
 from telerig.estimator.smoothing.smooth import smooth
@@ -133,7 +134,7 @@ def validate(
                 track_of(bubble, calibration, run.t_s), calibration,
                 stage=_without(run, mark, rest), model=model, accept=accept,
             )  # fmt: skip
-            of_rise = speed_warnings(found.solution)  # marks do not rise
+            of_rise = speed_warnings(_solution(found))  # marks do not rise
             warnings += [w for w in found.summary["warnings"] if w not in of_rise]
             done.append(judged(mark, rest, found, motion, calibration.cameras))
     entries = tuple(overall(done, rest) for rest in rests)
@@ -342,6 +343,11 @@ def _without(run: RunData, mark: Seen, rest: Rest) -> RunData:
     return replace(run, references=others.reset_index(drop=True))
 
 
+def _solution(found: Smoothing) -> Solution:
+    assert found.solution is not None, "the smoothing was read from a folder"
+    return found.solution
+
+
 def judged(
     mark: Seen, rest: Rest, found: Smoothing, motion: Motion, cameras: Sequence[Camera]
 ) -> WithheldMark:
@@ -350,7 +356,7 @@ def judged(
     The place where the mark stands is not known, so the mean of the path is subtracted, which
     makes NEES of the position a little too small. The velocity has no such unknown.
     """
-    solution = found.solution
+    solution = _solution(found)
     graph, covariances = solution.graph, solution.covariances
     if covariances is None:
         raise InputError("the smoothing has no covariances", where=f"mark {mark.mark}")
@@ -397,7 +403,7 @@ def _nees(off: Array, covariance: Array) -> float:
 def _unsmoothed(mark: Seen, found: Smoothing, cameras: Sequence[Camera]) -> float:
     """RMS of the places of the pixels about their mean, in mm along the axes of each image, with
     the encoder's travel added."""
-    problem = found.solution.graph.problem
+    problem = _solution(found).graph.problem
     parts = []
     for i in mark.cameras:
         mine = mark.camera == i

@@ -41,6 +41,8 @@ from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.machine.parallel import cores
+from telerig.progress import Progress as Steps
+from telerig.progress import showing_progress
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -157,24 +159,26 @@ def _window_warnings(run: RunData, calibration: Calibration) -> list[str]:
     return window_warnings(run.rig, calibration)
 
 
+@showing_progress
 def track(
     run: RunData,
     calibration: Calibration,
     *,
     options: TrackOptions | None = None,
-    stage: Progress | None = None,
+    progress: Steps | bool = False,
 ) -> Tracks:
     """Detect the bubbles of a run, pair them across the two views, and follow them in time.
 
     run : the run as read by `telerig.io.dataset.run.load_run` or ``dataset.runs[name].load()``.
     calibration : calibration of the rig.
     options : None for the defaults.
-    stage : function that is called with the name of the step, the number done and the total; or
-        None.
+    progress : True to show a progress bar; or a function that is called with the name of the step,
+        the number done and the total.
 
     Raises InputError for recordings that cannot be used, and CalibrationError for the calibration
     of another rig.
     """
+    stage = None if isinstance(progress, bool) else progress
     with tempfile.TemporaryDirectory(prefix="telerig-") as work:
         stream = tracking_stream(run, calibration, Path(work) / "work", options, stage)
         parts = list(stream.rows)

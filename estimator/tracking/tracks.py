@@ -14,15 +14,18 @@ from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_table
 from telerig.io.results.manifest import reading, replaced_results
 from telerig.io.results.tracking import EVENTS, POINT, REFERENCES, TrackingFile
+from telerig.short_text import ShortText, counted, first_of
 
 if TYPE_CHECKING:
+    import xarray
+
     from telerig.estimator.tracking.filter import TrackEvent
 
 EVENT_COLUMNS = ["frame", "t_s", "kind", "particles", "reason"]
 
 
-@dataclass(frozen=True)
-class Tracks:
+@dataclass(frozen=True, repr=False)
+class Tracks(ShortText):
     """Hold the tracks of a run.
 
     name : name of the run.
@@ -46,6 +49,42 @@ class Tracks:
     def __len__(self) -> int:
         """Number of tracks."""
         return int(self.table["particle"].nunique())
+
+    def title(self) -> str:
+        """Return the name of the run and the number of its tracks."""
+        return f"Tracks of run {self.name!r}: {counted(len(self), 'track')}"
+
+    def facts(self) -> dict[str, str]:
+        """Return the numbers of points and detections, the events and the warnings, in words."""
+        points = counted(len(self.table), "point")
+        if len(self.table):
+            points += f" in frames {self.table['frame'].min()} to {self.table['frame'].max()}"
+        rows = self.table.groupby("particle").size()
+        kinds = self.events["kind"].value_counts()
+        return {
+            "points": f"{points} from {counted(len(self.detections), 'detection')}",
+            "length": f"{rows.median():.0f} points per track (median)" if len(rows) else "",
+            "events": ", ".join(f"{count} x {kind}" for kind, count in kinds.items()),
+            "frame": "the first camera's; travel and shake of the rig are still in it",
+            "warnings": first_of(list(self.summary.get("warnings", ()))),
+        }
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return ``table`` indexed by particle and frame, sorted: ``.loc[3]`` is one bubble."""
+        return self.table.set_index(["particle", "frame"]).sort_index()
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the tracks as an `xarray.Dataset` with the names and units of the CF conventions.
+
+        Its dimension ``obs`` has the rows of ``table``, sorted by particle and frame;
+        ``trajectory`` has the bubbles, with the number of their rows in ``rowSize``.
+        ``covariance`` is (obs, axis, axis_of) in mm^2.
+        Raises InputError if xarray is not installed.
+        """
+        from telerig.io.exchange.export.netcdf import to_xarray
+        from telerig.io.exchange.export.run_results import RIG, RunResults
+
+        return to_xarray(RunResults(self.name, RIG, self.table, source="telerig.track"))
 
     def save(self, folder: str | Path) -> None:
         """Write detections.csv, tracks.csv, events.csv and tracking.json into a folder.

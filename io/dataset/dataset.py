@@ -19,6 +19,7 @@ from telerig.io.results.record import read_object
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.rig.target import Target
+from telerig.short_text import ShortText, counted, first_of
 
 if TYPE_CHECKING:
     from telerig.io.dataset.run import RunData
@@ -60,8 +61,8 @@ class Run:
         return load_run(self.path, **options)
 
 
-@dataclass(frozen=True)
-class Dataset:
+@dataclass(frozen=True, repr=False)
+class Dataset(ShortText):
     """Hold what `load_dataset` found in a dataset folder.
 
     path : the dataset folder.
@@ -81,6 +82,27 @@ class Dataset:
     source: Source | None
     notes: list[str] = field(default_factory=list)
     table: pd.DataFrame | None = field(default=None, repr=False, compare=False)
+
+    def title(self) -> str:
+        """Return the name of the rig and the folder."""
+        return f"Dataset {self.rig.name!r} in {self.path}"
+
+    def facts(self) -> dict[str, str]:
+        """Return the cameras, the target, the views and the runs, in words."""
+        cameras = (
+            f"{c.name} {c.image_size_px[0]} x {c.image_size_px[1]} px at {c.scale_px_per_mm:g} "
+            "px/mm"
+            for c in self.rig.cameras.values()
+        )
+        dots = f"{len(self.target.ids())} dots" if self.target.bounded else "an unbounded grid"
+        views = counted(len(self.views), "view")
+        return {
+            "cameras": ", ".join(cameras),
+            "target": dots,
+            "views": views + (f", given as {self.source}" if self.source else ""),
+            "runs": ", ".join(self.runs),
+            "notes": first_of(self.notes),
+        }
 
     @property
     def target(self) -> Target:

@@ -222,6 +222,12 @@ class SmoothingFile(Record):
     MAKE: ClassVar[str] = "telerig smooth RUN"
     AGAIN: ClassVar[str] = "smooth again (`telerig smooth`), or name the right results folder"
 
+    VERDICT: ClassVar[tuple[str, ...]] = (
+        "verdict", "flags", "axes", "contradictions", "inflation", "usable_for", "words", "remedy",
+        "remedies", "vertical", "left_out", "modes",
+    )  # fmt: skip
+    """The keys that belong to the verdict, `Smoothing.verdict`; the others are the summary."""
+
     verdict: Verdict | None = None
     flags: tuple[str, ...] = ()
     axes: dict[str, AxisVerdict] = Field(default_factory=dict)
@@ -284,5 +290,5 @@ TRAJECTORIES = [
     Column("particle", "whole"),
     Column("t_s"),
     *_optional([f"{kind}{name}" for kind in ("", "s", "naive_", "rts_") for name in STATE]),
-    *_optional(["observed"]),
+    Column("observed", "whole", required=False),
 ]

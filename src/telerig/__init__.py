@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from telerig.estimator.sensors.given import AccelerometerRecord as AccelerometerRecord
     from telerig.estimator.smoothing.problem.problem import ShakeModel as ShakeModel
     from telerig.estimator.smoothing.result import Smoothing as Smoothing
+    from telerig.estimator.smoothing.result import load_smoothing as load_smoothing
     from telerig.estimator.smoothing.smooth import smooth as smooth
     from telerig.estimator.tracking.track import track as track
     from telerig.estimator.tracking.tracks import Tracks as Tracks
@@ -63,6 +64,7 @@ _WHERE = {
     "load_calibration": "telerig.estimator.calibration.result.calibration",
     "load_dataset": "telerig.io.dataset.dataset",
     "load_run": "telerig.io.dataset.run",
+    "load_smoothing": "telerig.estimator.smoothing.result",
     "load_tracks": "telerig.estimator.tracking.tracks",
     "locate_dots": "telerig.estimator.dots.locate",
     "simulate": "telerig.io.simulation.simulate",

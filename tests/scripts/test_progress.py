@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from telerig import progress
 from telerig.scripts import console
 
 
@@ -11,7 +12,7 @@ def test_lines_say_how_many_of_all_how_fast_and_how_long(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
-    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with console.progress(quiet=False) as stage:
         for done in (200, 201, 260, 1000):
             stage("detection", done, 1000)
@@ -34,7 +35,7 @@ def test_a_share_is_said_in_percent(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
-    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with console.progress(quiet=False) as stage:
         for share in (0.0, 0.16, 1.0):
             stage("smoothing 2 bubbles in 300 frames", share, 1)
@@ -47,3 +48,16 @@ def test_quiet_says_nothing_but_takes_the_time(capsys: pytest.CaptureFixture[str
     with console.progress(quiet=True) as stage:
         stage("tracks", 1, 2)
     assert capsys.readouterr().err == "" and set(stage.seconds) == {"tracks"}
+
+
+def test_a_function_shows_how_far_it_is_if_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    @progress.showing_progress
+    def work(count: int, *, progress: progress.Progress | bool = False) -> int:
+        if not isinstance(progress, bool):
+            progress("work", count, count)
+        return count
+
+    assert work(2) == 2 and capsys.readouterr().err == ""
+    assert work(3, progress=True) == 3 and capsys.readouterr().err == "work: 3 of 3\n"
+    seen: list[tuple[str, float, int]] = []
+    assert work(4, progress=lambda *step: seen.append(step)) == 4 and seen == [("work", 4, 4)]

@@ -31,13 +31,16 @@ from telerig.rig.triangulation import (
     triangulate,
     triangulate_views,
 )
+from telerig.short_text import ShortText, first_of
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from telerig.io.results.calibration import CalibrationFile, CameraRecord
 
 
-@dataclass(frozen=True)
-class Calibration:
+@dataclass(frozen=True, repr=False)
+class Calibration(ShortText):
     """Hold a calibrated rig. The rig frame is the first camera's frame.
 
     cameras : the cameras, in the order of `rig.toml`.
@@ -86,6 +89,57 @@ class Calibration:
     dots: Any = None
     residuals: Any = None
 
+    def title(self) -> str:
+        """Return the name of the rig and the verdict."""
+        return f"Calibration {self.name!r}: {self.verdict.get('status', 'not judged')}"
+
+    def facts(self) -> dict[str, str]:
+        """Return the cameras' scales, the residual and the accuracy in space, in words."""
+        s = self.statistics
+        scales = []
+        for camera in self.cameras:
+            name = f"{camera.name}.scale_px_per_mm"
+            sd = f" +- {self.sd(name):.2g}" if name in self.covariance_names else ""
+            scales.append(f"{camera.name} {camera['scale_px_per_mm']:.6g}{sd} px/mm")
+        facts = {"cameras": ", ".join(scales)}
+        if "views" in s:
+            facts["views"] = (
+                f"{s['views']}, {s['dots_kept']} of {s['dots_measured']} dots kept, "
+                f"residual {s['rms_px']:.4f} px RMS per coordinate"
+            )
+        if "axes_angle_deg" in s:
+            facts["angle"] = (
+                f"{s['axes_angle_deg']:.4f} +- {s['axes_angle_sd_deg']:.2g} degrees between the "
+                "axes"
+            )
+        if "space_sd_um" in s:
+            facts["a point"] = (
+                f"triangulated from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um "
+                "per axis"
+            )
+        facts["medium"] = self.medium if self.medium != "air" else ""
+        facts["reasons"] = first_of([str(r) for r in self.verdict.get("reasons", ())])
+        return facts
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the parameters of the rig block as a table.
+
+        Its index is the name of the parameter, which ends in its unit. The columns are the
+        estimated value, NaN for the small motion of a camera's pose, and the standard deviation
+        ``sd``, 0 for a parameter that was held fixed. The errors are correlated: ``covariance``
+        has all of them.
+        """
+        import pandas as pd
+
+        rows = {}
+        for index, camera in enumerate(self.cameras):
+            values = {p: camera[p] for p in PARAMETERS}
+            values |= dict.fromkeys(POSE_COMPONENTS, np.nan) if index else {}
+            for parameter, value in values.items():
+                name = f"{camera.name}.{parameter}"
+                rows[name] = (float(value), self.sd(name))
+        return pd.DataFrame.from_dict(rows, orient="index", columns=["value", "sd"])
+
     def camera(self, camera: str | int) -> Camera:
         """Return one camera.
 
@@ -127,6 +181,40 @@ class Calibration:
         camera has a refractive window, these are the rays in the water behind it.
         """
         return self.camera(camera).unproject(uv_px)
+
+    def undistort_image(self, camera: str | int, image: NDArray[Any]) -> NDArray[Any]:
+        """Return the image that the camera would have taken with a lens free of distortion.
+
+        camera : its name or index.
+        image : (height, width) or (height, width, channels) of uint8, uint16 or floats.
+
+        Returns an array of the same shape and type, which belongs to the camera
+        ``calibration.camera(camera).undistorted()``; pixels that the camera did not see are 0. Each
+        pixel is interpolated by a cubic from 4 x 4 others, so the noise of neighbours is
+        correlated. Measure dots and bubbles in the original image: all functions of telerig include
+        the distortion.
+        Raises InputError for an image of another size or type.
+        """
+        import cv2
+
+        lens = self.camera(camera)
+        width, height = lens.image_size_px
+        pixels = np.asarray(image)
+        if pixels.shape[:2] != (height, width) or pixels.ndim not in (2, 3):
+            raise InputError(
+                f"the image has the shape {pixels.shape}",
+                where=f"Calibration.undistort_image, camera {lens.name}",
+                todo=f"give the (height, width) that was calibrated, ({height}, {width})",
+            )
+        if pixels.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+            raise InputError(
+                f"the image has the type {pixels.dtype}",
+                where=f"Calibration.undistort_image, camera {lens.name}",
+                todo="convert it to uint8, uint16 or floats",
+            )
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
+        source = lens.distorted_pixel(grid).astype(np.float32)
+        return np.asarray(cv2.remap(pixels, source[..., 0], source[..., 1], cv2.INTER_CUBIC))
 
     def project_covariance(self, camera: str | int, points_mm: ArrayLike) -> Array:
         """Return the covariance of projected points that the calibration's errors cause.

@@ -2,21 +2,26 @@
 
 CF-1.8, section 9.3.3 and appendix H.4.3. The file is NetCDF-3 with 64-bit offsets, which SciPy
 writes without a further dependency and every NetCDF program reads. It has no compression, and whole
-numbers of 32 bits only.
+numbers of 32 bits only. `to_xarray` gives the same content in memory.
 """
 
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import RunResults, facts, numbered, unit_of
 from telerig.io.files.atomic import atomic_path
+
+if TYPE_CHECKING:
+    import xarray
 
 _LARGEST = np.iinfo(np.int32).max
 _NAMES = {"t_s": "time", "x_mm": "x", "y_mm": "y", "z_mm": "z"}
@@ -30,43 +35,107 @@ _WORDS = {
 }
 
 
-def write_netcdf(results: RunResults, path: str | PathLike[str]) -> None:
-    """Write a run's trajectories to a NetCDF-3 file.
+@dataclass(frozen=True)
+class Variable:
+    """Hold a variable: the names of its dimensions, its values, and its attributes."""
 
-    Its dimensions are ``trajectory`` and ``obs`` (the rows); ``rowSize`` gives each trajectory's
-    number of rows. Variables have the names of the table's columns, except time, x, y, z. Text is
-    stored as characters of fixed width.
+    dimensions: tuple[str, ...]
+    values: NDArray[Any]
+    attributes: dict[str, Any]
+
+
+def variables(results: RunResults) -> dict[str, Variable]:
+    """Return the variables of a run, by name.
+
+    Their dimensions are ``trajectory`` and ``obs`` (the rows); ``rowSize`` gives each trajectory's
+    number of rows. Variables have the names of the table's columns, except time, x, y, z.
+    """
+    points = results.points
+    numbers, names = numbered(points)
+    starts = np.flatnonzero(np.r_[True, np.diff(numbers) != 0][: len(numbers)])
+    sizes = np.diff(np.append(starts, len(points)))
+    identity = {"cf_role": "trajectory_id", "long_name": "particle"}
+    out = {"trajectory": Variable(("trajectory",), numbers[starts], identity)}
+    if names:
+        out["particle_name"] = Variable(("trajectory",), np.array(names, object), {})
+    counted = {"long_name": "rows of this trajectory", "sample_dimension": "obs"}
+    out["rowSize"] = Variable(("trajectory",), sizes, counted)
+    for column in points.columns:
+        if column != "particle":
+            values = points[column].to_numpy()
+            out[_NAMES.get(column, column)] = Variable(("obs",), values, _attributes(column))
+    return out
+
+
+def _global_attributes(results: RunResults) -> dict[str, str]:
+    return {
+        "Conventions": "CF-1.8",
+        "featureType": "trajectory",
+        "title": f"Bubble trajectories of run {results.name}",
+        **facts(results),
+    }
+
+
+def write_netcdf(results: RunResults, path: str | PathLike[str]) -> None:
+    """Write a run's trajectories, the `variables`, to a NetCDF-3 file.
+
+    Text is stored as characters of fixed width.
     Raises InputError for whole numbers beyond 32 bits, and when the file cannot be written.
     """
     from scipy.io import netcdf_file
 
-    points = results.points
-    numbers, names = numbered(points)
-    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
-    memory = io.BytesIO()
+    memory, content = io.BytesIO(), variables(results)
     with netcdf_file(memory, "w", version=2) as handle:
         file: Any = handle
-        file.Conventions, file.featureType = "CF-1.8", "trajectory"
-        file.title = f"Bubble trajectories of run {results.name}"
-        for key, value in facts(results).items():
+        for key, value in _global_attributes(results).items():
             setattr(file, key, value)
-        file.createDimension("trajectory", len(starts))
-        file.createDimension("obs", len(points))
-        identity = {"cf_role": "trajectory_id", "long_name": "particle"}
-        _put(file, "trajectory", ("trajectory",), numbers[starts], identity)
-        if names:
-            _put(file, "particle_name", ("trajectory",), np.array(names, object), {})
-        sizes = np.diff(np.append(starts, len(points)))
-        counted = {"long_name": "rows of this trajectory", "sample_dimension": "obs"}
-        _put(file, "rowSize", ("trajectory",), sizes, counted)
-        for column in points.columns:
-            if column != "particle":
-                values = points[column].to_numpy()
-                _put(file, _NAMES.get(column, column), ("obs",), values, _attributes(column))
+        file.createDimension("trajectory", len(content["trajectory"].values))
+        file.createDimension("obs", len(results.points))
+        for name, one in content.items():
+            _put(file, name, one.dimensions, one.values, dict(one.attributes))
         file.flush()
-        content = memory.getvalue()
+        data = memory.getvalue()
     with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(data)
+
+
+def to_xarray(results: RunResults, covariance_mm2: Array | None = None) -> xarray.Dataset:
+    """Return a run's trajectories, the `variables`, as an `xarray.Dataset`.
+
+    covariance_mm2 : (N, 3, 3) covariances of the N positions; None takes the columns sxx_mm2,
+        sxy_mm2, ... of the table, if it has them, which are then left out. They become the variable
+        ``covariance`` (obs, axis, axis_of).
+    The particle of each row is the coordinate ``particle``; the rows are sorted by particle and
+    frame.
+    Raises InputError if xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError as error:
+        todo = "pip install 'telerig[notebook]'"
+        raise InputError("xarray is not installed", where="to_xarray", todo=todo) from error
+    points = results.points.reset_index(drop=True)
+    order = points.sort_values(["particle", "frame"], kind="stable").index
+    points = points.loc[order].reset_index(drop=True)
+    columns = [f"s{'xyz'[min(i, j)]}{'xyz'[max(i, j)]}_mm2" for i in range(3) for j in range(3)]
+    covariance = covariance_mm2
+    if covariance is not None:
+        covariance = covariance[order]
+    elif set(columns) <= set(points):
+        covariance = points[columns].to_numpy(float).reshape(-1, 3, 3)
+        points = points.drop(columns=list(dict.fromkeys(columns)))
+    content = variables(replace(results, points=points))
+    if covariance is not None:
+        words = {"units": "mm2", "long_name": "covariance of the position"}
+        content["covariance"] = Variable(("obs", "axis", "axis_of"), covariance, words)
+    data = xarray.Dataset(
+        {name: (one.dimensions, one.values, one.attributes) for name, one in content.items()},
+        attrs=_global_attributes(results),
+    )
+    if covariance is not None:
+        data = data.assign_coords(axis=list("xyz"), axis_of=list("xyz"))
+    particle = ("obs", points["particle"].to_numpy(), {"long_name": "particle"})
+    return data.assign_coords(particle=particle).set_coords(["time", "x", "y", "z", "frame"])
 
 
 def _attributes(column: str) -> dict[str, Any]:

@@ -482,7 +482,7 @@ def test_two_frames_and_a_bubble_seen_once(run: Run) -> None:
     once = run.tracks.iloc[[1]].assign(particle=9)
     found = smooth(
         pd.concat([two, once]), run.calibration, stage=run.stage, rig=RIG, model=TRUE,
-        progress=lambda what, share: seen.append((what, share)),
+        progress=lambda what, share, _: seen.append((what, share)),
     )  # fmt: skip
     table = found.trajectories
     assert list(table["particle"]) == [4, 4, 9]

@@ -1,0 +1,125 @@
+"""Show how far a function or a command is."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Progress = Callable[[str, float, int], None]
+"""Called with the name of a step, the number done and the total; a share has the total 1."""
+
+
+class Steps:
+    """Show how far a command is: call it with the name of a step, the number done and the total.
+
+    A number with a point is the share that is done, of 1.
+    seconds : how long each step has taken so far, by name.
+    """
+
+    def __init__(self, show: Callable[[str, float, int, float, float], None] | None) -> None:
+        self._show = show
+        self._begun: dict[str, tuple[float, float]] = {}
+        self._now = ""
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, what: str, done: float, of: int) -> None:
+        now = time.monotonic()
+        if self._now:
+            self.seconds[self._now] = now - self._begun[self._now][0]
+        self._now = what
+        begun_s, first = self._begun.setdefault(what, (now, done))
+        self.seconds[what] = now - begun_s
+        if self._show is not None:
+            self._show(what, done, of, now - begun_s, done - first)
+
+    def words(self) -> str:
+        """Return the steps that took a second or longer, in words; "" for none."""
+        return ", ".join(f"{what} {s:.0f} s" for what, s in self.seconds.items() if s >= 1)
+
+
+def showing_progress(function: Callable[P, T]) -> Callable[P, T]:
+    """Let the argument ``progress`` of a public function be True, to show how far it is.
+
+    The function itself then gets a `Progress`; False means that nobody wants to know.
+    """
+
+    @wraps(function)
+    def showing(*arguments: P.args, **named: P.kwargs) -> T:
+        if named.get("progress") is not True:
+            return function(*arguments, **named)
+        with steps_shown() as steps:
+            named["progress"] = steps
+            return function(*arguments, **named)
+
+    return showing
+
+
+@contextmanager
+def steps_shown() -> Iterator[Steps]:
+    """Yield `Steps` that show a progress bar in a notebook and on a terminal, else plain lines."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not (console.is_jupyter or sys.stderr.isatty()):
+        yield Steps(_plain_lines())
+        return
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
+    # no refreshing thread: worker processes are copies of this one, which must have one thread
+    with Progress(*columns, console=console, transient=True, auto_refresh=False) as bar:
+        tasks: dict[str, Any] = {}
+
+        def update(what: str, done: float, of: int, seconds: float, here: float) -> None:
+            words = _how_far(done, of, seconds, here)
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=of or None, words=words)
+            bar.update(tasks[what], completed=done, words=words, refresh=True)
+
+        yield Steps(update)
+
+
+_PLAIN_S = 2.0
+
+
+def _plain_lines() -> Callable[[str, float, int, float, float], None]:
+    last: dict[str, Any] = {"time": 0.0, "what": ""}
+
+    def update(what: str, done: float, of: int, seconds: float, here: float) -> None:
+        now = time.monotonic()
+        if what != last["what"] or (of and done == of) or now - last["time"] > _PLAIN_S:
+            last.update(time=now, what=what)
+            words = _how_far(done, of, seconds, here)
+            sys.stderr.write(f"{what}: {words}\n" if words else f"{what}\n")
+            sys.stderr.flush()
+
+    return update
+
+
+def _how_far(done: float, of: int, seconds: float, here: float) -> str:
+    """Return in words how far a step is, how fast, and how long it will take.
+
+    here : how many of those that are done were done in these ``seconds``.
+    """
+    share = isinstance(done, float)
+    words = [f"{100 * done:.0f} %" if share else f"{done} of {of}" if of else f"{done or ''}"]
+    if here and seconds >= 1:
+        rate = here / seconds
+        words += [] if share else [f"{rate:.3g} a second"]
+        words.append(f"{_duration(seconds)} so far")
+        if of > done:
+            words.append(f"{_duration((of - done) / rate)} left")
+    return ", ".join(word for word in words if word)
+
+
+def _duration(seconds: float) -> str:
+    whole = round(seconds)
+    if whole < 120:
+        return f"{whole} s"
+    return f"{whole // 60} min" if whole < 7200 else f"{whole / 3600:.1f} h"

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.rig.camera import Camera
 
 TRACE_VARIANCE = {
     (3, 1): 21 / 8,
@@ -33,6 +34,8 @@ TRACE_VARIANCE = {
 
 _SAMPLES = 8
 _FLATTEST = 0.9
+_STEP_MM = 0.01
+_THINNEST = 0.05
 
 
 def third_degree(directions: Array) -> Array:
@@ -237,3 +240,56 @@ def _most_spherical(moments: Array, gram: Array) -> Array:
     constant = det1 * trace0 - 3 * trace1 * det0
     root = np.sqrt(np.maximum(linear**2 - 4 * square * constant, 0))
     return np.asarray(-2 * constant / (linear + np.copysign(root, linear)))
+
+
+def ellipsoids_from_outlines(
+    cameras: tuple[Camera, Camera], points_mm: Array, ellipses: Array
+) -> Array:
+    """Return Q (N, 3, 3) in mm^2 and rig axes of the ellipsoids x^T Q^-1 x = 1 with these outlines.
+
+    points_mm : (N, 3) centres in the rig frame.
+    ellipses : (N, 2, 3) semi-axes in px and angle in rad of each outline.
+
+    A parallel projection P maps an ellipsoid Q to the ellipse P Q P^T, so the two outlines are six
+    linear equations. They leave one number open, a shear that neither camera sees: of all that
+    fit, the body of largest volume is taken (the determinant is quadratic along that direction).
+    """
+    upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    basis = np.zeros((6, 3, 3))
+    for k, (i, j) in enumerate(upper):
+        basis[k, i, j] = basis[k, j, i] = 1.0
+    rows, targets = [], []
+    for index, camera in enumerate(cameras):
+        steps = _STEP_MM * np.eye(3)
+        plus, minus = (camera.project(points_mm[:, None] + s * steps) for s in (1, -1))
+        by_point = np.swapaxes(plus - minus, 1, 2) / (2 * _STEP_MM)
+        seen = by_point[:, None] @ basis @ np.swapaxes(by_point, 1, 2)[:, None]
+        rows.append(seen[..., [0, 0, 1], [0, 1, 1]].swapaxes(1, 2))
+        targets.append(_ellipse_matrix(ellipses[:, index])[..., [0, 0, 1], [0, 1, 1]])
+    system, target = np.concatenate(rows, 1), np.concatenate(targets, 1)
+    fitted = (np.linalg.pinv(system, rcond=1e-3) @ target[..., None])[..., 0]
+    open_direction = np.linalg.svd(system)[2][:, -1]
+    body = np.einsum("nk,kij->nij", fitted, basis)
+    return _proper(_largest(body, np.einsum("nk,kij->nij", open_direction, basis)))
+
+
+def _ellipse_matrix(ellipse: Array) -> Array:
+    cos, sin = np.cos(ellipse[:, 2]), np.sin(ellipse[:, 2])
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    return np.asarray(turn * ellipse[:, None, :2] ** 2 @ np.swapaxes(turn, 1, 2))
+
+
+def _largest(body: Array, direction: Array) -> Array:
+    """Return body + t direction where its determinant, a parabola in t, is largest."""
+    unit = np.trace(body, axis1=1, axis2=2)[:, None, None] / 3 * direction
+    down, here, up = (np.linalg.det(body + t * unit) for t in (-1.0, 0.0, 1.0))
+    bend = up + down - 2 * here
+    t = np.where(bend < 0, (down - up) / (2 * np.where(bend < 0, bend, -1.0)), 0.0)
+    return np.asarray(body + t[:, None, None] * unit)
+
+
+def _proper(body: Array) -> Array:
+    """Return the body with its thinnest axis limited: outlines may not fit together."""
+    squares, axes = np.linalg.eigh(body)
+    squares = np.maximum(squares, _THINNEST**2 * np.abs(squares).max(1, keepdims=True))
+    return np.asarray(axes * squares[:, None] @ np.swapaxes(axes, 1, 2))

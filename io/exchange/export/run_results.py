@@ -47,6 +47,7 @@ class RunResults:
     verdict : verdict of the smoothing with its flags; "" where the run was not smoothed.
     source : the name of the file from which ``points`` was read.
     accepted : why the results are stale, if they were read although they are.
+    folder : the results folder from which they were read; None for a run in memory.
     """
 
     name: str
@@ -56,6 +57,7 @@ class RunResults:
     verdict: str = ""
     source: str = ""
     accepted: tuple[str, ...] = ()
+    folder: Path | None = None
 
 
 def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -> RunResults:
@@ -95,6 +97,7 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
         verdict=_verdict(place / "smoothing.json") if smoothed else "",
         source=source,
         accepted=accepted,
+        folder=place,
     )
 
 

@@ -13,12 +13,12 @@ import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Picture, Progress, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.results import TrackResults, read_track_results, run_cameras
 from telerig.io.report.run.tracking.scene import thinned, track_colour
+from telerig.io.results.bodies import ellipsoids_of, spheres_of
 from telerig.io.results.manifest import reading
 from telerig.rig.camera import Camera
 
@@ -26,11 +26,8 @@ STEP_DEG = 2
 MOST_POINTS = 3_000
 MOST_BODIES = 120
 _SPACING = 1.7
-_STEP_MM = 0.01
-_THINNEST = 0.05
 _PLACE, _SD = ["x_mm", "y_mm", "z_mm"], ["sx_mm", "sy_mm", "sz_mm"]
 _VARIANCE = ["sxx_mm2", "syy_mm2", "szz_mm2"]
-_ELLIPSE = ["a_px", "b_px", "angle_rad"]
 
 DPI = 100
 """Of the pictures; all lengths below in px are at 100 dpi."""
@@ -165,16 +162,13 @@ def _bodies(
     )
     sizes = sizes[np.isfinite(sizes["d_eq_mm"].to_numpy(float))].sort_values("row")
     sizes = sizes.iloc[_apart(kept, sizes)].reset_index(drop=True)
-    radius = sizes["d_eq_mm"].to_numpy(float) / 2
-    quadrics = radius[:, None, None] ** 2 * np.eye(3)
+    quadrics = spheres_of(sizes)
     rows = sizes["row"].to_numpy(np.int64)
-    ellipses = _ellipses(folder, sizes, cameras)
-    if cameras is None or ellipses is None:
+    ellipsoids = None if cameras is None else ellipsoids_of(folder, sizes, cameras)
+    if ellipsoids is None:
         return rows, quadrics, "bubbles: spheres of equal volume"
-    seen = np.isfinite(ellipses).all((1, 2))
-    if seen.any():
-        points = sizes.loc[seen, _PLACE].to_numpy(float)
-        quadrics[seen] = ellipsoids_from_outlines(cameras, points, ellipses[seen])
+    seen = np.isfinite(ellipsoids).all((1, 2))
+    quadrics[seen] = ellipsoids[seen]
     return rows, quadrics, "bubbles: ellipsoids from both outlines"
 
 
@@ -189,80 +183,6 @@ def _apart(kept: pd.DataFrame, sizes: pd.DataFrame) -> list[int]:
         if last < 0 or particle[i] != particle[last] or far:
             chosen.append(i)
     return chosen[:: len(chosen) // MOST_BODIES + 1]
-
-
-def _ellipses(
-    folder: Path, sizes: pd.DataFrame, cameras: tuple[Camera, Camera] | None
-) -> Array | None:
-    """(B, cameras, 3) semi-axes and angle; NaN where a bubble was not seen."""
-    names = [Column(n, required=False, blank=True) for n in _ELLIPSE]
-    key = [
-        Column("frame", "whole"),
-        Column("camera", "text"),
-        Column("particle", "text", blank=True),
-    ]
-    table = read_columns(folder / "detections.csv", [*key, *names], optional=True)
-    if cameras is None or not len(table) or any(name not in table for name in _ELLIPSE):
-        return None
-    table = table[table["particle"] != ""]
-    table = table.assign(particle=table["particle"].astype(float).astype("int64"))
-    views = []
-    for camera in cameras:
-        mine = table[table["camera"] == camera.name].drop_duplicates(["frame", "particle"])
-        joined = sizes[["frame", "particle"]].merge(mine, how="left", on=["frame", "particle"])
-        views.append(joined[_ELLIPSE].to_numpy(float))
-    return np.stack(views, axis=1)
-
-
-def ellipsoids_from_outlines(
-    cameras: tuple[Camera, Camera], points_mm: Array, ellipses: Array
-) -> Array:
-    """(N, 3, 3) in rig axes, Q of x^T Q^-1 x = 1, from the outlines in two views.
-
-    points_mm : (N, 3). ellipses : (N, 2, 3) semi-axes in px and angle in rad.
-    A parallel projection P maps an ellipsoid Q to the ellipse P Q P^T, so the two outlines are six
-    linear equations. They leave one number open, a shear that neither camera sees: of all that
-    fit, the body of largest volume is taken (the determinant is quadratic along that direction).
-    """
-    upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    basis = np.zeros((6, 3, 3))
-    for k, (i, j) in enumerate(upper):
-        basis[k, i, j] = basis[k, j, i] = 1.0
-    rows, targets = [], []
-    for index, camera in enumerate(cameras):
-        steps = _STEP_MM * np.eye(3)
-        plus, minus = (camera.project(points_mm[:, None] + s * steps) for s in (1, -1))
-        by_point = np.swapaxes(plus - minus, 1, 2) / (2 * _STEP_MM)
-        seen = by_point[:, None] @ basis @ np.swapaxes(by_point, 1, 2)[:, None]
-        rows.append(seen[..., [0, 0, 1], [0, 1, 1]].swapaxes(1, 2))
-        targets.append(_ellipse_matrix(ellipses[:, index])[..., [0, 0, 1], [0, 1, 1]])
-    system, target = np.concatenate(rows, 1), np.concatenate(targets, 1)
-    fitted = (np.linalg.pinv(system, rcond=1e-3) @ target[..., None])[..., 0]
-    open_direction = np.linalg.svd(system)[2][:, -1]
-    body = np.einsum("nk,kij->nij", fitted, basis)
-    return _proper(_largest(body, np.einsum("nk,kij->nij", open_direction, basis)))
-
-
-def _ellipse_matrix(ellipse: Array) -> Array:
-    cos, sin = np.cos(ellipse[:, 2]), np.sin(ellipse[:, 2])
-    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-    return np.asarray(turn * ellipse[:, None, :2] ** 2 @ np.swapaxes(turn, 1, 2))
-
-
-def _largest(body: Array, direction: Array) -> Array:
-    """body + t direction where its determinant, a parabola in t, is largest."""
-    unit = np.trace(body, axis1=1, axis2=2)[:, None, None] / 3 * direction
-    down, here, up = (np.linalg.det(body + t * unit) for t in (-1.0, 0.0, 1.0))
-    bend = up + down - 2 * here
-    t = np.where(bend < 0, (down - up) / (2 * np.where(bend < 0, bend, -1.0)), 0.0)
-    return np.asarray(body + t[:, None, None] * unit)
-
-
-def _proper(body: Array) -> Array:
-    """Outlines that do not fit together may leave no body: the thinnest axis is limited."""
-    squares, axes = np.linalg.eigh(body)
-    squares = np.maximum(squares, _THINNEST**2 * np.abs(squares).max(1, keepdims=True))
-    return np.asarray(axes * squares[:, None] @ np.swapaxes(axes, 1, 2))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from telerig.io.report.film import path as film_path
 from telerig.io.report.film.path import (
     FilmPath,
     draw_path,
-    ellipsoids_from_outlines,
     film_axes,
     film_layout,
     project_px,
@@ -36,6 +35,7 @@ from telerig.io.report.film.path import (
 from telerig.io.report.run.tracking.results import read_track_results, run_cameras
 from telerig.io.report.run.tracking.scene import scene_widening, track_scene_json
 from telerig.io.report.run.tracking.two_rays import ray_pair, rays_of_row, two_rays, typical_row
+from telerig.rig.silhouette import ellipsoids_from_outlines
 
 BLUE = (31, 95, 168)
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
 from telerig.io.files.names import check_name
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.io.exchange.export.run_results import RunResults
@@ -220,7 +221,7 @@ def export_run(
     RUN_EXPORTS[to](results, out, cameras=cameras)
     count = results.points["particle"].nunique()
     return [
-        f"{results.name}: {len(results.points)} rows, {count} bubbles, from {results.source}",
+        f"{results.name}: {len(results.points)} rows, {counted(count, 'bubble')}, from {results.source}",
         f"frame: {results.frame}",
         f"verdict: {results.verdict or 'none: the run was tracked, but not smoothed'}",
     ]

@@ -100,11 +100,11 @@ def blocks(kind: str) -> list[str]:
 
 def test_commands_of_the_page(place: Path) -> None:
     lines = [line for block in blocks("sh") for line in block.splitlines()]
-    assert len(lines) == 9
+    assert len(lines) == 10
     said = {line: command(line) for line in lines}
     exports = place / "data" / "results" / "export"
     assert sorted(p.name for p in exports.iterdir()) == (
-        ["halcon", "opencv.yml", "rise.nc", "soloff"]
+        ["halcon", "opencv.yml", "rise", "rise.nc", "soloff"]
     )
     assert "20 terms, RMS" in said[lines[2]] and "verdict: UNRESOLVED" in said[lines[3]]
     assert loadmat("rise.mat")["trajectories"]["x_mm"][0, 0].shape == (4, 1)

@@ -219,9 +219,9 @@ def export_run(
     Raises InputError for data that the format cannot hold, and when ``out`` cannot be written.
     """
     RUN_EXPORTS[to](results, out, cameras=cameras)
-    count = results.points["particle"].nunique()
+    bubbles = counted(results.points["particle"].nunique(), "bubble")
     return [
-        f"{results.name}: {len(results.points)} rows, {counted(count, 'bubble')}, from {results.source}",
+        f"{results.name}: {len(results.points)} rows, {bubbles}, from {results.source}",
         f"frame: {results.frame}",
         f"verdict: {results.verdict or 'none: the run was tracked, but not smoothed'}",
     ]

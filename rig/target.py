@@ -131,18 +131,39 @@ class Target:
         return np.where(self.is_mark(dot), mark, self.dot_diameter_mm).astype(float)
 
     def symmetry_order(self) -> int:
-        """Return how many of the four rotations by multiples of 90 degrees leave the target
-        unchanged.
+        """Return how many rotations leave the target unchanged: of a grid those by multiples of 90
+        degrees, of listed points the largest of 6, 4, 3, 2 and 1 equal parts of a full turn.
 
-        On an unbounded grid a rotation may be combined with a shift. The result is 1 for the layout
-        "points".
+        On an unbounded grid a rotation may be combined with a shift.
         """
         if self.layout == "points":
-            return 1
+            return len(self.turns())
         return sum(self._unchanged_by(turn) for turn in QUARTER_TURNS)
 
+    def turns(self) -> list[Ints]:
+        """Return the relabellings (N,), id -> id, by the rotations about z that leave a bounded
+        target unchanged, in the order of their angles; the first is no rotation.
+        """
+        if self.layout == "points":
+            for order in (6, 4, 3, 2):
+                angles = 2 * np.pi * np.arange(order) / order
+                moved = [self._moved(np.exp(1j * angle)) for angle in angles]
+                if all(len(ids) for ids in moved):
+                    return moved
+            return [self.ids()]
+        order = self.symmetry_order()
+        grid = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
+        return [np.rot90(grid, k * (4 // order)).ravel() for k in range(order)]
+
     def mirror_images_differ(self) -> bool:
-        """Return whether the marks of a grid distinguish it from its mirror image."""
+        """Return whether the marks of a grid, or the listed points, distinguish the target from its
+        mirror image."""
+        if self.layout == "points":
+            place = self._complex_points()
+            far = int(np.argmax(np.abs(place))) if len(place) else 0
+            alike = place[np.isclose(np.abs(place), np.abs(place[far]), rtol=0.02)]
+            axes = place[far] * alike / np.abs(place[far] * alike)
+            return not any(len(self._moved(axis, mirrored=True)) for axis in axes)
         mirrored = (turn * np.array([[-1], [1]]) for turn in QUARTER_TURNS)
         return bool(self.marks) and not any(self._unchanged_by(turn) for turn in mirrored)
 
@@ -166,6 +187,26 @@ class Target:
         else:
             low = moved.min(0) - marks.min(0)
         return {*map(tuple, (moved - low).tolist())} == {*map(tuple, marks.tolist())}
+
+    def _complex_points(self) -> NDArray[np.complex128]:
+        """Return the listed points (N,) about their mean, x + iy."""
+        points = self._points()
+        return np.asarray((points - points.mean(0)) @ [1, 1j])
+
+    def _moved(self, turn: complex, *, mirrored: bool = False) -> Ints:
+        """Return the ids (N,) of the listed points at the rotated (and before it mirrored) places
+        of all points; none if a point has no other one there, or a mark no mark.
+        """
+        from scipy.spatial import cKDTree
+
+        place = self._complex_points()
+        moved = turn * (np.conj(place) if mirrored else place)
+        miss, at = cKDTree(np.stack([place.real, place.imag], -1)).query(
+            np.stack([moved.real, moved.imag], -1)
+        )
+        marked = self.is_mark(self.ids())
+        kept = np.all(miss < self.dot_diameter_mm / 4) and np.array_equal(marked[at], marked)
+        return np.asarray(at, np.int64) if kept else np.zeros(0, np.int64)
 
     def _points(self) -> Array:
         return np.zeros((0, 2)) if self.points_mm is None else np.asarray(self.points_mm, float)

@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from telerig.estimator.calibration.start.symmetric_target import turns
-
 
 def turned(scene: Any, seed: int = 0, *, images: bool = True) -> tuple[Any, Any]:
     """Every image (or every view) numbered after a random turn; and (M,) the turns."""
     rng = np.random.default_rng(seed)
-    labels, dots = turns(scene.target), scene.dots.copy()
+    labels, dots = scene.target.turns(), scene.dots.copy()
     by = ["view", "camera"] if images else ["view"]
     turn = np.zeros(len(dots), int)
     for _, group in dots.groupby(by):
@@ -27,4 +25,6 @@ def settled(calibration: Any, scene: Any, true_ids: Any) -> list[int]:
     final = calibration.dots.sort_values(columns)["dot"].to_numpy()
     order = scene.dots.sort_values(columns).index.to_numpy()
     truth = np.asarray(true_ids)[order]
-    return [k for k, label in enumerate(turns(scene.target)) if np.array_equal(label[truth], final)]
+    return [
+        k for k, label in enumerate(scene.target.turns()) if np.array_equal(label[truth], final)
+    ]

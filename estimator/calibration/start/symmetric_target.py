@@ -18,16 +18,8 @@ from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.factors.calibration import State, whitened_residuals
 from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
-from telerig.rig.target import Target
 
 TIE_DEG = 15.0
-
-
-def turns(target: Target) -> list[Ints]:
-    """Every relabelling (id -> id, as arrays over ids 0..N-1) that leaves the target unchanged."""
-    order = target.symmetry_order()
-    grid = np.arange(target.rows * target.columns).reshape(target.rows, target.columns)
-    return [np.rot90(grid, k * (4 // order)).ravel() for k in range(order)]
 
 
 def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[Problem, list[str]]:
@@ -35,7 +27,7 @@ def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[
 
     Raises CalibrationError when two numberings explain two cameras alike.
     """
-    labels = turns(problem.target)
+    labels = problem.target.turns()
     if len(problem.cameras) > 1:
         problem = _numbered_alike_in_cameras(problem, labels, nominal_rotvec_deg)
     problem, contrast = _numbered_alike_in_views(problem, labels)

@@ -1,9 +1,9 @@
 """Grow a lattice from unordered dots: which of them lie on one grid, and at which places.
 
 The dots are circles, so their median ellipse tells the foreshortening. Mapping that ellipse to a
-circle makes the grid rectangular to first order, however strong the tilt. From there the grid
-grows place by place, each predicted from the dots around it, so that perspective and distortion
-only have to be smooth.
+circle gives the grid's cell its true shape to first order, however strong the tilt. From there the
+grid grows place by place, each predicted from the dots around it, so that perspective and
+distortion only have to be smooth.
 """
 
 from __future__ import annotations
@@ -97,8 +97,34 @@ _REACH = 0.25
 _ROUGH = 0.05
 """On a true grid the median distance from the neighbours' prediction is below this fraction of the
 pitch."""
+_ANGLE_REACH = 0.55
+"""Steps are looked for within this angle (rad) of the cell's."""
 _PATCH = 60
 _SEEDS = 4
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Shape of a grid's cell, whatever its size and direction.
+
+    ratio : of the longer to the shorter pitch.
+    cosine : of the acute angle between the pitch vectors; 0 for a rectangle, 1/2 for a hexagonal
+        grid.
+    """
+
+    ratio: float
+    cosine: float
+
+    @classmethod
+    def of(cls, basis: ArrayLike) -> Cell:
+        """Return the shape of the cell that two pitch vectors (2, 2), as rows, make."""
+        one, two = np.asarray(basis, float)
+        length = np.hypot(*one), np.hypot(*two)
+        ratio = float(max(length) / min(length))
+        return cls(ratio, float(abs(one @ two) / (length[0] * length[1])))
+
+
+SQUARE = Cell(1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -109,7 +135,7 @@ class Lattice:
     places : (n, 2) integer place of each.
     basis_px : (n, 2, 2) local pitch vectors; basis_px[k, axis] is the step in (u, v).
     shape : (n, 2, 2) each dot's shape matrix in units of the local pitch vectors; for a round dot
-        of radius r on pitches p it is diag(r^2 / p1^2, r^2 / p2^2).
+        of radius r on perpendicular pitches p it is diag(r^2 / p1^2, r^2 / p2^2).
     unplaced : (m,) positions of the other dots; reasons : why, one each.
     """
 
@@ -142,11 +168,15 @@ def circle_from_ellipses(shapes_px2: ArrayLike) -> Array:
 
 
 def grow_lattice(
-    points_px: ArrayLike, shapes_px2: ArrayLike, *, pitch_ratio: float = 1.0, floor_px: float = 0.3
+    points_px: ArrayLike,
+    shapes_px2: ArrayLike,
+    *,
+    cell: Cell = SQUARE,
+    floor_px: float = 0.3,
 ) -> Lattice:
     """Find the largest grid among (N, 2) dots of shapes (N, 2, 2).
 
-    pitch_ratio : pitch_x / pitch_y of the grid; which axis is x need not be known.
+    cell : shape of the grid's cell; which axis is x need not be known.
     floor_px : dots within this distance of their place are never taken for false ones.
 
     Raises DetectionError when fewer than 6 dots lie on a common grid.
@@ -160,7 +190,7 @@ def grow_lattice(
     circle = circle_from_ellipses(shapes)
     back = np.asarray(np.linalg.inv(circle), float)
     flat = points @ circle.T
-    best = _best_growth(flat, pitch_ratio)
+    best = _best_growth(flat, cell)
     if best is not None:
         _drop_false_dots(best, back, floor_px)
     if best is None or not _is_grid(best):
@@ -172,32 +202,48 @@ def grow_lattice(
     return _lattice(best, back, shapes)
 
 
-def _best_growth(flat: Array, pitch_ratio: float) -> _Growth | None:
+def _best_growth(flat: Array, cell: Cell) -> _Growth | None:
     """Return the best of a few starts, or the first that covers nearly all dots."""
     best: _Growth | None = None
-    for basis in _bases(flat, pitch_ratio):
+    for basis in _bases(flat, cell):
         for seed in _seeds(flat, basis):
             growth = _Growth(flat, seed, basis)
             growth.grow()
-            if best is None or growth.score(pitch_ratio) > best.score(pitch_ratio):
+            if best is None or growth.score(cell) > best.score(cell):
                 best = growth
-            if best.score(pitch_ratio) > 0.85 * len(flat):
+            if best.score(cell) > 0.85 * len(flat):
                 return best
     return best
 
 
-def _bases(flat: Array, pitch_ratio: float) -> list[Array]:
-    """Return pairs of frequent perpendicular steps with the pitch ratio, likeliest first."""
-    ratio = max(pitch_ratio, 1 / pitch_ratio)
-    steps, votes = _frequent_steps(flat, min(len(flat) - 1, round(4 + 6 * ratio)))
+def _bases(flat: Array, cell: Cell) -> list[Array]:
+    """Return pairs of frequent steps that make a cell of this shape, likeliest first."""
+    steps, votes = _frequent_steps(flat, min(len(flat) - 1, round(4 + 6 * cell.ratio)))
     length = np.linalg.norm(steps, axis=1)
     one, two = np.triu_indices(len(steps), 1)
     area = np.abs(steps[one, 0] * steps[two, 1] - steps[one, 1] * steps[two, 0])
-    aspect = np.abs(np.abs(np.log(length[one] / length[two])) - np.log(ratio))
-    good = (area > 0.85 * length[one] * length[two]) & (aspect < 0.3)
+    angle = np.arcsin(np.clip(area / (length[one] * length[two]), 0, 1))
+    aspect = np.abs(np.abs(np.log(length[one] / length[two])) - np.log(cell.ratio))
+    good = (np.abs(angle - np.arccos(cell.cosine)) < _ANGLE_REACH) & (aspect < 0.3)
     score = np.sqrt(votes[one] * votes[two]) * good
     kept = np.flatnonzero((score > 0) & (score >= 0.4 * score.max(initial=0)))
     return [steps[[one[k], two[k]]] for k in kept[np.argsort(area[kept])][:6]]
+
+
+def frequent_cell(points: Array) -> Array | None:
+    """Return the two shortest frequent steps (2, 2) between near ones of N points (N, 2), as rows;
+    None if there is only one direction.
+    """
+    if len(points) < MIN_DOTS:
+        return None
+    steps, votes = _frequent_steps(points, min(len(points) - 1, 12))
+    steps = steps[votes > 0.4 * votes.max(initial=0)]
+    steps = steps[np.argsort(np.linalg.norm(steps, axis=1))]
+    if not len(steps):
+        return None
+    length = np.linalg.norm(steps, axis=1) * np.hypot(*steps[0])
+    aside = np.abs(steps[:, 0] * steps[0, 1] - steps[:, 1] * steps[0, 0]) > 0.3 * length
+    return steps[[0, int(np.argmax(aside))]] if aside.any() else None
 
 
 def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
@@ -252,16 +298,15 @@ class _Growth:
     def placed(self) -> Bools:
         return np.asarray(self.place[:, 0] >= 0)
 
-    def score(self, pitch_ratio: float) -> float:
+    def score(self, cell: Cell) -> float:
         """Return the number of dots on the grid, reduced for gaps and for a ragged outline."""
         dots = np.flatnonzero(self.placed())
         i, j = self.place[dots].T
         runs = (self.at[i + 1, j] >= 0).sum() + (self.at[i, j + 1] >= 0).sum()
         full = min(1.0, 0.5 + float(runs) / (2 * len(dots)))
-        one, two = np.median(self.basis[dots], axis=0)
-        length = np.hypot(*one), np.hypot(*two)
-        skew = abs(one @ two) / (length[0] * length[1])
-        stretch = abs(abs(np.log(length[0] / length[1])) - abs(np.log(pitch_ratio)))
+        seen = Cell.of(np.median(self.basis[dots], axis=0))
+        skew = abs(seen.cosine - cell.cosine)
+        stretch = abs(np.log(seen.ratio) - np.log(cell.ratio))
         return len(dots) * full * float(np.exp(-((skew / 0.3) ** 2) - (stretch / 0.3) ** 2))
 
     def grow(self) -> None:

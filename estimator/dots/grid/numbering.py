@@ -7,37 +7,32 @@ not impossible, so the evidence of each place is bounded on both sides. Where th
 suffice, the numbering is marked as ambiguous and lists all candidates: a wrong number would spoil a
 calibration, a missing image hardly matters.
 
-A target of arbitrary points has no lattice; `match_points` numbers it by the arrangement of the
-dots alone. Their ellipses give the foreshortening. With it removed, triangles of neighbouring dots
-look as they do on the target, up to rotation, mirroring and perspective. Pairs of triangles with
-equal sides propose maps from the target to the image; the map that explains most dots is the best.
+Listed points that lie on a lattice, such as a hexagonal grid, are numbered in the same way; other
+points by `match_points`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import combinations, permutations
-from typing import Any
+from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import DetectionError, InputError
+from telerig.estimator.dots.grid.arrangement import match_points
 from telerig.estimator.dots.grid.lattice import (
     MIN_DOTS,
+    Cell,
     Lattice,
-    apply_homography,
-    circle_from_ellipses,
-    fit_affine,
-    fit_homography,
+    frequent_cell,
     grow_lattice,
     shape_matrix,
 )
-from telerig.rig.target import QUARTER_TURNS, Target
+from telerig.rig.target import Target
 from telerig.statistics import robust_sd
 
 LOG_MISSED_MARK = -4.0
@@ -155,6 +150,80 @@ MARGIN = 4.0
 MAX_TIED = 64
 
 _MIN_ASPECT_SIGMA = 0.03
+_LEAST_LIKELY = 100.0
+_NEAR_CELL = 0.3
+"""Ways to lay the lattice on the target are tried whose cell is distorted by as much more."""
+
+
+@dataclass(frozen=True)
+class TargetLattice:
+    """The places of the target's dots on its own lattice.
+
+    cell_mm : (2, 2) pitch vectors as rows. Places of a grid are its (column, row).
+    places : (N, 2) of all dots of a bounded target, by id, also where a mark is a missing dot; None
+        for an unbounded grid.
+    marks : (K, 2) places of the marks.
+    mirrored : whether the target differs from its mirror image.
+    """
+
+    cell_mm: Array
+    places: Ints | None
+    marks: Ints
+    mirrored: bool
+
+    @classmethod
+    def of(cls, target: Target) -> TargetLattice | None:
+        """Return the target's lattice; None for listed points that lie on none."""
+        if target.layout == "points":
+            listed = np.asarray(target.points_mm, float)
+            found = listed_lattice(listed.tobytes())
+            if found is None:
+                return None
+            cell, places = found
+            marks = places[target.marks_column_row()[:, 0]]
+            return cls(cell, places, marks, target.mirror_images_differ())
+        places = np.argwhere(np.ones((target.rows, target.columns)))[:, ::-1]
+        return cls(
+            np.diag(target.pitch_mm),
+            places if target.bounded else None,
+            target.marks_column_row(),
+            target.mirror_images_differ(),
+        )
+
+    def ids(self, places: Ints, target: Target) -> Ints:
+        """Return the dot ids (...) at places (..., 2), -1 where the target has no dot."""
+        if self.places is None:
+            ids = target.id_from_row_column(places[..., 1], places[..., 0])
+        else:
+            low, high = self.places.min(0), self.places.max(0)
+            table = np.full(high - low + 1, -1)
+            table[tuple((self.places - low).T)] = np.arange(len(self.places))
+            inside = np.all((places >= low) & (places <= high), axis=-1)
+            at = np.clip(places, low, high) - low
+            ids = np.where(inside, table[at[..., 0], at[..., 1]], -1)
+        if target.mark_style == "missing":
+            ids = np.where(target.is_mark(ids), -1, ids)
+        return np.asarray(ids)
+
+
+@lru_cache(maxsize=8)
+def listed_lattice(points_mm: bytes) -> tuple[Array, Ints] | None:
+    """Return the cell (2, 2) and the places (N, 2) of N listed points if all lie on one lattice.
+
+    points_mm : the bytes of (N, 2) positions.
+    """
+    points = np.frombuffer(points_mm).reshape(-1, 2)
+    cell = frequent_cell(points)
+    if cell is None:
+        return None
+    try:
+        round_dots = np.broadcast_to(np.eye(2), (len(points), 2, 2))
+        found = grow_lattice(points, round_dots, cell=Cell.of(cell))
+    except DetectionError:
+        return None
+    if len(found.index) < len(points):
+        return None
+    return np.median(found.basis_px, axis=0), found.places[np.argsort(found.index)]
 
 
 @dataclass(frozen=True)
@@ -180,28 +249,30 @@ class Placements:
     def places(self, columns_rows: Ints) -> Ints:
         """(K, m, 2) places of (m, 2) columns and rows: the inverse of `columns_rows`."""
         shifted = columns_rows + self.shift[:, None]
-        return np.asarray(np.einsum("kba,knb->kna", self.turn, shifted))
+        return np.asarray(np.einsum("kab,knb->kna", inverse_of(self.turn), shifted))
 
     def take(self, which: Ints) -> Placements:
         return Placements(self.turn[which], self.shift[which], self.score[which])
 
 
-def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: Target) -> Placements:
+def inverse_of(turn: Ints) -> Ints:
+    """Return the inverse of integer matrices (..., 2, 2) of determinant 1 or -1."""
+    return np.asarray(np.rint(np.linalg.inv(turn)), np.int64)
+
+
+def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: TargetLattice) -> Placements:
     """Return all placements within `MARGIN` of the best, best first, unmirrored before mirrored.
 
-    Mirrored images are considered where the target's marks tell them apart.
+    Mirrored images are considered where the target tells them apart.
 
     Raises DetectionError when the image shows none of the marks that an unbounded grid needs,
     InputError when an unbounded grid has no marks.
     """
-    hands = (1, -1) if target.mirror_images_differ() else (1,)
-    turns = [turn * np.array([[hand], [1]]) for hand in hands for turn in QUARTER_TURNS]
-    aspect = _aspect_score(lattice, target)
+    turns, fit = _turns(lattice, target)
     parts = []
-    for turn in turns:
+    for turn, score_of_turn in zip(turns, fit):
         shifts, score = _shifts(lattice, evidence, target, turn)
-        score = score + aspect[int(turn[0, 0] == 0)]
-        parts.append((np.broadcast_to(turn, (len(shifts), 2, 2)), shifts, score))
+        parts.append((np.broadcast_to(turn, (len(shifts), 2, 2)), shifts, score + score_of_turn))
     every = Placements(*(np.concatenate(p) for p in zip(*parts)))
     if not len(every.score):
         raise DetectionError(
@@ -213,25 +284,55 @@ def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: Target) ->
     return every.take(order[every.score[order] >= every.score[order[0]] - MARGIN])
 
 
-def _aspect_score(lattice: Lattice, target: Target) -> tuple[float, float]:
-    """Log-likelihoods, from the dots' shapes, that the lattice's first axis is x and is y."""
-    logs = 0.5 * np.log(lattice.shape[:, 1, 1] / lattice.shape[:, 0, 0])
-    middle = float(np.median(logs))
-    spread = float(robust_sd(logs - middle))
-    sigma = max(_MIN_ASPECT_SIGMA, 1.25 * spread / np.sqrt(len(logs)))
-    nominal = float(np.log(target.pitch_mm[0] / target.pitch_mm[1]))
-    along = [max(-0.5 * ((middle - s * nominal) / sigma) ** 2, -100.0) for s in (1, -1)]
-    return along[0], along[1]
+_UNIMODULAR: Ints = np.array(
+    [t for t in product((1, 0, -1), repeat=4) if abs(t[0] * t[3] - t[1] * t[2]) == 1], np.int64
+).reshape(-1, 2, 2)
+"""The maps between two lattices whose cells are nearly the same, by small whole numbers."""
+
+
+def _turns(lattice: Lattice, target: TargetLattice) -> tuple[Ints, Array]:
+    """Return the maps (T, 2, 2) from the lattice's places to the target's, unmirrored first, and
+    the log-likelihood (T,) of each by the dots' shapes.
+
+    On the target the dots are round, so that their shapes there have no strain.
+    """
+    seen = _strain(lattice.shape)
+    middle = np.median(seen, axis=0)
+    spread = max(float(robust_sd(column)) for column in (seen - middle).T)
+    sigma = max(_MIN_ASPECT_SIGMA, 1.25 * spread / np.sqrt(len(seen)))
+    size = np.linalg.norm(middle)
+    shape = np.cosh(size) * np.eye(2) + np.sinh(size) / max(size, 1e-12) * np.array(
+        [[middle[0], middle[1]], [middle[1], -middle[0]]]
+    )
+    to_mm = target.cell_mm.T @ _UNIMODULAR
+    off = np.linalg.norm(_strain(to_mm @ shape @ to_mm.mT), axis=1)
+    score = np.maximum(-0.5 * (off / sigma) ** 2, -_LEAST_LIKELY)
+    hand = np.rint(np.linalg.det(_UNIMODULAR))
+    near = off < off.min() + _NEAR_CELL
+    kept = np.concatenate(
+        [np.flatnonzero(near & (hand == side)) for side in ((1, -1) if target.mirrored else (1,))]
+    )
+    return _UNIMODULAR[kept], score[kept]
+
+
+def _strain(shape: Array) -> Array:
+    """Return the logarithm of symmetric matrices (..., 2, 2), scaled to unit determinant, as
+    (..., 2): its first and its mixed element.
+    """
+    scaled = shape / np.sqrt(np.linalg.det(shape))[..., None, None]
+    values, vectors = np.linalg.eigh(scaled)
+    logs = np.einsum("...ij,...j,...kj->...ik", vectors, np.log(values), vectors)
+    return np.stack([logs[..., 0, 0], logs[..., 0, 1]], -1)
 
 
 def _shifts(
-    lattice: Lattice, evidence: MarkEvidence, target: Target, turn: Ints
+    lattice: Lattice, evidence: MarkEvidence, target: TargetLattice, turn: Ints
 ) -> tuple[Ints, Array]:
-    if target.bounded:
-        shifts, score = _bounded_shifts(lattice.places @ turn.T, target)
-    elif target.marks:
+    if target.places is not None:
+        shifts, score = _bounded_shifts(lattice.places @ turn.T, target.places)
+    elif len(target.marks):
         seen = evidence.seen @ turn.T
-        shifts = np.unique((seen[:, None] - target.marks_column_row()).reshape(-1, 2), axis=0)
+        shifts = np.unique((seen[:, None] - target.marks).reshape(-1, 2), axis=0)
         score = np.zeros(len(shifts))
     else:
         raise InputError(
@@ -239,39 +340,37 @@ def _shifts(
             where="[target]",
             todo="state marks, or extent = 'bounded'",
         )
-    if target.marks:
-        score = score + evidence.at((target.marks_column_row() + shifts[:, None]) @ turn).sum(1)
+    if len(target.marks):
+        at = (target.marks + shifts[:, None]) @ inverse_of(turn).T
+        score = score + evidence.at(at).sum(1)
     return shifts, score
 
 
-def _bounded_shifts(turned: Ints, target: Target) -> tuple[Ints, Array]:
-    """Return the shifts (S, 2) that keep most dots on the grid, and log-likelihoods (S,)."""
-    size = np.array([target.columns, target.rows])
-    low = turned.min(0) - size + 1
-    span = turned.max(0) - low + size
-    count = np.zeros(span + 1, np.int64)
-    count[tuple((turned - low + 1).T)] = 1
-    total = count.cumsum(0).cumsum(1)
-    c, r = size
-    inside = total[c:, r:] - total[:-c, r:] - total[c:, :-r] + total[:-c, :-r]
+def _bounded_shifts(turned: Ints, places: Ints) -> tuple[Ints, Array]:
+    """Return the shifts (S, 2) that keep most dots on the target, and log-likelihoods (S,)."""
+    from scipy.signal import correlate
+
+    low = turned.min(0), places.min(0)
+    dots, target = (np.zeros(np.ptp(one, axis=0) + 1) for one in (turned, places))
+    dots[tuple((turned - low[0]).T)] = 1
+    target[tuple((places - low[1]).T)] = 1
+    inside = np.rint(correlate(dots, target)).astype(np.int64)
     outside = len(turned) - inside
     near = np.argwhere(outside <= outside.min() + 8)
-    return near + low, LOG_DOT_OUTSIDE * outside[tuple(near.T)]
+    return near - target.shape + 1 + low[0] - low[1], LOG_DOT_OUTSIDE * outside[tuple(near.T)]
 
 
-def related_by_symmetry(placements: Placements, target: Target) -> bool:
+def related_by_symmetry(placements: Placements, target: TargetLattice) -> bool:
     """Whether the placements differ only by rotations that leave the target unchanged."""
     hands = np.linalg.det(placements.turn)
     if np.any(hands != hands[0]):
         return False
-    marks = target.marks_column_row()
-    corners = np.array([[0, 0], [target.columns - 1, target.rows - 1]])
-    seen = placements.places(np.concatenate([marks, corners]))[0]
-    moved = placements.columns_rows(seen)
-    if target.bounded and np.any(np.sort(moved[:, len(marks) :], axis=1) != corners):
-        return False
-    wanted = {*map(tuple, marks.tolist())}
-    return all({*map(tuple, one[: len(marks)].tolist())} == wanted for one in moved)
+    return all(
+        {*map(tuple, one.tolist())} == {*map(tuple, kept.tolist())}
+        for kept in (target.marks, target.places)
+        if kept is not None
+        for one in placements.columns_rows(placements.places(kept)[0])
+    )
 
 
 NEEDED = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
@@ -320,14 +419,14 @@ def number_dots(dots: pd.DataFrame, target: Target) -> Numbering:
     _check_columns(dots)
     points = dots[["u_px", "v_px"]].to_numpy(float)
     shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
-    if target.layout == "points":
+    on = TargetLattice.of(target)
+    if on is None:
         return _number_points(points, shapes, target)
-    ratio = target.pitch_mm[0] / target.pitch_mm[1]
-    lattice = grow_lattice(points, shapes, pitch_ratio=ratio)
+    lattice = grow_lattice(points, shapes, cell=Cell.of(on.cell_mm))
     ring = dots["ring"].to_numpy(bool) if "ring" in dots else np.zeros(len(dots), bool)
     evidence = mark_evidence(lattice, ring[lattice.index], target)
-    ranked, ambiguous = _kept(rank_placements(lattice, evidence, target), evidence, target)
-    return _numbering(lattice, evidence, ranked, ambiguous, target)
+    ranked, ambiguous = _kept(rank_placements(lattice, evidence, on), evidence, target, on)
+    return _numbering(lattice, evidence, ranked, ambiguous, target, on)
 
 
 def _check_columns(dots: pd.DataFrame) -> None:
@@ -386,10 +485,12 @@ def _mirrored_camera(
     return None
 
 
-def _kept(ranked: Placements, evidence: MarkEvidence, target: Target) -> tuple[Placements, bool]:
+def _kept(
+    ranked: Placements, evidence: MarkEvidence, target: Target, on: TargetLattice
+) -> tuple[Placements, bool]:
     """Return the placements to keep, and whether they differ by more than a symmetry."""
     best = ranked.take(np.flatnonzero(ranked.score >= ranked.score[0] - 1e-6))
-    if len(ranked.score) == len(best.score) and related_by_symmetry(best, target):
+    if len(ranked.score) == len(best.score) and related_by_symmetry(best, on):
         return best, False
     if len(ranked.score) <= MAX_TIED and (target.marks or not target.bounded):
         return ranked, True
@@ -406,8 +507,9 @@ def _numbering(
     ranked: Placements,
     ambiguous: bool,
     target: Target,
+    on: TargetLattice,
 ) -> Numbering:
-    ids = np.stack([_ids(cr, target) for cr in ranked.columns_rows(lattice.places)])
+    ids = on.ids(ranked.columns_rows(lattice.places), target)
     on_target = ids[0] >= 0
     _check_fits(lattice, on_target, target)
     signs = np.round(np.linalg.det(ranked.turn)).astype(np.int64)
@@ -425,20 +527,8 @@ def _numbering(
         equivalents=ids[:, order],
         equivalent_handedness=signs,
         ambiguous=ambiguous,
-        marks_found=mark_ids[evidence.is_seen(ranked.places(marks)[0])],
+        marks_found=mark_ids[evidence.is_seen(ranked.places(on.marks)[0])],
     )
-
-
-def _ids(columns_rows: Ints, target: Target) -> Ints:
-    """Return the dot ids (n,), -1 where the target has no dot."""
-    column, row = columns_rows.T
-    ids = target.id_from_row_column(row, column)
-    there = np.ones(len(ids), bool)
-    if target.bounded:
-        there = (column >= 0) & (column < target.columns) & (row >= 0) & (row < target.rows)
-    if target.mark_style == "missing":
-        there &= ~target.is_mark(ids)
-    return np.where(there, ids, -1)
 
 
 def _check_fits(lattice: Lattice, on_target: Bools, target: Target) -> None:
@@ -446,9 +536,9 @@ def _check_fits(lattice: Lattice, on_target: Bools, target: Target) -> None:
     if on_target.sum() < max(MIN_DOTS, 0.75 * len(on_target)):
         raise DetectionError(
             f"a grid of {size.min()} x {size.max()} places with {len(on_target)} dots was found; "
-            f"the target's {target.rows} x {target.columns} hold only {on_target.sum()} of them",
-            todo="check [target] rows, columns and marks in rig.toml; a grid without visible ends "
-            "needs extent = 'unbounded'",
+            f"the target holds only {on_target.sum()} of them",
+            todo="check [target] rows, columns or points_mm, and marks in rig.toml; a grid without "
+            "visible ends needs extent = 'unbounded'",
         )
 
 
@@ -463,7 +553,7 @@ def _unplaced(index: Ints, reasons: list[str]) -> pd.DataFrame:
 
 
 def _number_points(points_px: Array, shapes_px2: Array, target: Target) -> Numbering:
-    """Return the numbering of a target whose layout is "points"."""
+    """Return the numbering of listed points that lie on no lattice."""
     matches = match_points(
         points_px,
         shapes_px2,
@@ -489,221 +579,3 @@ def _number_points(points_px: Array, shapes_px2: Array, target: Target) -> Numbe
         ambiguous=False,
         marks_found=np.zeros(0, np.int64),
     )
-
-
-_NEAR = 5
-_TRIANGLES = 240
-_LOCAL = 12
-_REFINED = 12
-
-
-@dataclass(frozen=True)
-class PointMatch:
-    """One assignment of the target's points to the dots.
-
-    dot : (n,) positions of the matched dots; point : (n,) the target's point of each.
-    handedness : +1, or -1 when the image is mirrored.
-    """
-
-    dot: Ints
-    point: Ints
-    handedness: int
-
-    def agrees(self, other: PointMatch) -> bool:
-        """Whether both assign the same point to more than half of the dots."""
-        ours = set(zip(self.dot.tolist(), self.point.tolist()))
-        shared = len(ours & set(zip(other.dot.tolist(), other.point.tolist())))
-        return shared > 0.5 * min(len(self.dot), len(other.dot))
-
-
-def match_points(
-    points_px: ArrayLike,
-    shapes_px2: ArrayLike,
-    points_mm: ArrayLike,
-    *,
-    dot_radius_mm: float,
-) -> list[PointMatch]:
-    """Return distinct matches of dots (M, 2), shapes (M, 2, 2), to points (N, 2), best first.
-
-    Raises DetectionError when there are fewer than 6 dots or no map explains half of them.
-    """
-    points, wanted = np.asarray(points_px, float), np.asarray(points_mm, float)
-    if len(points) < MIN_DOTS or len(wanted) < MIN_DOTS:
-        raise DetectionError(
-            f"{len(points)} dots for a target of {len(wanted)} points are too few to match",
-            todo=f"at least {MIN_DOTS} dots must be whole and sharp",
-        )
-    circle = dot_radius_mm * circle_from_ellipses(shapes_px2)
-    flat = points @ circle.T
-    matches: list[PointMatch] = []
-    for start, middle in _proposals(flat, wanted):
-        found = _extended(flat, wanted, start, middle)
-        if len(found.dot) >= MIN_DOTS and not any(found.agrees(other) for other in matches):
-            matches.append(found)
-    matches.sort(key=lambda match: -len(match.dot))
-    if not matches or len(matches[0].dot) < 0.5 * min(len(points), len(wanted)):
-        best = len(matches[0].dot) if matches else 0
-        raise DetectionError(
-            f"at most {best} of {len(points)} dots fit the target's {len(wanted)} points",
-            todo="check [target] points_mm, dot_diameter_mm and polarity in rig.toml, "
-            "and that enough of the target is in view",
-        )
-    return matches
-
-
-def _triangles(points: Array) -> Ints:
-    """Return triangles (T, 3) of each point and two near ones, without slivers or repeats."""
-    count = min(_NEAR, len(points) - 1)
-    _, near = cKDTree(points).query(points, count + 1)
-    pairs = np.array(list(combinations(range(1, count + 1), 2)))
-    corners = np.concatenate(
-        [np.repeat(near[:, :1, None], len(pairs), 1), near[:, pairs]], axis=2
-    ).reshape(-1, 3)
-    corners = np.unique(np.sort(corners, axis=1), axis=0)
-    one = points[corners[:, 1]] - points[corners[:, 0]]
-    two = points[corners[:, 2]] - points[corners[:, 0]]
-    area = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
-    longest = _sides(points, corners).max(axis=1)
-    return np.asarray(corners[area > 0.2 * longest**2])
-
-
-def _sides(points: Array, corners: Ints) -> Array:
-    """Return the sides (T, 3) opposite to the corners."""
-    p = points[corners]
-    return np.asarray(np.linalg.norm(p[:, [1, 2, 0]] - p[:, [2, 0, 1]], axis=2))
-
-
-def _signature(sides: Array) -> Array:
-    """Return the shape of each triangle (T, 3), and its size with a third of the weight."""
-    logs = np.log(sides)
-    size = logs.mean(axis=1)
-    return np.column_stack([logs[:, 0] - size, logs[:, 1] - size, size / 3])
-
-
-def _proposals(flat: Array, wanted: Array) -> list[tuple[Array, int]]:
-    """(affine map flat_from_mm, a point in its middle) of the maps that explain most dots near."""
-    ours, theirs = _triangles(flat), _triangles(wanted)
-    ours = ours[:: max(1, len(ours) // _TRIANGLES)]
-    if not len(ours) or not len(theirs):
-        return []
-    theirs = np.concatenate([theirs[:, list(order)] for order in permutations(range(3))])
-    tree = cKDTree(_signature(_sides(wanted, theirs)))
-    near: Any = tree.query_ball_point(_signature(_sides(flat, ours)), 0.12)
-    mine = np.repeat(np.arange(len(ours)), [len(n) for n in near])
-    other = np.concatenate([np.asarray(n, np.int64) for n in near])
-    if not len(mine):
-        return []
-    affine = _affine_from_triangles(wanted[theirs[other]], flat[ours[mine]])
-    corner = theirs[other][:, 0]
-    count = min(_LOCAL, len(wanted))
-    _, around = cKDTree(wanted).query(wanted, count)
-    expected = apply_homography(affine, wanted[around[corner]])
-    miss, _ = cKDTree(flat).query(expected)
-    hits = np.sum(miss < 0.25 * _spacing(flat), axis=1)
-    top = np.argsort(-hits, kind="stable")[: 40 * _REFINED]
-    return _distinct(affine[top], corner[top], wanted)
-
-
-def _distinct(affine: Array, corner: Ints, wanted: Array) -> list[tuple[Array, int]]:
-    """Return the first few different proposals; many triangles propose the same map."""
-    centre = apply_homography(affine, wanted.mean(0)[None])[:, 0]
-    reach = 0.3 * np.ptp(wanted, axis=0).max()
-    kept: list[int] = []
-    for k in range(len(affine)):
-        linear = affine[k, :2, :2]
-        if not any(
-            np.linalg.norm(centre[k] - centre[j]) < reach
-            and np.linalg.norm(linear - affine[j, :2, :2]) < 0.3 * np.linalg.norm(linear)
-            for j in kept
-        ):
-            kept.append(k)
-        if len(kept) == _REFINED:
-            break
-    return [(affine[k], int(corner[k])) for k in kept]
-
-
-def _affine_from_triangles(source: Array, target: Array) -> Array:
-    """Return the affine maps (T, 3, 3) that take corners (T, 3, 2) to corners (T, 3, 2)."""
-    ones = np.ones((*source.shape[:2], 1))
-    rows = np.linalg.solve(np.concatenate([source, ones], 2), target)
-    affine = np.zeros((len(source), 3, 3))
-    affine[:, :2], affine[:, 2, 2] = rows.mT, 1.0
-    return affine
-
-
-def _extended(flat: Array, wanted: Array, start: Array, middle: int) -> PointMatch:
-    """Return the match of a map that is refined outwards from its middle."""
-    away = np.argsort(np.sum((wanted - wanted[middle]) ** 2, axis=1))
-    count, model = min(_LOCAL, len(wanted)), _Model(start, None)
-    reach = 0.3 * _spacing(flat)
-    tree = cKDTree(flat)
-    rounds = 0
-    dot = point = np.zeros(0, np.int64)
-    while rounds < 3:
-        dot, point = _mutually_nearest(tree, flat, model.apply(wanted[away[:count]]), reach)
-        point = away[point]
-        if len(dot) < min(4, MIN_DOTS):
-            break
-        model = _fit(wanted[point], flat[dot])
-        rounds += int(count == len(wanted))
-        count = min(2 * count, len(wanted))
-    if len(dot) >= MIN_DOTS:
-        off = np.linalg.norm(flat[dot] - model.apply(wanted[point]), axis=1)
-        good = off <= max(8 * float(np.median(off)), 0.02 * _spacing(flat))
-        dot, point = dot[good], point[good]
-    return PointMatch(dot, point, model.handedness(wanted[middle]))
-
-
-def _mutually_nearest(
-    tree: cKDTree, flat: Array, expected: Array, reach: float
-) -> tuple[Ints, Ints]:
-    miss, dot = tree.query(expected)
-    _, back = cKDTree(expected).query(flat)
-    good = np.flatnonzero((miss < reach) & (back[dot] == np.arange(len(expected))))
-    return dot[good], good
-
-
-@dataclass(frozen=True)
-class _Model:
-    """A homography, and a cubic polynomial of its residuals for the lens distortion."""
-
-    homography: Array
-    cubic: Array | None
-    centre: Array | float = 0.0
-    scale: float = 1.0
-
-    def apply(self, points: Array) -> Array:
-        out = apply_homography(self.homography, points)
-        if self.cubic is not None:
-            out = out + _monomials((points - self.centre) / self.scale) @ self.cubic
-        return out
-
-    def handedness(self, point: Array) -> int:
-        """Return the sign of the homography's determinant at a point (2,)."""
-        depth = self.homography[2] @ [*point, 1.0]
-        return 1 if np.linalg.det(self.homography) * depth >= 0 else -1
-
-
-def _fit(source: Array, target: Array) -> _Model:
-    if len(source) < 8:
-        return _Model(fit_affine(source, target), None)
-    homography = fit_homography(source, target)
-    if len(source) < 30:
-        return _Model(homography, None)
-    centre, scale = source.mean(0), float(np.ptp(source, axis=0).max()) / 2
-    residual = target - apply_homography(homography, source)
-    design = _monomials((source - centre) / scale)
-    normal = design.T @ design + 1e-3 * np.eye(design.shape[1])
-    cubic = np.asarray(np.linalg.solve(normal, design.T @ residual), float)
-    return _Model(homography, cubic, centre, scale)
-
-
-def _monomials(p: Array) -> Array:
-    x, y = p[..., 0], p[..., 1]
-    return np.stack([x**0, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], -1)
-
-
-def _spacing(flat: Array) -> float:
-    """Return the median distance of nearest neighbours."""
-    near, _ = cKDTree(flat).query(flat, 2)
-    return float(np.median(near[:, 1]))

@@ -11,7 +11,7 @@ import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import DetectionError
-from telerig.estimator.dots.grid.lattice import Lattice, grow_lattice, shape_matrix
+from telerig.estimator.dots.grid.lattice import Cell, Lattice, grow_lattice, shape_matrix
 from telerig.estimator.dots.grid.numbering import gaps, relative_diameter
 from telerig.rig.target import QUARTER_TURNS, MarkStyle, Target
 from telerig.statistics import robust_sd
@@ -133,7 +133,7 @@ def _best_lattice(points: Array, shapes: Array) -> Lattice:
     failure: DetectionError | None = None
     for ratio in _RATIOS:
         try:
-            found.append(grow_lattice(points, shapes, pitch_ratio=ratio))
+            found.append(grow_lattice(points, shapes, cell=Cell(ratio, 0.0)))
         except DetectionError as error:
             failure = failure or error
             continue

@@ -13,6 +13,7 @@ from telerig.estimator.dots.grid.lattice import (
     NOT_ON_GRID,
     OFF_PLACE,
     SECOND_DOT,
+    Cell,
     Lattice,
     apply_homography,
     circle_from_ellipses,
@@ -80,7 +81,7 @@ def test_random_views_of_a_grid_with_gaps_and_dirt(ratio: float) -> None:
         points = np.concatenate([points[keep], dirt])[order]
         shapes = np.concatenate([shapes[keep], shapes[:5] * rng.uniform(0.2, 2, (5, 1, 1))])[order]
         points = points + 0.1 * rng.standard_normal(points.shape)
-        lattice = grow_lattice(points, shapes, pitch_ratio=ratio)
+        lattice = grow_lattice(points, shapes, cell=Cell(max(ratio, 1 / ratio), 0.0))
         true = order[lattice.index]
         real = true < keep.sum()
         placed = Lattice(*(getattr(lattice, f)[real] for f in ("index", "places")), *[None] * 4)  # type: ignore[arg-type]

@@ -47,6 +47,30 @@ def scattered(count: int, seed: int) -> Target:
     return Target(layout="points", points_mm=points, dot_diameter_mm=1.6)
 
 
+def staggered(
+    rows: int, columns: int, pitch_mm: tuple[float, float], holes: tuple[int, ...] = ()
+) -> Target:
+    """A grid whose odd rows are shifted by half a pitch and have one dot less."""
+    points = [
+        ((c + 0.5 * (r % 2)) * pitch_mm[0], r * pitch_mm[1])
+        for r in range(rows)
+        for c in range(columns - r % 2)
+    ]
+    listed = np.delete(np.array(points), list(holes), axis=0)
+    return Target(layout="points", points_mm=listed, dot_diameter_mm=2.4)
+
+
+def hexagon(side: int) -> Array:
+    """The points of a hexagonal grid within a regular hexagon of so many pitches of 7 mm a side."""
+    q, r = np.mgrid[-side : side + 1, -side : side + 1].reshape(2, -1)
+    inside = np.abs(q + r) <= side
+    return np.asarray(7.0 * np.stack([q + r / 2, r * np.sqrt(0.75)], -1)[inside])
+
+
+HEXAGONAL = (7.0, 7.0 * np.sqrt(0.75))
+CODED = staggered(9, 12, HEXAGONAL, holes=(40, 41, 58, 65))
+
+
 @dataclass(frozen=True)
 class View:
     """How a target is seen: random within these limits."""
@@ -165,6 +189,11 @@ def is_right(
         (replace(ENDLESS, mark_style="ring"), View(mirrored=True)),
         (replace(ENDLESS, mark_style="missing"), View(missing=0.0)),
         (scattered(40, 1), View(mirrored=True)),
+        (CODED, View()),
+        (CODED, View(mirrored=True)),
+        (staggered(9, 12, (14.0, 7.0), holes=(40, 41, 58, 65)), View(mirrored=True)),
+        (staggered(9, 12, (7.0, 9.0), holes=(40, 41, 58, 65)), View()),
+        (replace(CODED, marks=((0, 40), (0, 45), (0, 60)), mark_style="ring"), View(false=0.2)),
     ],
 )
 def test_random_views_are_numbered_right(target: Target, view: View) -> None:
@@ -190,6 +219,35 @@ def test_symmetric_targets_list_every_equivalent(rows: int, columns: int, order:
         assert sum(is_right(numbering, truth, ids) for ids in numbering.equivalents) == 1
         assert not numbering.ambiguous
         assert numbering.handedness == 1
+
+
+@pytest.mark.parametrize(
+    ("target", "order"),
+    [
+        (staggered(9, 12, HEXAGONAL), 2),
+        (staggered(11, 4, (14.0, 7.0)), 2),
+        (replace(CODED, points_mm=hexagon(4)), 6),
+    ],
+)
+def test_symmetric_hexagonal_grids_list_every_equivalent(target: Target, order: int) -> None:
+    assert target.symmetry_order() == order
+    assert not target.mirror_images_differ()
+    labels = [tuple(label) for label in target.turns()]
+    for seed in range(10):
+        dots, truth = photograph(target, View(missing=0.03), np.random.default_rng([17, seed]))
+        numbering = number_dots(dots, target)
+        assert not numbering.ambiguous
+        found = np.array(numbering.equivalents)
+        assert sum(is_right(numbering, truth, ids) for ids in found) == 1
+        assert {tuple(np.array(label)[found[0]]) for label in labels} == {*map(tuple, found)}
+
+
+def test_a_part_of_a_hexagonal_grid_without_marks_is_refused() -> None:
+    target = staggered(9, 12, HEXAGONAL)
+    dots, truth = photograph(target, View(missing=0, false=0), np.random.default_rng(3))
+    part = dots[target.nominal_mm(truth)[:, 0] < 60].reset_index(drop=True)
+    with pytest.raises(DetectionError, match="seen in part and has no marks"):
+        number_dots(part, target)
 
 
 def test_equivalents_are_the_half_turn_of_a_rectangle() -> None:

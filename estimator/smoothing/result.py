@@ -23,6 +23,7 @@ from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
 from telerig.factors.bubble_motion import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 from telerig.short_text import ShortText, counted, first_of
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ class Smoothing(ShortText):
         no results.h5.
     solution : the solution of the graph; None if the smoothing was read from a folder.
     name : name of the run; "" if it is not known.
+    bodies : table of the bubbles' sizes, aspect ratios and poles by frame, measured from their
+        outlines (`telerig.estimator.physics.bodies`); None if there are no bubbles.
     """
 
     trajectories: pd.DataFrame
@@ -56,6 +59,7 @@ class Smoothing(ShortText):
     states: Mapping[str, Array] = field(default_factory=dict)
     solution: Solution | None = None
     name: str = ""
+    bodies: pd.DataFrame | None = None
 
     def title(self) -> str:
         """Return the name of the run and the verdict."""
@@ -117,7 +121,8 @@ class Smoothing(ShortText):
         return np.asarray(out)
 
     def save(self, folder: str | Path) -> None:
-        """Write trajectories.csv, shake.csv, smoothing.json and results.h5 (HDF5) into a folder.
+        """Write trajectories.csv, shake.csv, bubbles.csv, bubble_summary.csv, smoothing.json and
+        results.h5 (HDF5) into a folder.
 
         All files appear together.
         """
@@ -134,9 +139,56 @@ class Smoothing(ShortText):
 
         write_table(self.trajectories, out / "trajectories.csv")
         write_table(self.shake, out / "shake.csv")
+        bubbles = bubble_table(self)
+        if len(bubbles):
+            write_table(bubbles, out / "bubbles.csv")
+            write_table(bubble_summary(self, bubbles), out / "bubble_summary.csv")
         file = out / "smoothing.json"
         SmoothingFile.of({**self.verdict, **self.summary}, file).write(file)
         write_hdf5(self, out / "results.h5")
+
+
+def bubble_table(smoothing: Smoothing, fluid: Any = None) -> pd.DataFrame:
+    """Return what is known of each bubble in each frame: size, shape, motion and forces.
+
+    One row for each row of ``smoothing.trajectories``; `docs/bubbles.md` describes the columns.
+    fluid : a mapping with the keys of [fluid] in rig.toml (density_kg_m3, viscosity_pa_s,
+        surface_tension_n_m, and if known velocity_mm_s, gas_density_kg_m3); None for the one of the
+        run's rig.toml. Without one the dimensionless numbers are NaN.
+
+    Raises InputError for a fluid that lacks a key or has an impossible value.
+    """
+    from telerig.estimator.physics.frames import frames_table
+
+    up, gravity, known = _surroundings(smoothing, fluid)
+    if not len(smoothing.trajectories):
+        return smoothing.trajectories
+    return frames_table(smoothing.trajectories, smoothing.bodies, up, gravity, known)
+
+
+def bubble_summary(
+    smoothing: Smoothing, bubbles: pd.DataFrame | None = None, fluid: Any = None
+) -> pd.DataFrame:
+    """Return one row per bubble: sizes, rise velocity, oscillations and forces in the mean.
+
+    bubbles : what `bubble_table` returned for the same fluid; None to compute it.
+    fluid : as for `bubble_table`. `docs/bubbles.md` describes the columns.
+    """
+    from telerig.estimator.physics.frames import liquid_of
+    from telerig.estimator.physics.summary import summary_table
+
+    up, gravity, known = _surroundings(smoothing, fluid)
+    frames = bubble_table(smoothing, fluid) if bubbles is None else bubbles
+    liquid = liquid_of(known, gravity)
+    return summary_table(frames, up, None if liquid is None else liquid[0])
+
+
+def _surroundings(smoothing: Smoothing, fluid: Any) -> tuple[Array, float, Any]:
+    """The direction up (3,), gravity in m/s^2, and the liquid: the given one or that of the run."""
+    summary = smoothing.summary
+    up = np.asarray(summary.get("up") or (0.0, -1.0, 0.0), float)
+    gravity = float(summary.get("gravity_m_s2") or STANDARD_GRAVITY_M_S2)
+    return up, gravity, (summary.get("fluid") or None) if fluid is None else fluid
 
 
 def summary_of(solution: Solution) -> dict[str, Any]:
@@ -163,6 +215,8 @@ def summary_of(solution: Solution) -> dict[str, Any]:
             n: f"along its depth, {_direction(c.camera_from_rig.rotation[2])} in rig axes"
             for n, c in zip(names, problem.cameras)
         },
+        "up": np.asarray(problem.up, float).tolist(),
+        "gravity_m_s2": float(problem.gravity_m_s2),
         "depth_axes": {n: c.camera_from_rig.rotation[2] for n, c in zip(names, problem.cameras)},
         "residuals": {
             "bubbles": _residuals(solution, 0),
@@ -307,17 +361,20 @@ def load_smoothing(folder: str | Path) -> Smoothing:
 
     from telerig.io.files.csv_table import read_table
     from telerig.io.files.hdf5 import read_arrays
+    from telerig.io.results.bubbles import BODY_COLUMNS, BUBBLES
     from telerig.io.results.manifest import reading
     from telerig.io.results.smoothing import TRAJECTORIES, SmoothingFile, shake_columns
 
     place = Path(folder)
-    names = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
+    names = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5", "bubbles.csv")
     with reading(place, names):
         record = SmoothingFile.read(place / "smoothing.json")
         paths = read_table(place / names[0], TRAJECTORIES, extra=True, empty=True)
         offsets = read_table(place / names[1], shake_columns(record.cameras), extra=True)
         file = place / "results.h5"
         states = read_arrays(file, "states") if file.is_file() else {}
+        file = place / "bubbles.csv"
+        bodies = read_table(file, BUBBLES)[BODY_COLUMNS] if file.is_file() else None
     content = record.content()
     verdict = {name: content.pop(name) for name in record.VERDICT if name in content}
     try:
@@ -329,7 +386,9 @@ def load_smoothing(folder: str | Path) -> Smoothing:
             todo=SmoothingFile.AGAIN,
         ) from error
     paths, offsets = paths.reset_index(drop=True), offsets.reset_index(drop=True)
-    return Smoothing(paths, offsets, verdict, content, model, states, name=place.resolve().name)
+    return Smoothing(
+        paths, offsets, verdict, content, model, states, name=place.resolve().name, bodies=bodies
+    )
 
 
 def write_hdf5(smoothing: Smoothing, path: Path) -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Stage = Callable[[str, float, int], None]
 """Called with the name of a step, the share that is done, and 1."""
 
-_RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "accelerometers")
+_RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "accelerometers", "fluid")
 """The tables of rig.toml on which smoothing depends."""
 _USED = ("tracks.csv", "detections.csv", "tracking.json")
 """The files of a tracked run on which smoothing depends."""
@@ -50,7 +50,7 @@ def smooth_run(
     stage: Stage | None = None,
     again: str = "",
 ) -> Smoothing:
-    """Smooth and write trajectories.csv, shake.csv, smoothing.json, results.h5, run.json, report.
+    """Smooth and write the files of `Smoothing.save`, run.json and the report.
 
     tracks : `tracks.csv`, or the folder that `telerig track` wrote.
     refine_rig, accept : see `telerig.smooth`.

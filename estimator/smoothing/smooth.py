@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -186,10 +186,18 @@ def smooth(
     with phases.phase("tables", "making the tables"):
         paths = trajectories(solution, None if tracked is None else tracked.table, inflation)
         offsets = shake_table(solution, inflation)
+        bodies = None
+        if tracked is not None:
+            from telerig.estimator.physics.bodies import bodies_table
+
+            bodies, deviations = bodies_table(tracks, problem.cameras, problem.up)
+            summary["bodies"] = asdict(deviations)
+        fluid = getattr(rig or getattr(stage, "rig", None), "fluid", None)
+        summary["fluid"] = {} if fluid is None else asdict(fluid)
     summary["learning"], summary["seconds"] = learned, phases.seconds
     return Smoothing(
         paths, offsets, verdict, summary, chosen, states_of(solution), solution,
-        name=getattr(tracks, "name", ""),
+        name=getattr(tracks, "name", ""), bodies=bodies,
     )  # fmt: skip
 
 

@@ -212,6 +212,9 @@ class SmoothingFile(Record):
     older files.
     frames, bubbles : how many were smoothed. modes : the vibrations of the rig.
     log_evidence : logarithm of the model's probability density for the data; None if not computed.
+    up, gravity_m_s2 : unit vector against gravity in rig axes, and gravity.
+    fluid : the keys of [fluid] in rig.toml; empty without one. bodies : how far the bubbles of the
+    run are from spheroids, and their outlines from ellipses. swarm : numbers per volume of liquid.
     depth_axes : by camera, unit vector (3,) in rig axes along which that camera cannot measure.
     learning : from which part of a long run the modes were learned, and how they hold elsewhere.
     seconds : wall time by phase.
@@ -249,6 +252,11 @@ class SmoothingFile(Record):
     passes: int | None = None
     states: dict[str, Any] = Field(default_factory=dict)
     unseen: dict[str, Any] = Field(default_factory=dict)
+    up: Vector3 | None = None
+    gravity_m_s2: float | None = None
+    fluid: dict[str, Any] = Field(default_factory=dict)
+    bodies: dict[str, float] = Field(default_factory=dict)
+    swarm: dict[str, Any] = Field(default_factory=dict)
     depth_axes: dict[str, Vector3] = Field(default_factory=dict)
     residuals: dict[str, PixelResiduals] = Field(default_factory=dict)
     whiteness: dict[str, Any] = Field(default_factory=dict)

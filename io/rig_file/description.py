@@ -138,6 +138,29 @@ class ReferencesDescription(Table):
 
 
 @dataclass(frozen=True)
+class FluidDescription(Table):
+    """Describe the liquid in which the bubbles rise, and their gas.
+
+    velocity_mm_s : the liquid's own velocity in the lab, along the axes of the rig frame, or one
+    number upwards; None when the file does not state it, which counts as a liquid at rest.
+    gas_density_kg_m3 : density of the gas, 0 when the file does not state it.
+    """
+
+    density_kg_m3: Annotated[Positive, Field(description="a positive number: 998.2 for water")]
+    viscosity_pa_s: Annotated[
+        Positive, Field(lt=100, description="a positive number in Pa s: 0.001 for water")
+    ]
+    surface_tension_n_m: Annotated[
+        Positive, Field(lt=5, description="a positive number in N/m: 0.0728 for water and air")
+    ]
+    velocity_mm_s: Annotated[
+        float | Vector | None,
+        Field(description="three numbers along the rig's axes, or one number upwards"),
+    ] = None
+    gas_density_kg_m3: Annotated[float, Field(ge=0, description="0 or more: 1.2 for air")] = 0.0
+
+
+@dataclass(frozen=True)
 class FieldDescription(Table):
     """Describe where in a camera's images bubbles are looked for; without both, everywhere.
 
@@ -246,6 +269,7 @@ class RigDescription:
     file does not state them, which means the first two.
     stage, references : None when the file has no such table.
     bubbles : by camera, where in its images bubbles are looked for.
+    fluid : the liquid of the tank; None when the file has no such table.
     """
 
     name: str
@@ -259,6 +283,7 @@ class RigDescription:
     walls: Mapping[str, WallDescription] = field(default_factory=dict)
     devices: Mapping[str, DeviceDescription] = field(default_factory=dict)
     bubbles: Mapping[str, FieldDescription] = field(default_factory=dict)
+    fluid: FluidDescription | None = None
 
     @property
     def first(self) -> str:

@@ -22,6 +22,7 @@ from telerig.io.rig_file.description import (
     AccelerometerDescription,
     CameraDescription,
     FieldDescription,
+    FluidDescription,
     ReferencesDescription,
     RigDescription,
     StageDescription,
@@ -38,7 +39,7 @@ from telerig.rig.target import Target
 
 TOP_LEVEL = [
     *("schema", "name", "cameras", "stereo", "target"),
-    *("stage", "accelerometers", "devices", "references", "walls", "tracking", "bubbles"),
+    *("stage", "accelerometers", "devices", "references", "walls", "tracking", "bubbles", "fluid"),
 ]
 
 _CORRECT = "correct that line: strings need quotes, each key stands once, keys follow their [table]"
@@ -50,6 +51,7 @@ _HOMES = {
     for table, kind in (
         ("accelerometers.<name>", AccelerometerDescription),
         ("walls.<camera>", WallDescription),
+        ("fluid", FluidDescription),
         ("target", TargetTable),
         ("cameras.<name>", CameraDescription),
     )
@@ -167,6 +169,7 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
     references = _references(raw, problems)
     walls = _walls(raw, cameras, problems)
     bubbles = _bubbles(raw, names, problems)
+    fluid = _fluid(raw, problems)
     devices = devices_from_tables(raw, names, problems)
     if problems or target is None:
         return None
@@ -182,6 +185,7 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
         walls=walls,
         devices=devices,
         bubbles=bubbles,
+        fluid=fluid,
     )
 
 
@@ -317,6 +321,16 @@ def _references(raw: dict[str, Any], problems: Problems) -> ReferencesDescriptio
     return read_table(
         ReferencesDescription, raw["references"], "references", problems, homes=_HOMES
     )
+
+
+def _fluid(raw: dict[str, Any], problems: Problems) -> FluidDescription | None:
+    if "fluid" not in raw:
+        return None
+    fluid = read_table(FluidDescription, raw["fluid"], "fluid", problems, homes=_HOMES)
+    if fluid is not None and fluid.gas_density_kg_m3 >= fluid.density_kg_m3:
+        what = f"is {fluid.gas_density_kg_m3:g}, not below density_kg_m3"
+        problems.add("fluid", "gas_density_kg_m3", what, "bubbles are lighter than the liquid")
+    return fluid
 
 
 def _bubbles(

@@ -29,6 +29,7 @@ _COMMENTS = {
     "axes": "rows: the sensor's x, y, z axes in rig coordinates",
     "range_m_s2": "beyond it readings are clipped",
     "clock": 'of its times: "frames", or "unknown" for a logger of its own',
+    "velocity_mm_s": "of the liquid, along the rig's axes, or one number upwards",
     "normal": "in the camera's frame",
     "indices": "camera side, glass, behind",
     "distance_mm": "of the near face on the camera's axis",
@@ -65,6 +66,8 @@ def rig_toml(rig: RigDescription) -> str:
     blocks += [
         _block(f"bubbles.{toml_key(f.camera)}", _all_fields(f)) for f in rig.bubbles.values()
     ]
+    if rig.fluid is not None:
+        blocks.append(_block("fluid", _all_fields(rig.fluid)))
     for wall in rig.walls.values():
         lines = [line for line in _all_fields(wall) if line[:2] != ("normal_sigma_deg", 0.0)]
         blocks.append(_block(f"walls.{toml_key(wall.camera)}", lines))

@@ -132,8 +132,9 @@ class SimulationConfig:
 class BubbleConfig:
     """Sizes, shapes and looks; a range is drawn from evenly, once for each bubble.
 
-    d_eq_mm : diameter of the sphere of equal volume; aspect : large over small semi-axis, the
-    small one along the path, and half of ``triaxial`` more or less between the two large ones.
+    d_eq_mm : diameter of the sphere of equal volume; aspect : large over small semi-axis, or
+    "wellek" for that of contaminated bubbles in the run's liquid (Wellek 1966); the small one along
+    the path, and half of ``triaxial`` more or less between the two large ones.
     modes_static, modes_oscillating : greatest relative amplitude of each mode of a degree
     (2, 3, 4), constant and swinging at the frequency that surface tension gives (Lamb), times
     ``tone``. spin_hz : about the small axis.
@@ -142,7 +143,7 @@ class BubbleConfig:
     """
 
     d_eq_mm: Range = (4.0, 5.0)
-    aspect: Range = (1.3, 1.6)
+    aspect: Range | Literal["wellek"] = (1.3, 1.6)
     triaxial: float = 0.06
     modes_static: Mapping[int, float] = field(default_factory=dict)
     modes_oscillating: Mapping[int, float] = field(default_factory=dict)
@@ -160,7 +161,11 @@ class BubbleConfig:
 class MotionConfig:
     """Paths of the bubbles in the lab.
 
-    path : "zigzag" and "helix" have a constant speed ``rise_mm_s`` along the path and the lateral
+    path : "forces" integrates the equation of motion in the run's liquid (`FluidConfig`): buoyancy,
+    added mass, drag, and a lift across the velocity of ``lift`` times the buoyancy, which swings at
+    ``lateral_hz`` and makes the zigzag, and of RMS ``lift_noise`` below 4 Hz. Sizes decide the
+    speed; ``rise_mm_s`` tells only how many bubbles exist and how fast the stage is.
+    "zigzag" and "helix" have a constant speed ``rise_mm_s`` along the path and the lateral
     amplitude ``lateral_mm``; "stochastic" rises at ``rise_mm_s`` in the mean, with the stochastic
     oscillations ``height_oscillation`` and ``lateral_oscillation``.
     wander_mm_s, wander_tau_s : Ornstein-Uhlenbeck velocity on every axis, added to any path.
@@ -169,7 +174,7 @@ class MotionConfig:
     are ``apart_mm`` apart ``apart_s`` later.
     """
 
-    path: Literal["zigzag", "helix", "stochastic"] = "zigzag"
+    path: Literal["zigzag", "helix", "stochastic", "forces"] = "zigzag"
     rise_mm_s: Range = (280.0, 280.0)
     lateral_mm: Range = (2.5, 3.5)
     lateral_hz: Range = (5.5, 6.5)
@@ -177,11 +182,27 @@ class MotionConfig:
     wander_tau_s: float = 0.3
     height_oscillation: Oscillation = (0.177, 12.0, 0.03)
     lateral_oscillation: Oscillation = (2.0, 6.0, 0.03)
+    lift: Range = (0.25, 0.45)
+    lift_noise: float = 0.03
     spread: tuple[float, float] = (0.15, 0.15)
     pairs: bool = False
     closest_mm: float = 0.25
     apart_mm: float = 0.3
     apart_s: float = 0.01
+
+
+@dataclass(frozen=True)
+class FluidConfig:
+    """The liquid, at rest: written into rig.toml, and what drives bubbles of the path "forces".
+
+    law : whose terminal velocity gives each bubble's drag coefficient, which depends on its size
+    alone: `telerig.rig.bubble_physics`.
+    """
+
+    density_kg_m3: float = 998.2
+    viscosity_pa_s: float = 1.0e-3
+    surface_tension_n_m: float = 0.0728
+    law: Literal["clift", "mendelson", "tomiyama"] = "clift"
 
 
 @dataclass(frozen=True)
@@ -261,7 +282,8 @@ class TableConfig:
 
     centre : what the noisy pixel is of, the silhouette's area centroid or the projected centre of
     volume. missed : share of detections left out; false_per_image : added at random places.
-    particle_ids : whether the table says which detection is which bubble.
+    particle_ids : whether the table says which detection is which bubble. noisy_axes : whether the
+    semi-axes and angles are noisy, too, as those of an outline whose centre has ``sigma_px``.
     references : marks fixed to the tank that each camera sees at a time, 0 for none.
     """
 
@@ -270,6 +292,7 @@ class TableConfig:
     missed: float = 0.0
     false_per_image: float = 0.0
     particle_ids: bool = False
+    noisy_axes: bool = False
     references: int = 0
     reference_sigma_px: float = 0.1
 
@@ -292,7 +315,10 @@ class StripConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """A run and its calibration; ``bubbles`` in view at a time; ``strip`` drawn into images."""
+    """A run and its calibration; ``bubbles`` in view at a time; ``strip`` drawn into images.
+
+    fluid : the liquid; None leaves it out of rig.toml.
+    """
 
     name: str
     calibration: SimulationConfig
@@ -305,6 +331,7 @@ class RunConfig:
     image: ImageConfig = field(default_factory=ImageConfig)
     table: TableConfig = field(default_factory=TableConfig)
     strip: StripConfig | None = None
+    fluid: FluidConfig | None = None
 
     def __post_init__(self) -> None:
         """Raises InputError for values that no run can have."""
@@ -317,7 +344,13 @@ class RunConfig:
             "blur_px": (not self.image.blur_px >= 0.2, "at least 0.2"),
             "dropped": (not 0 <= self.image.dropped < 1, "within 0 and 1"),
         }
-        values = vars(self.bubble) | vars(self.image) | vars(self)
+        driven = self.motion.path == "forces"
+        faults["fluid"] = (
+            self.fluid is None and (driven or self.bubble.aspect == "wellek"),
+            'given for the path "forces" and the aspect "wellek"',
+        )
+        faults["pairs"] = (driven and self.motion.pairs, 'False for the path "forces"')
+        values = vars(self.bubble) | vars(self.image) | vars(self.motion) | vars(self)
         _refuse(self.name, values, faults)
 
 

@@ -13,6 +13,7 @@ from telerig.errors import InputError
 from telerig.io.simulation.config import (
     BubbleConfig,
     CameraConfig,
+    FluidConfig,
     ImageConfig,
     MotionConfig,
     RunConfig,
@@ -271,6 +272,26 @@ _RUNS = (
         ),
         stage=StageConfig(ramp_s=0.0, shake_mm=0.2),
         table=TableConfig(centre="volume"),
+    ),
+    RunConfig(
+        "forces",
+        _like_paper("forces", (1280, 800), 20.0, 0.8),
+        frames=250,
+        frame_rate_hz=500.0,
+        bubbles=6,
+        bubble=BubbleConfig(
+            d_eq_mm=(1.5, 4.5), aspect="wellek", triaxial=0.04, modes_oscillating={2: 0.02}
+        ),
+        motion=MotionConfig("forces", rise_mm_s=(220.0, 260.0), spread=(0.8, 0.8)),
+        stage=StageConfig(
+            ramp_s=0.0,
+            shake_mm=0.05,
+            accelerometers=("left", "right"),
+        ),
+        table=TableConfig(
+            sigma_px=0.05, centre="volume", particle_ids=True, noisy_axes=True, references=4
+        ),
+        fluid=FluidConfig(),
     ),
     _scenario("S0", 100.0, shake_hz=12.0, shake_mm=0.2, sigma_px=1.5),
     _scenario("S1", 500.0, shake_hz=8.0, shake_mm=0.2, sigma_px=0.5),

@@ -20,6 +20,7 @@ from telerig.io.files.csv_table import write_table
 from telerig.io.rig_file.description import (
     CARRIAGE,
     AccelerometerDescription,
+    FluidDescription,
     ReferencesDescription,
     RigDescription,
     StageDescription,
@@ -90,7 +91,11 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
         marks = ReferencesDescription() if config.table.references else None
         if config.strip is not None:
             marks = ReferencesDescription(dot_diameter_mm=config.strip.diameter_mm)
-        return replace(rig, stage=stage, accelerometers=sensors, references=marks)
+        fluid = None
+        if config.fluid is not None:
+            liquid = vars(config.fluid)
+            fluid = FluidDescription(**{k: v for k, v in liquid.items() if k != "law"})
+        return replace(rig, stage=stage, accelerometers=sensors, references=marks, fluid=fluid)
 
     cameras, target = write_calibration(
         config.calibration, folder, calibration_rng, images=images, complete=complete
@@ -256,6 +261,8 @@ def _detected(
     false = int(rng.poisson(table.false_per_image))
     centre = view.centre_px if table.centre == "volume" else view.silhouette_px
     a, b, angle = (value[found] for value in view.ellipse_px())
+    if table.noisy_axes:
+        a, b, angle = _noisy_axes(a, b, angle, table.sigma_px, rng.spawn(1)[0])
     radius = rng.choice(a, false) if len(a) else np.full(false, 5.0)
     uv = np.concatenate([centre[found], rng.uniform(0, np.array(size_px) - 1.0, (false, 2))])
     uv += table.sigma_px * rng.standard_normal(uv.shape)
@@ -277,6 +284,26 @@ def _detected(
     if not table.particle_ids:
         del columns["particle"]
     return {name: values[order] for name, values in columns.items()}
+
+
+def _noisy_axes(
+    a: Array, b: Array, angle: Array, sigma_px: float, rng: Generator
+) -> tuple[Array, Array, Array]:
+    """Ellipses whose outlines have been displaced by white noise.
+
+    On the unit circle cos and sin of 2 phi have the variance of those of phi, which move the
+    centre, and the mean radius half of it.
+    """
+    noise = sigma_px / np.sqrt(a * b) * rng.standard_normal((3, len(a)))
+    grown, stretched, sheared = noise * np.array([[np.sqrt(0.5)], [1.0], [1.0]])
+    turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1)
+    axes = turn.reshape(-1, 2, 2) * np.stack([a, b], -1)[:, None]
+    change = np.stack([grown + stretched, sheared, sheared, grown - stretched], -1)
+    axes = axes @ (np.eye(2) + change.reshape(-1, 2, 2))
+    values, vectors = np.linalg.eigh(axes @ np.swapaxes(axes, -1, -2))
+    turned = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    turned = (turned + np.pi / 2) % np.pi - np.pi / 2
+    return np.sqrt(values[:, 1]), np.sqrt(values[:, 0]), turned
 
 
 def _joined(parts: list[dict[str, Any]]) -> pd.DataFrame:
@@ -304,8 +331,7 @@ def _write_truth(
         columns[f"{name}_lost"] = lost[j].astype(int)
     write_table(pd.DataFrame(columns), folder / "cameras.csv")
     population, config = scene.population, plain(scene.config)
-    if config["strip"] is None:
-        del config["strip"]
+    config = {k: v for k, v in config.items() if v is not None or k not in ("strip", "fluid")}
     write_json_atomic(
         folder / "truth.json",
         {

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from telerig.estimator.sensors.given import AccelerometerRecord as AccelerometerRecord
     from telerig.estimator.smoothing.problem.problem import ShakeModel as ShakeModel
     from telerig.estimator.smoothing.result import Smoothing as Smoothing
+    from telerig.estimator.smoothing.result import bubble_summary as bubble_summary
+    from telerig.estimator.smoothing.result import bubble_table as bubble_table
     from telerig.estimator.smoothing.result import load_smoothing as load_smoothing
     from telerig.estimator.smoothing.smooth import smooth as smooth
     from telerig.estimator.tracking.track import track as track
@@ -56,6 +58,8 @@ _WHERE = {
     "Smoothing": "telerig.estimator.smoothing.result",
     "TelerigError": "telerig.errors",
     "Triangulation": "telerig.rig.triangulation",
+    "bubble_summary": "telerig.estimator.smoothing.result",
+    "bubble_table": "telerig.estimator.smoothing.result",
     "calibrate": "telerig.estimator.calibration.calibrate",
     "Tracks": "telerig.estimator.tracking.tracks",
     "compare_calibrations": "telerig.estimator.calibration.quality.comparison",

@@ -198,7 +198,8 @@ class Outlines:
     columns are the semi-axes.  trace : (M, 6) coefficients of cos and sin of 1, 3 and 4 phi of the
     radial displacement of the unit circle (semi-axes are 1), trace_covariance : (M, 6, 6); NaN
     where no harmonics are known.  located : (M,) centre and covariance are usable; shaped : axes
-    are too; whole : harmonics are too, and no flag says that part of the outline is missing.
+    are too; entire : and no flag says that part of the outline is missing; whole : and harmonics
+    are usable.
     """
 
     uv_px: Array
@@ -208,6 +209,7 @@ class Outlines:
     trace_covariance: Array
     located: Bools
     shaped: Bools
+    entire: Bools
     whole: Bools
 
     def rows(self, keep: Bools) -> Outlines:
@@ -245,6 +247,7 @@ def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> 
         gain @ np.swapaxes(gain, -1, -2) * (sigma**2 + _FLOOR_PX2)[:, None, None],
         located,
         shaped,
+        shaped & ~blocked,
         shaped & known & ~blocked,
     )
 

@@ -176,12 +176,15 @@ class Path:
 
     height_mm, height_mm_s : (...) along the stage's axis, in mm and mm/s.
     lateral_mm, lateral_mm_s : (..., 2) perpendicular to it, in mm and mm/s.
+    height_mm_s2, lateral_mm_s2 : accelerations in mm/s^2; None where the path has none.
     """
 
     height_mm: Array
     lateral_mm: Array
     height_mm_s: Array
     lateral_mm_s: Array
+    height_mm_s2: Array | None = None
+    lateral_mm_s2: Array | None = None
 
 
 def constant_speed_path(
@@ -260,6 +263,87 @@ def stochastic_paths(
         across[:, :, POSITION],
         rise[:, None] + up[..., VELOCITY],
         across[:, :, VELOCITY],
+    )
+
+
+def added_mass_along(aspect: float) -> float:
+    """Added-mass coefficient of a spheroid along its pole, by quadrature of Lamb's integral.
+
+    gamma = a^2 c int dl / ((c^2 + l)^(3/2) (a^2 + l)) (Hydrodynamics, section 373), with l = c^2 u
+    here; the coefficient is gamma / (2 - gamma).
+    """
+    from scipy.integrate import quad
+
+    square = aspect**2
+    gamma, _ = quad(lambda u: square / ((1 + u) ** 1.5 * (square + u)), 0, np.inf)
+    return float(gamma / (2 - gamma))
+
+
+@dataclass(frozen=True)
+class Forces:
+    """What drives each of B bubbles, per mass of displaced liquid.
+
+    drag_1_mm : (B,) drag over speed^2; added_mass : (B,). lift_mm_s2, lift_hz, lift_rad : (B, K) a
+    lift that swings; lift_azimuth : (B, K, 2) unit vectors across the vertical, to one side of
+    which it acts.
+    """
+
+    drag_1_mm: Array
+    added_mass: Array
+    lift_mm_s2: Array
+    lift_hz: Array
+    lift_rad: Array
+    lift_azimuth: Array
+    gravity_mm_s2: float
+
+    def acceleration(self, t_s: float, velocity: Array) -> Array:
+        """(B, 3) in mm/s^2 at velocities (B, 3): height first, then the two lateral axes."""
+        speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
+        along = velocity / speed
+        swing = self.lift_mm_s2 * np.cos(2 * np.pi * self.lift_hz * t_s + self.lift_rad)
+        push = np.einsum("bk,bkj->bj", swing, self.lift_azimuth)
+        across = np.concatenate([np.zeros_like(speed), push], -1)
+        across = across - along * (across * along).sum(-1, keepdims=True)
+        force = across - self.drag_1_mm[:, None] * speed * velocity
+        force[:, 0] += self.gravity_mm_s2
+        return np.asarray(force / self.added_mass[:, None])
+
+
+_WARM_UP_S = 1.0
+_LONGEST_STEP_S = 5e-4
+
+
+def driven_paths(step_s: float, steps: int, forces: Forces) -> Path:
+    """Paths of bubbles under forces, by Runge-Kutta steps of order 4, once they have settled."""
+    velocity = np.zeros((len(forces.added_mass), 3))
+    velocity[:, 0] = np.sqrt(forces.gravity_mm_s2 / forces.drag_1_mm)
+    state = np.concatenate([0 * velocity, velocity], -1)
+
+    def slope(t: float, state: Array) -> Array:
+        return np.concatenate([state[:, 3:], forces.acceleration(t, state[:, 3:])], -1)
+
+    def advanced(state: Array, t: float, span_s: float) -> Array:
+        count = int(np.ceil(span_s / _LONGEST_STEP_S))
+        h = span_s / count
+        for i in range(count):
+            now = t + i * h
+            first = slope(now, state)
+            second = slope(now + h / 2, state + h / 2 * first)
+            third = slope(now + h / 2, state + h / 2 * second)
+            fourth = slope(now + h, state + h * third)
+            state = state + h / 6 * (first + 2 * second + 2 * third + fourth)
+        return state
+
+    state = advanced(state, -_WARM_UP_S, _WARM_UP_S)
+    state[:, :3] = 0.0
+    states, rates = [], []
+    for i in range(steps):
+        states.append(state)
+        rates.append(forces.acceleration(i * step_s, state[:, 3:]))
+        state = advanced(state, i * step_s, step_s)
+    place, rate = np.stack(states, 1), np.stack(rates, 1)
+    return Path(
+        place[..., 0], place[..., 1:3], place[..., 3], place[..., 4:], rate[..., 0], rate[..., 1:]
     )
 
 

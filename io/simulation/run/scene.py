@@ -16,15 +16,25 @@ from telerig.io.simulation.images.bubbles import Look
 from telerig.io.simulation.run.motion import (
     POSITION,
     VELOCITY,
+    Forces,
     Path,
     Shake,
+    added_mass_along,
     constant_speed_path,
     constant_speed_rise_mm_s,
+    driven_paths,
     mode_acceleration,
     rig_mode,
     rig_shake,
     stage_trajectory,
     stochastic_paths,
+)
+from telerig.rig.bubble_physics import (
+    Liquid,
+    clift_velocity,
+    mendelson_velocity,
+    tomiyama_velocity,
+    wellek_aspect,
 )
 from telerig.rig.camera import Camera
 
@@ -60,7 +70,8 @@ class RunScene:
     """Everything true of a run.
 
     t_s, position_mm, velocity_mm_s : (F,) at the frames; shake_mm, shake_mm_s : (C, F, 3).
-    lab_mm, lab_mm_s : (B, F, 3) centres of volume and their velocities.
+    lab_mm, lab_mm_s : (B, F, 3) centres of volume and their velocities; lab_mm_s2, drag :
+    accelerations (B, F, 3) and drag coefficients (B,) of the path "forces", otherwise None.
     closest_s : (pairs,) when each pair passes; empty without pairs.
     """
 
@@ -71,6 +82,8 @@ class RunScene:
     lab_mm: Array
     lab_mm_s: Array
     closest_s: Array
+    lab_mm_s2: Array | None = None
+    drag: Array | None = None
 
     @property
     def t_s(self) -> Array:
@@ -128,16 +141,78 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     first = config.calibration.cameras[0]
     size_mm = np.array(first.image_size_px) / first.nominal_scale_px_per_mm
     count = _bubble_count(config, position, size_mm)
-    population = random_population(config.bubble, count, shape_rng)
-    paths = _paths(config, count, path_rng)
+    population = random_population(config, count, shape_rng)
+    if config.motion.path == "forces":
+        forces, drag = _forces(config, population, path_rng)
+        paths = driven_paths(1 / config.frame_rate_hz, config.frames, forces)
+    else:
+        paths, drag = _paths(config, count, path_rng), None
     lab, velocity, closest = _lab_paths(config, paths, path_rng)
+    acceleration = None
+    if paths.height_mm_s2 is not None and paths.lateral_mm_s2 is not None:
+        acceleration = paths.height_mm_s2[..., None] * AXIS_RIG + paths.lateral_mm_s2 @ _ACROSS
     start = _starts(config, lab, position, population.d_eq_mm, size_mm, place_rng)
-    return RunScene(config, cameras, carriage, population, lab + start[:, None], velocity, closest)
+    return RunScene(
+        config, cameras, carriage, population, lab + start[:, None], velocity, closest,
+        acceleration, drag,
+    )  # fmt: skip
+
+
+def liquid(config: RunConfig) -> Liquid:
+    """The run's liquid; there must be one."""
+    fluid = config.fluid
+    assert fluid is not None, "RunConfig checks it"
+    return Liquid(
+        fluid.density_kg_m3, fluid.viscosity_pa_s, fluid.surface_tension_n_m,
+        config.stage.gravity_m_s2,
+    )  # fmt: skip
+
+
+_LAWS = {
+    "clift": clift_velocity,
+    "mendelson": mendelson_velocity,
+    "tomiyama": tomiyama_velocity,
+}
+_NOISES = 8
+_NOISE_HZ = (0.5, 4.0)
+
+
+def _forces(config: RunConfig, population: Population, rng: Generator) -> tuple[Forces, Array]:
+    """The forces on each bubble, and its drag coefficient.
+
+    Raises InputError for bubbles so small that the law does not hold.
+    """
+    motion, fluid, count = config.motion, liquid(config), len(population.d_eq_mm)
+    assert config.fluid is not None
+    d = 1e-3 * population.d_eq_mm
+    drag = fluid.terminal_drag(d, _LAWS[config.fluid.law](d, fluid))
+    if not np.isfinite(drag).all():
+        raise InputError(
+            f"bubbles of {1e3 * d[~np.isfinite(drag)].max():.2g} mm are too small for the law "
+            f"{config.fluid.law!r}",
+            where=f"simulation {config.name!r}",
+            todo="ask for larger ones, or another law",
+        )
+    gravity = 1000 * config.stage.gravity_m_s2
+    swing = gravity * rng.uniform(*motion.lift, count)[:, None]
+    noise = np.full((count, _NOISES), gravity * motion.lift_noise * np.sqrt(2 / _NOISES))
+    hertz = rng.uniform(*motion.lateral_hz, count)[:, None]
+    turn = rng.uniform(0, 2 * np.pi, (count, 1 + _NOISES))
+    azimuth = rng.uniform(0, 2 * np.pi, (count, 1 + _NOISES))
+    return Forces(
+        0.75 * drag / population.d_eq_mm,
+        np.array([added_mass_along(a) for a in population.aspect]),
+        np.concatenate([swing, noise], -1),
+        np.concatenate([hertz, rng.uniform(*_NOISE_HZ, (count, _NOISES))], -1),
+        turn,
+        np.stack([np.cos(azimuth), np.sin(azimuth)], -1),
+        gravity,
+    ), drag
 
 
 def _mean_rise(motion: MotionConfig) -> float:
     rise = float(np.mean(motion.rise_mm_s))
-    if motion.path == "stochastic":
+    if motion.path in ("stochastic", "forces"):
         return rise
     amplitude = float(np.mean(motion.lateral_mm))
     both = (amplitude, amplitude if motion.path == "helix" else 0.0)
@@ -330,12 +405,13 @@ _DENSITY_KG_M3 = 998.0
 class Population:
     """What stays the same of each of B bubbles.
 
-    d_eq_mm : (B,); semi_axes_mm : (B, 3), proportions, the third along the path.
+    d_eq_mm, aspect : (B,); semi_axes_mm : (B, 3), proportions, the third along the path.
     modes_static, modes_swing : (B, 21) relative; swing_hz, swing_rad : (B, 21).
     spin_hz, spin_rad : (B,).
     """
 
     d_eq_mm: Array
+    aspect: Array
     semi_axes_mm: Array
     modes_static: Array
     modes_swing: Array
@@ -354,10 +430,14 @@ def lamb_frequency_hz(degree: int, d_eq_mm: float) -> float:
     return float(np.sqrt(square) / (2 * np.pi))
 
 
-def random_population(config: BubbleConfig, count: int, rng: Generator) -> Population:
+def random_population(run: RunConfig, count: int, rng: Generator) -> Population:
     """Draw ``count`` bubbles."""
+    config = run.bubble
     d_eq = rng.uniform(*config.d_eq_mm, count)
-    aspect = rng.uniform(*config.aspect, count)
+    if config.aspect == "wellek":
+        aspect = wellek_aspect(liquid(run).eotvos(1e-3 * d_eq))
+    else:
+        aspect = rng.uniform(*config.aspect, count)
     uneven = rng.uniform(-config.triaxial, config.triaxial, count)
     axes = np.stack([1 + uneven / 2, 1 - uneven / 2, 1 / aspect], -1)
     degrees = np.array([degree for degree, _ in MODES])
@@ -374,7 +454,7 @@ def random_population(config: BubbleConfig, count: int, rng: Generator) -> Popul
     turn = rng.uniform(0, 2 * np.pi, count)
     looks = tuple(_look(config, rng) for _ in range(count))
     swing_hz = np.reshape(hertz, (count, len(MODES)))
-    return Population(d_eq, axes, static, swing, swing_hz, phase, spin, turn, looks)
+    return Population(d_eq, aspect, axes, static, swing, swing_hz, phase, spin, turn, looks)
 
 
 def _look(config: BubbleConfig, rng: Generator) -> Look:

@@ -138,10 +138,11 @@ def _any_inside(points: Array, outline: Array, centre: Array) -> bool:
 def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dict[str, Any]:
     """Columns of `truth/runs/<run>/bubbles.csv` for one frame: bubbles that any camera sees.
 
-    Lab place and velocity of the centre of volume; its rig place is that in the carriage's frame,
-    without any camera's shake. Per camera: pixels of the projected centre of volume and of the
-    silhouette's centroid (both with that camera's shake), area, blur, and the flags of
-    `CameraView`; blank where the bubble is far from the image.
+    Lab place and velocity of the centre of volume, and its acceleration and drag coefficient where
+    they are known; its rig place is that in the carriage's frame, without any camera's shake. Per
+    camera: pixels of the projected centre of volume and of the silhouette's centroid (both with
+    that camera's shake), area, blur, and the flags of `CameraView`; blank where the bubble is far
+    from the image.
     """
     seen = np.zeros(len(scene.population.d_eq_mm), bool)
     for view in views.values():
@@ -159,6 +160,10 @@ def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dic
         columns[f"{name}_lab_mm"] = lab[:, axis]
         columns[f"v{name}_lab_mm_s"] = velocity[:, axis]
         columns[f"{name}_rig_mm"] = rig[:, axis]
+    if scene.lab_mm_s2 is not None and scene.drag is not None:
+        for axis, name in enumerate("xyz"):
+            columns[f"a{name}_lab_mm_s2"] = scene.lab_mm_s2[particle, frame, axis]
+        columns["drag"] = scene.drag[particle]
     columns["d_eq_mm"] = scene.population.d_eq_mm[particle]
     for name, view in views.items():
         columns |= _camera_columns(name, view, particle)

@@ -1,0 +1,386 @@
+"""Size, aspect ratio and axis of a bubble from its two outlines.
+
+An ellipsoid has six numbers. Each outline gives three, of which the extent along the shared
+coordinate is measured twice: two views determine five numbers. Bubbles are nearly spheroids, which
+have four. The body is therefore a spheroid times exp(t), where t, two numbers, is how unequal the
+two equatorial semi-axes are; its prior N(0, triaxial^2) is learned from all bubbles of a run
+(`learn_deviations`). The covariance then states what two views leave open, and 2 degrees of freedom
+test the spheroid.
+
+In the unit circle of an outline, a deviation of the ellipse is a radial displacement
+g0 + g1 cos 2 phi + g2 sin 2 phi. White noise along the outline gives cos and sin of every order the
+same variance v, and g0 half of it; modes of degree 4 of the body do nearly the same (81/64 and
+45/16 of their variance). v is taken from the stated covariance of the centre, which is of order 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from telerig.arrays import Array, Bools
+from telerig.estimator.bubbles.shape.volume_centroid import Outlines, outlines_from_table
+from telerig.rig import silhouette
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import stacked_jacobian
+
+PARAMETERS = ("log_size", "log_aspect", "lean_1", "lean_2", "triaxial_1", "triaxial_2")
+"""Columns of `Spheroids.covariance`: log of d_eq, log of the aspect ratio, the turn of the pole
+about two axes (rad), and the deviation of the equatorial axes."""
+
+DEFAULT_TRIAXIAL = 0.01
+_DEFAULT_WEIGHT = 1.0  # in outlines' pairs, of the default in what a run learns
+_LEAST_EXCESS = 3e-4
+_LEAST_FOR_LEARNING = 8
+_TRIM, _TRIMMED = 0.02, 0.873
+"""Share of squares that is left out, and the mean of the others for normal errors."""
+_STEPS = 12
+_PROLATE_COST = 8.0
+_UPRIGHT_RAD = 0.4
+_LOG_ASPECT = 0.5
+"""What decides between bodies with the same outlines: how much more an oblate body is expected, and
+standard deviations of its pole from the vertical and of its log aspect ratio."""
+
+_NEAR_SPHERE = 4.0
+"""Bias of a log aspect ratio, times itself over its variance: near a sphere the five components of
+its deformation are all noise, and the fit takes the largest for the flattening."""
+
+_LOOSE = np.array([0.0, 0.25, 1.0, 1.0])
+"""Prior precision of a single body's log size, log aspect ratio and pole."""
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """How far the bubbles of a run are from spheroids, and their outlines from ellipses.
+
+    triaxial : standard deviation of both numbers t. excess : standard deviation of cos 2 phi and
+    sin 2 phi of an outline, relative to its radius, beyond its stated noise.
+    pairs : number of pairs of outlines that were used.
+    """
+
+    triaxial: float = DEFAULT_TRIAXIAL
+    excess: float = _LEAST_EXCESS
+    pairs: int = 0
+
+
+@dataclass(frozen=True)
+class Spheroids:
+    """M bodies, rig axes; NaN where an outline is missing, cut or covered.
+
+    d_eq_mm, aspect : (M,) diameter of the sphere of equal volume; equatorial over polar semi-axis.
+    pole : (M, 3) unit vector of the polar axis; its sign means nothing.
+    frame : (M, 3, 3) columns: two equatorial axes, about whose turns `covariance` speaks, and pole.
+    covariance : (M, 6, 6) of `PARAMETERS`.
+    chi2 : (M,) misfit of the spheroid itself, without t: 2 degrees of freedom.
+    """
+
+    d_eq_mm: Array
+    aspect: Array
+    pole: Array
+    frame: Array
+    covariance: Array
+    chi2: Array
+
+    @property
+    def equator_mm(self) -> Array:
+        """(M,) geometric mean of the two equatorial semi-axes."""
+        return np.asarray(self.d_eq_mm / 2 * np.cbrt(self.aspect))
+
+    @property
+    def polar_mm(self) -> Array:
+        """(M,) polar semi-axis."""
+        return np.asarray(self.equator_mm / self.aspect)
+
+
+def paired_outlines(
+    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
+) -> tuple[Outlines, Outlines]:
+    """Return two detection tables as outlines; row i of both is one bubble."""
+    left, right = (
+        outlines_from_table(table, camera.image_size_px)
+        for table, camera in zip((first, second), cameras)
+    )
+    return left, right
+
+
+def fit_spheroids(
+    outlines: tuple[Outlines, Outlines],
+    points_mm: Array,
+    cameras: tuple[Camera, Camera],
+    up: Array,
+    deviations: Deviations | None = None,
+) -> tuple[Spheroids, Deviations]:
+    """Bodies of M bubbles from their outlines in two cameras, and what was learned from them.
+
+    points_mm : (M, 3) where the bubbles are, in the rig frame. up : (3,) against gravity there. An
+    oblate body lying flat has the same two outlines as a prolate one on its side, between the
+    views; the one that is expected of a rising bubble is taken.
+    deviations : None to learn them from these outlines.
+    """
+    good = outlines[0].entire & outlines[1].entire & np.isfinite(points_mm).all(-1)
+    pair = (outlines[0].rows(good), outlines[1].rows(good))
+    _, jacobian = stacked_jacobian(cameras, points_mm[good])
+    views = _Views.of(pair, (jacobian[:, :2], jacobian[:, 2:]))
+    known = learn_deviations(views, up) if deviations is None else deviations
+    found = _best(views, known, up)
+    return _scattered(found, good), known
+
+
+@dataclass(frozen=True)
+class _Views:
+    """M pairs of outlines.
+
+    whitening : two (M, 2, 3), from the rig to the unit circle of each outline. noise : two (M,),
+    variance of the circle's cos 2 phi. ellipses : the pair in mm.
+    """
+
+    whitening: tuple[Array, Array]
+    noise: tuple[Array, Array]
+    ellipses: silhouette.EllipsePair
+
+    @staticmethod
+    def of(pair: tuple[Outlines, Outlines], jacobians: tuple[Array, Array]) -> _Views:
+        inverse = [np.linalg.inv(o.axes_px) for o in pair]
+        noise = [
+            np.einsum("mij,mjk,mik->m", a, o.covariance_px2, a) / 2 for a, o in zip(inverse, pair)
+        ]
+        first, second = (a @ j for a, j in zip(inverse, jacobians))
+        ellipses = silhouette.ellipse_pair(jacobians, (pair[0].axes_px, pair[1].axes_px))
+        return _Views((first, second), (noise[0], noise[1]), ellipses)
+
+    def precision(self, deviations: Deviations) -> Array:
+        """(M, 6) inverse variances of the deviations g of both outlines."""
+        excess2 = deviations.excess**2
+        each = [1 / (n + excess2)[:, None] * np.array([2.0, 1.0, 1.0]) for n in self.noise]
+        return np.concatenate(each, -1)
+
+    def deviation(self, moments: Array) -> Array:
+        """(M, 6) g of both outlines for bodies of these moments A A^T (M, 3, 3), or changes of
+        them, linear in them."""
+        seen = [w @ moments @ w.mT / 2 for w in self.whitening]
+        parts = [
+            part
+            for s in seen
+            for part in (
+                (s[:, 0, 0] + s[:, 1, 1]) / 2,
+                (s[:, 0, 0] - s[:, 1, 1]) / 2,
+                s[:, 0, 1],
+            )
+        ]
+        return np.stack(parts, -1)
+
+
+_ROUND = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0])
+"""`_Views.deviation` of a body whose outlines are those that were measured."""
+
+
+def _moments(frame: Array, value: Array) -> Array:
+    """(M, 3, 3) A A^T of bodies: frame (M, 3, 3), value (M, 4) log size, log aspect, t."""
+    size, aspect, t1, t2 = value.T
+    t = np.hypot(t1, t2) + 1e-300
+    even, odd = np.cosh(2 * t), np.sinh(2 * t) / t
+    plane = np.exp(2 * (size + aspect / 3))
+    body = np.zeros((len(value), 3, 3))
+    body[:, 0, 0], body[:, 1, 1] = plane * (even + odd * t1), plane * (even - odd * t1)
+    body[:, 0, 1] = body[:, 1, 0] = plane * odd * t2
+    body[:, 2, 2] = np.exp(2 * (size - 2 * aspect / 3))
+    return np.asarray(frame @ body @ frame.mT)
+
+
+def _tangents(frame: Array, moments: Array) -> Array:
+    """(M, 6, 3, 3) derivative of the moments by the `PARAMETERS`; by t to first order."""
+    e1, e2, n = (frame[:, :, i] for i in range(3))
+
+    def outer(a: Array, b: Array) -> Array:
+        product = a[:, :, None] * b[:, None, :]
+        return np.asarray(product + product.mT) / 2
+
+    shape = (outer(e1, e1) + outer(e2, e2) - 2 * outer(n, n)) / 3
+    stretches = [np.broadcast_to(np.eye(3), moments.shape), shape]
+    stretches += [outer(e1, e1) - outer(e2, e2), 2 * outer(e1, e2)]
+    changes = [s @ moments + moments @ s for s in stretches]
+    # the pole moves towards an equatorial axis, and that axis away from it
+    for axis in (e2, e1):
+        turn = axis[:, :, None] * n[:, None, :] - n[:, :, None] * axis[:, None, :]
+        changes.insert(2, turn @ moments - moments @ turn)
+    return np.stack(changes, 1)
+
+
+def _frame(pole: Array) -> Array:
+    """(M, 3, 3) right-handed frames whose third column is the pole (M, 3)."""
+    start = np.where(np.abs(pole[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
+    first = start - pole * (start * pole).sum(-1, keepdims=True)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(pole, first), pole], -1)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """frame (M, 3, 3), value (M, 4) as `_moments` takes them; covariance (M, 6, 6); cost (M,)."""
+
+    frame: Array
+    value: Array
+    covariance: Array
+    cost: Array
+
+
+def _fit(views: _Views, start: tuple[Array, Array, Array], deviations: Deviations) -> _Fit:
+    """Maximum a posteriori by Gauss-Newton steps. start : pole (M, 3), log size, log aspect."""
+    pole, size, aspect = start
+    frame = _frame(pole)
+    value = np.stack([size, aspect, 0 * size, 0 * size], -1)
+    weight = views.precision(deviations)
+    prior = np.concatenate([_LOOSE, np.full(2, deviations.triaxial**-2)])
+    covariance = np.zeros((len(pole), 6, 6))
+    for _ in range(_STEPS):
+        moments = _moments(frame, value)
+        miss = _ROUND - views.deviation(moments)
+        changes = _tangents(frame, moments)
+        slope = np.stack([views.deviation(changes[:, i]) for i in range(6)], -1)
+        normal = slope.mT @ (weight[..., None] * slope) + np.diag(prior)
+        covariance = np.asarray(np.linalg.inv(normal))
+        right = (slope.mT @ (weight * miss)[..., None])[..., 0]
+        right[:, 1] -= prior[1] * value[:, 1]
+        right[:, 4:] -= prior[4:] * value[:, 2:]
+        step = np.clip((covariance @ right[..., None])[..., 0], -0.5, 0.5)
+        value = value + step[:, [0, 1, 4, 5]]
+        lean = np.concatenate([step[:, 2:4], np.ones((len(step), 1))], -1)
+        leaned = (frame @ lean[..., None])[..., 0]
+        frame = _carried(frame, leaned / np.linalg.norm(leaned, axis=-1, keepdims=True))
+    miss = _ROUND - views.deviation(_moments(frame, value))
+    cost = (weight * miss**2).sum(-1) + (prior[4:] * value[:, 2:] ** 2).sum(-1)
+    return _Fit(frame, value, covariance, cost)
+
+
+def _carried(frame: Array, pole: Array) -> Array:
+    """The frames turned the shortest way so that their third column is the pole."""
+    first = frame[:, :, 0] - pole * (frame[:, :, 0] * pole).sum(-1, keepdims=True)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(pole, first), pole], -1)
+
+
+def _starts(ellipses: silhouette.EllipsePair) -> list[tuple[Array, Array, Array]]:
+    """(pole, log size, log aspect) of an oblate spheroid, of its mirror image about the shared
+    coordinate in the second view, and of a prolate one."""
+    pole, moments = silhouette.oblate_spheroid(ellipses)
+    pole = pole / np.linalg.norm(pole, axis=-1, keepdims=True)
+    basis = np.stack([ellipses.shared, *ellipses.sides], -2)
+    lean = (basis @ pole[..., None])[..., 0] * [1.0, 1.0, -1.0]
+    mirrored = np.linalg.solve(basis, lean[..., None])[..., 0]
+    mirrored /= np.linalg.norm(mirrored, axis=-1, keepdims=True)
+    values = np.log(np.linalg.eigvalsh(moments)) / 2
+    size, flat = values.mean(-1), values[:, 2] - values[:, 0]
+    values, vectors = np.linalg.eigh(silhouette.most_spherical(ellipses))
+    logs = np.log(values) / 2
+    long = logs[:, :2].mean(-1) - logs[:, 2]
+    return [(pole, size, flat), (mirrored, size, flat), (vectors[..., 2], logs.mean(-1), long)]
+
+
+def _best(views: _Views, deviations: Deviations, up: Array) -> Spheroids:
+    """The most probable of the local optima; how far the others are from it is in its covariance,
+    by their probability."""
+    fits = [_fit(views, start, deviations) for start in _starts(views.ellipses)]
+    cost = np.stack([f.cost + _unusual(f, up) for f in fits])
+    best = np.argmin(cost, 0)
+    rows = np.arange(len(best))
+    chosen = _Fit(
+        *(np.stack([getattr(f, name) for f in fits])[best, rows] for name in _Fit.__annotations__)
+    )
+    weight = np.exp(-(cost - cost[best, rows]) / 2)
+    weight /= weight.sum(0)
+    covariance = chosen.covariance.copy()
+    for fit, share in zip(fits, weight):
+        sign = np.sign((fit.frame[:, :, 2] * chosen.frame[:, :, 2]).sum(-1, keepdims=True))
+        lean = (chosen.frame.mT @ (sign * fit.frame[:, :, 2])[..., None])[:, :2, 0]
+        apart = np.concatenate([fit.value[:, :2] - chosen.value[:, :2], lean], -1)
+        covariance[:, :4, :4] += share[:, None, None] * apart[:, :, None] * apart[:, None, :]
+    size, aspect = chosen.value[:, 0], chosen.value[:, 1]
+    # the sphere has no pole, and no flattening that could be negative
+    blur = _NEAR_SPHERE * chosen.covariance[:, 1, 1] / np.maximum(aspect**2, 1e-12)
+    covariance[:, 1, 1] += np.minimum(blur, 1.0) ** 2 * aspect**2
+    covariance[:, [2, 3], [2, 3]] += np.minimum(blur, 1.0)[:, None] ** 2
+    chi2 = np.min([_spheroid_misfit(views, f, deviations)[0] for f in fits[:2]], 0)
+    return Spheroids(
+        2 * np.exp(size), np.exp(aspect), chosen.frame[:, :, 2], chosen.frame, covariance, chi2
+    )
+
+
+def _unusual(fit: _Fit, up: Array) -> Array:
+    """(M,) what is expected of a bubble before it is seen, as a chi-square."""
+    aspect, upright = fit.value[:, 1], np.abs(fit.frame[:, :, 2] @ up)
+    tilt = np.arccos(np.clip(upright, 0, 1))
+    prolate = np.where(aspect < 0, _PROLATE_COST, 0.0)
+    return np.asarray(prolate + (aspect / _LOG_ASPECT) ** 2 + (tilt / _UPRIGHT_RAD) ** 2)
+
+
+def _spheroid_misfit(views: _Views, fit: _Fit, deviations: Deviations) -> tuple[Array, Array]:
+    """Chi-square (M,) of a spheroid with t = 0 near this fit, and how much it grows per unit of
+    the variance of t, (M,)."""
+    weight = views.precision(deviations)
+    value = fit.value * [1.0, 1.0, 0.0, 0.0]
+    moments = _moments(fit.frame, value)
+    miss = _ROUND - views.deviation(moments)
+    changes = _tangents(fit.frame, moments)
+    slope = np.stack([views.deviation(changes[:, i]) for i in range(6)], -1)
+    body, odd = slope[..., :4], slope[..., 4:]
+    normal = np.linalg.inv(body.mT @ (weight[..., None] * body) + np.diag(_LOOSE))
+
+    def left(part: Array) -> Array:
+        solved = body @ (normal @ (body.mT @ (weight[..., None] * part)))
+        return np.asarray((weight[..., None] * part * (part - solved)).sum((-1, -2)))
+
+    return left(miss[..., None]), left(odd)
+
+
+def learn_deviations(views: _Views, up: Array) -> Deviations:
+    """How far outlines are from those of ellipsoids, and bodies from spheroids: by moments.
+
+    The extents of an ellipsoid along the shared coordinate are the same in both views, so their
+    difference shows the outlines' errors alone. What spheroids then leave of the outlines shows t.
+    """
+    count = len(views.noise[0])
+    if count < _LEAST_FOR_LEARNING:
+        return Deviations(pairs=count)
+    extents = [np.log(m[..., 0, 0]) / 2 for m in views.ellipses.moments_mm2]
+    # along one direction the displacement is g0 plus a unit combination of g1 and g2: 3/2 v
+    noise = 1.5 * (views.noise[0] + views.noise[1])
+    excess2 = _excess_variance((extents[0] - extents[1]) ** 2, noise, np.full(count, 3.0))
+    excess = float(np.sqrt(max(excess2, _LEAST_EXCESS**2)))
+    strict, rough = Deviations(1e-5, excess, count), Deviations(excess=excess)
+    fits = [_fit(views, start, strict) for start in _starts(views.ellipses)]
+    misfits = [_spheroid_misfit(views, f, rough) for f in fits]
+    better = np.argmin([m[0] + _unusual(f, up) for m, f in zip(misfits, fits)], 0)
+    chi2, gain = (np.choose(better, [m[i] for m in misfits]) for i in range(2))
+    variance = _excess_variance(chi2, np.full(count, 2.0), gain)
+    total = variance * count + _DEFAULT_WEIGHT * DEFAULT_TRIAXIAL**2
+    triaxial2 = total / (count + _DEFAULT_WEIGHT)
+    return Deviations(float(np.sqrt(max(triaxial2, 1e-6))), excess, count)
+
+
+def _excess_variance(squares: Array, expected: Array, gain: Array) -> float:
+    """The variance s that explains squares (M,) of mean expected + gain s; 0 or more.
+
+    Squares are weighted by their own variance; the largest are left out, as wrong pairs and
+    covered outlines make them.
+    """
+    excess = 0.0
+    for _ in range(20):
+        total = expected + gain * excess
+        kept = squares / total <= np.quantile(squares / total, 1 - _TRIM)
+        weight = np.where(kept, gain / total**2, 0.0)
+        mean = (weight * squares).sum() / _TRIMMED
+        excess = max(float((mean - (weight * expected).sum()) / (weight * gain).sum()), 0.0)
+    return excess
+
+
+def _scattered(found: Spheroids, good: Bools) -> Spheroids:
+    """Rows of the good outlines among all, NaN for the others."""
+    parts = []
+    for name in Spheroids.__annotations__:
+        values = getattr(found, name)
+        out = np.full((len(good), *values.shape[1:]), np.nan)
+        out[good] = values
+        parts.append(out)
+    return Spheroids(*parts)

@@ -1,0 +1,125 @@
+"""The dominant oscillation of a series: frequency and amplitude with standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from telerig.arrays import Array
+
+LEAST_PERIODS = 1.5
+_LEAST_SAMPLES = 16
+_PADDING = 8
+_SIGNIFICANT = 6.0
+_ROUNDING = 1e-9
+_NEAR_PERIODS, _OWN_PERIODS = 5.0, 1.5
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """c cos 2 pi f t + s sin 2 pi f t of K components.
+
+    frequency_hz, s_frequency_hz : f and its standard deviation.
+    major, minor : semi-axes of the ellipse that two components describe; minor is 0 for one.
+    s_major, s_minor : their standard deviations. cosine, sine : (K,) c and s.
+    """
+
+    frequency_hz: float
+    s_frequency_hz: float
+    major: float
+    minor: float
+    s_major: float
+    s_minor: float
+    cosine: Array
+    sine: Array
+
+    def at(self, t_s: Array) -> Array:
+        """(N, K) values at times (N,)."""
+        phase = 2 * np.pi * self.frequency_hz * np.asarray(t_s)[:, None]
+        return np.asarray(np.cos(phase) * self.cosine + np.sin(phase) * self.sine)
+
+
+def dominant_oscillation(
+    t_s: Array, values: Array, low_hz: float = 0.0, high_hz: float = np.inf
+) -> Oscillation | None:
+    """Return the strongest sinusoid of a series (N, K) between two frequencies.
+
+    The series is a straight line, the sinusoid and a coloured noise of the one-sided density S at
+    f, which what the sinusoid leaves near f shows. A sinusoid of T seconds and amplitude A then has
+    the variances S / T of A and 3 S / (pi^2 A^2 T^3) of f, the Cramer-Rao bound for white noise of
+    that density.
+    None where the record is shorter than 1.5 periods or 16 samples, or where the amplitude is below
+    4 of its standard deviations.
+    """
+    good = np.isfinite(values).all(-1)
+    t, y = np.asarray(t_s, float)[good], np.asarray(values, float)[good]
+    if len(t) < _LEAST_SAMPLES:
+        return None
+    duration = (t[-1] - t[0]) * len(t) / (len(t) - 1)
+    step = float(np.median(np.diff(t)))
+    low, high = max(low_hz, LEAST_PERIODS / duration), min(high_hz, 0.45 / step)
+    if low >= high:
+        return None
+    even = np.linspace(t[0], t[-1], round((t[-1] - t[0]) / step) + 1)
+    line = np.stack([np.ones(len(t)), t - t[0]], -1)
+    level = y - line @ np.linalg.lstsq(line, y, rcond=None)[0]
+    grid = np.stack([np.interp(even, t, column) for column in level.T], -1)
+    count = _PADDING * len(even)
+    power = (np.abs(np.fft.rfft(grid * np.hanning(len(even))[:, None], count, axis=0)) ** 2).sum(-1)
+    frequency = np.fft.rfftfreq(count, step)
+    inside = np.flatnonzero((frequency >= low) & (frequency <= high))
+    if not len(inside):
+        return None
+    f = _refined(t, y, float(frequency[inside[np.argmax(power[inside])]]), 0.5 / duration)
+    coefficients, left = _fitted(t, y, f)
+    density = _density(even, np.stack([np.interp(even, t, c) for c in left.T], -1), f, duration)
+    if not density > (_ROUNDING * np.abs(y).max()) ** 2 * duration:
+        return None
+    cosine, sine = coefficients[2], coefficients[3]
+    _, axes, _ = np.linalg.svd(np.stack([cosine, sine]), full_matrices=False)
+    minor = float(axes[1]) if len(axes) > 1 else 0.0
+    s_amplitude = float(np.sqrt(density / duration))
+    if axes[0] < _SIGNIFICANT * s_amplitude or not low <= f <= high:
+        return None
+    total = float((axes**2).sum())
+    s_f = float(np.sqrt(3 * density / (np.pi**2 * total * duration**3)))
+    return Oscillation(
+        f, s_f, float(axes[0]), minor, s_amplitude, s_amplitude * (len(axes) > 1), cosine, sine
+    )
+
+
+def _fitted(t: Array, y: Array, f: float) -> tuple[Array, Array]:
+    """Coefficients (4, K) of 1, t, cos, sin by least squares, and what they leave (N, K)."""
+    phase = 2 * np.pi * f * t
+    basis = np.stack([np.ones(len(t)), t - t.mean(), np.cos(phase), np.sin(phase)], -1)
+    found = np.linalg.lstsq(basis, y, rcond=None)[0]
+    return found, y - basis @ found
+
+
+def _refined(t: Array, y: Array, f: float, around: float) -> float:
+    """The frequency near f whose sinusoid leaves least."""
+    from scipy.optimize import minimize_scalar
+
+    found = minimize_scalar(
+        lambda x: float((_fitted(t, y, x)[1] ** 2).sum()),
+        bounds=(max(f - around, 0.1 * f), f + around), method="bounded",
+        options={"xatol": 1e-5 * f},
+    )  # fmt: skip
+    return float(found.x)
+
+
+def _density(t: Array, left: Array, f: float, duration: float) -> float:
+    """One-sided density at f, per component.
+
+    From the periodogram within 5 periods of the record, without the 1.5 about f that the fit has
+    emptied. It is taken to fall with the square of the frequency, as that of a velocity that
+    wanders does: few periods of a slow oscillation look like such noise.
+    """
+    step = float(t[1] - t[0])
+    frequency = np.fft.rfftfreq(len(t), step)
+    periodogram = 2 * step / len(t) * (np.abs(np.fft.rfft(left, axis=0)) ** 2).mean(-1)
+    away = np.abs(frequency - f) * duration
+    near = (away < _NEAR_PERIODS) & (away > _OWN_PERIODS)
+    near[0] = False
+    return float((periodogram * frequency**2)[near].mean()) / f**2 if near.any() else 0.0

@@ -1,0 +1,169 @@
+"""bubble_summary.csv: one row per bubble, every mean with its standard deviation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from telerig.arrays import Array
+from telerig.estimator.physics.frames import AXES
+from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillation
+from telerig.io.results.bubbles import SUMMARY_COLUMNS, WHOLE
+from telerig.rig.bubble_physics import Liquid
+
+_ABOVE_ZIGZAG = 2.6
+"""Shape oscillations are sought above the zigzag's second harmonic, with which the aspect ratio
+follows the bubble's speed."""
+
+
+def summary_table(frames: pd.DataFrame, up: Array, liquid: Liquid | None = None) -> pd.DataFrame:
+    """Return the content of bubble_summary.csv.
+
+    frames : what `telerig.bubble_table` returns. up : (3,) unit vector against gravity.
+    liquid : the liquid of the dimensionless numbers, NaN without one.
+    """
+    groups = frames.groupby("particle", sort=True)
+    rows = [_row(mine, up, liquid) for _, mine in groups]
+    table = pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
+    return table.astype({name: np.int64 for name in WHOLE if name in table})
+
+
+def _row(mine: pd.DataFrame, up: Array, liquid: Liquid | None) -> dict[str, Any]:
+    t = mine["t_s"].to_numpy(float)
+    row: dict[str, Any] = {
+        "particle": mine["particle"].iloc[0],
+        "first_frame": mine["frame"].iloc[0],
+        "last_frame": mine["frame"].iloc[-1],
+        "frames": int((mine["observed"] != 0).sum()),
+        "lifetime_s": t[-1] - t[0],
+    }
+    for value, sd in (("d_eq_mm", "sd_eq_mm"), ("aspect", "s_aspect"), ("tilt_deg", "s_tilt_deg")):
+        row[value], row[sd] = mean_of_body(mine[value].to_numpy(float), mine[sd].to_numpy(float))
+    row["rise_mm_s"], row["s_rise_mm_s"] = _mean_rise(t, mine, up)
+    row["slip_mm_s"] = _mean(mine["slip_mm_s"])
+    row["s_slip_mm_s"] = row["s_rise_mm_s"]
+    row |= _zigzag(t, mine, up)
+    low = _ABOVE_ZIGZAG * row.get("zigzag_hz", 0.0)
+    shape = dominant_oscillation(t, np.log(mine[["aspect"]].to_numpy(float)), low)
+    if shape is not None:
+        row["shape_hz"], row["s_shape_hz"] = shape.frequency_hz, shape.s_frequency_hz
+        row["shape_amplitude"], row["s_shape_amplitude"] = shape.major, shape.s_major
+    return row | _numbers(row, mine, liquid)
+
+
+def mean_of_body(values: Array, sd: Array) -> tuple[float, float]:
+    """Mean over a bubble's frames of a property of its body, with a standard deviation.
+
+    Of the stated variance, the part that is not seen as scatter is common to all frames; scatter
+    averages out over its correlation time.
+    """
+    good = np.isfinite(values) & np.isfinite(sd)
+    if not good.any():
+        return float("nan"), float("nan")
+    x, variance = values[good], float((sd[good] ** 2).mean())
+    scatter = float(x.var())
+    common = max(variance - scatter, 0.0)
+    return float(x.mean()), float(np.sqrt(common + scatter * _correlated_share(x)))
+
+
+def _correlated_share(x: Array) -> float:
+    """Variance of the mean of a series (N,) over the series' variance, 1/N for white noise.
+
+    By the integral of its autocorrelation to the first zero (Sokal's window is longer; a trend
+    would make both 1).
+    """
+    count = len(x)
+    level = x - x.mean()
+    if count < 3 or not level.any():
+        return 1.0 / count
+    padded = np.fft.rfft(level, 2 * count)
+    correlation = np.fft.irfft(np.abs(padded) ** 2)[:count]
+    correlation = correlation / correlation[0]
+    positive = correlation[: int(np.argmax(correlation <= 0)) or count]
+    return float(min(1.0, (2 * positive.sum() - 1) / count))
+
+
+def _mean(values: pd.Series[Any]) -> float:
+    known = values.to_numpy(float)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if len(known) else float("nan")
+
+
+def _along(mine: pd.DataFrame, pattern: str, direction: Array) -> Array:
+    return np.asarray(
+        np.stack([mine[pattern.format(a)].to_numpy(float) for a in AXES], -1) @ direction
+    )
+
+
+def _mean_rise(t: Array, mine: pd.DataFrame, up: Array) -> tuple[float, float]:
+    """Height gained over the time, and an upper bound of its standard deviation.
+
+    Errors of both ends have a positive correlation, and so have those of the velocities: the
+    smaller of the two bounds is taken.
+    """
+    if len(t) < 2:
+        velocity = _along(mine, "v{}_mm_s", up)[0]
+        return float(velocity), float(np.sqrt(_along_variance(mine, "sv{}_mm_s", up)[0]))
+    height = _along(mine, "{}_mm", up)
+    duration = t[-1] - t[0]
+    ends = _along_variance(mine, "s{}_mm", up)[[0, -1]].sum() / duration**2
+    steady = np.sqrt(_along_variance(mine, "sv{}_mm_s", up)).mean() ** 2
+    bound = np.fmin(ends, steady)
+    return float((height[-1] - height[0]) / duration), float(np.sqrt(bound))
+
+
+def _along_variance(mine: pd.DataFrame, pattern: str, direction: Array) -> Array:
+    sd = np.stack([mine[pattern.format(a)].to_numpy(float) for a in AXES], -1)
+    return np.asarray(sd**2 @ direction**2)
+
+
+def _zigzag(t: Array, mine: pd.DataFrame, up: Array) -> dict[str, float]:
+    """The strongest oscillation of the velocity across the vertical, as a displacement.
+
+    The velocity's noise is white where a wandering path's is red, so that a slow drift is not taken
+    for a zigzag.
+    """
+    across = np.linalg.svd(np.atleast_2d(up))[2][1:]
+    velocity = np.stack([_along(mine, "v{}_mm_s", direction) for direction in across], -1)
+    found: Oscillation | None = dominant_oscillation(t, velocity)
+    if found is None:
+        return {}
+    f, s_f = found.frequency_hz, found.s_frequency_hz
+    out = {"zigzag_hz": f, "s_zigzag_hz": s_f}
+    for name, value, sd in (
+        ("zigzag_mm", found.major, found.s_major),
+        ("zigzag_minor_mm", found.minor, found.s_minor),
+    ):
+        out[name] = value / (2 * np.pi * f)
+        out[f"s_{name}"] = float(np.hypot(sd / (2 * np.pi * f), out[name] * s_f / f))
+    return out
+
+
+def _numbers(row: dict[str, Any], mine: pd.DataFrame, liquid: Liquid | None) -> dict[str, float]:
+    """Dimensionless numbers of the means, and the mean drag coefficient."""
+    d, slip = row["d_eq_mm"], row["slip_mm_s"]
+    size, speed = row["sd_eq_mm"] / d, row["s_slip_mm_s"] / slip
+    out = {}
+    if "zigzag_hz" in row:
+        out["strouhal"] = row["zigzag_hz"] * d / slip
+        relative = (row["s_zigzag_hz"] / row["zigzag_hz"], size, speed)
+        out["s_strouhal"] = out["strouhal"] * float(np.linalg.norm(relative))
+    if liquid is None:
+        return out
+    metres, metres_s = 1e-3 * d, 1e-3 * slip
+    for name, value, powers in (
+        ("reynolds", liquid.reynolds(metres, metres_s), (1, 1)),
+        ("weber", liquid.weber(metres, metres_s), (1, 2)),
+        ("eotvos", liquid.eotvos(metres), (2, 0)),
+    ):
+        out[name] = float(value)
+        out[f"s_{name}"] = float(value) * float(np.hypot(powers[0] * size, powers[1] * speed))
+    out["drag"] = _mean(mine["drag"])
+    # The mean of the acceleration is a difference of two velocities over the lifetime.
+    ends = mine["s_slip_mm_s"].to_numpy(float)[[0, -1]]
+    inertia = float(np.hypot(*ends)) / row["lifetime_s"] if row["lifetime_s"] else np.inf
+    inertia *= _mean(mine["added_mass"]) * 1e-3 / liquid.gravity
+    out["s_drag"] = abs(out["drag"]) * float(np.linalg.norm((size, 2 * speed, inertia)))
+    return out

@@ -1,0 +1,206 @@
+"""bubbles.csv and bubble_summary.csv: numbers, errors by Monte-Carlo, what is not known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.errors import InputError
+from telerig.estimator.physics.bodies import bodies_table
+from telerig.estimator.physics.frames import frames_table, liquid_of, propagated
+from telerig.estimator.physics.oscillation import dominant_oscillation
+from telerig.estimator.physics.summary import mean_of_body, summary_table
+from telerig.io.results.bubbles import BODY_COLUMNS, FRAME_COLUMNS, NUMBERS, SUMMARY_COLUMNS
+
+UP = np.array([0.0, -1.0, 0.0])
+WATER = {"density_kg_m3": 998.2, "viscosity_pa_s": 1e-3, "surface_tension_n_m": 0.0728}
+G = 9.80665
+
+
+def motion(frames: int = 1, **changes: object) -> pd.DataFrame:
+    """A bubble that rises at 250 mm/s and brakes a little."""
+    t = np.arange(frames) / 500
+    values = {"vx": 60.0, "vy": -250.0, "vz": -20.0, "ax": 900.0, "ay": 250.0, "az": -500.0}
+    table = {
+        "frame": np.arange(frames), "particle": 4, "t_s": t,
+        "x_mm": 0.06 * t, "y_mm": -0.25 * t, "z_mm": 0 * t,
+        "sx_mm": 0.02, "sy_mm": 0.02, "sz_mm": 0.02, "observed": 1,
+    }  # fmt: skip
+    for name, value in values.items():
+        unit = "mm_s" if name[0] == "v" else "mm_s2"
+        table[f"{name}_{unit}"] = value
+        table[f"s{name}_{unit}"] = 3.0 if name[0] == "v" else 120.0
+    return pd.DataFrame(table | changes)
+
+
+def body(frames: int = 1) -> pd.DataFrame:
+    table = pd.DataFrame({"frame": np.arange(frames), "particle": 4}).reindex(columns=BODY_COLUMNS)
+    known = {
+        "d_eq_mm": 3.0, "sd_eq_mm": 0.03, "aspect": 1.6, "s_aspect": 0.05, "tilt_deg": 13.0,
+        "s_tilt_deg": 1.0, "pole_x": 0.2, "pole_y": -(0.96**0.5), "pole_z": 0.0,
+        "r_size_aspect": 0.5,
+    }  # fmt: skip
+    return table.assign(**known)
+
+
+def test_standard_deviations_are_those_of_a_monte_carlo() -> None:
+    """Inputs are drawn with their stated errors, and every row is computed anew."""
+    rng, count = np.random.default_rng(1), 20_000
+    one = frames_table(motion(), body(), UP, G, WATER).iloc[0]
+    drawn, bodies = motion(count), body(count)
+    for column in [c for c in drawn if c.endswith(("mm_s", "mm_s2")) and not c.startswith("s")]:
+        drawn[column] += drawn[f"s{column}"] * rng.standard_normal(count)
+    sd = np.array([0.01, 0.05 / 1.6])
+    off = rng.multivariate_normal([0, 0], np.outer(sd, sd) * [[1, 0.5], [0.5, 1]], count)
+    bodies["d_eq_mm"] *= np.exp(off[:, 0])
+    bodies["aspect"] *= np.exp(off[:, 1])
+    many = frames_table(drawn, bodies, UP, G, WATER)
+    for name in (*NUMBERS, "slip_mm_s", "curvature_1_mm"):
+        stated = one[f"s_{name}"]
+        assert many[name].std() == pytest.approx(stated, rel=0.04), name
+        assert abs(many[name].mean() - one[name]) < 0.15 * stated, name
+
+
+def test_numbers_by_hand() -> None:
+    row = frames_table(motion(), body(), UP, G, WATER).iloc[0]
+    speed = np.sqrt(60**2 + 250**2 + 20**2)
+    assert row["slip_mm_s"] == pytest.approx(speed)
+    assert row["reynolds"] == pytest.approx(998.2 * speed * 1e-3 * 3e-3 / 1e-3)
+    assert row["eotvos"] == pytest.approx(998.2 * G * 9e-6 / 0.0728)
+    along = np.array([60, -250, -20]) / speed
+    braking = along @ np.array([0.9, 0.25, -0.5])
+    expected = (
+        4 * 3e-3 / (3 * (speed * 1e-3) ** 2) * (G * 250 / speed - row["added_mass"] * braking)
+    )
+    assert row["drag"] == pytest.approx(expected)
+    assert 0.5 < row["added_mass"] < 0.9
+
+
+def test_liquid_that_moves_is_taken_off() -> None:
+    still = frames_table(motion(), body(), UP, G, WATER).iloc[0]
+    upward = frames_table(motion(), body(), UP, G, {**WATER, "velocity_mm_s": 100.0}).iloc[0]
+    same = frames_table(motion(), body(), UP, G, {**WATER, "velocity_mm_s": [0, -100, 0]}).iloc[0]
+    assert upward["slip_mm_s"] == pytest.approx(np.sqrt(60**2 + 150**2 + 20**2))
+    assert same["drag"] == upward["drag"] > still["drag"]
+    assert upward["curvature_1_mm"] == still["curvature_1_mm"]  # of the path in the laboratory
+
+
+def test_what_is_not_known_is_not_a_number() -> None:
+    none = frames_table(motion(3), None, UP, G)
+    assert list(none) == FRAME_COLUMNS and len(none) == 3
+    assert none[["d_eq_mm", "drag", "reynolds"]].isna().all(axis=None)
+    assert none["slip_mm_s"].notna().all()
+    slow = motion(2).drop(columns=[c for c in motion() if c.endswith("mm_s2")])
+    without = frames_table(slow, body(1), UP, G, WATER)
+    assert without["drag"].isna().all() and without["reynolds"].notna().tolist() == [True, False]
+    round_ = body().assign(aspect=np.nan, s_aspect=np.nan, pole_x=np.nan, r_size_aspect=np.nan)
+    sphere = frames_table(motion(), round_, UP, G, WATER).iloc[0]
+    assert sphere["added_mass"] == pytest.approx(0.5) and np.isfinite(sphere["s_drag"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"viscosity_pa_s": None}, "missing"),
+        ({"viscosity_pa_s": -1.0}, "-1"),
+        ({"viscosity": 1.0}, "unknown key"),
+        ({"gas_density_kg_m3": 2000.0}, "2000"),
+        ({"velocity_mm_s": [1.0, 2.0]}, "velocity"),
+        ({"density_kg_m3": "998"}, "998"),
+    ],
+)
+def test_an_impossible_fluid_is_refused(changes: dict[str, object], word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        frames_table(motion(), body(), UP, G, {**WATER, **changes})
+
+
+def test_fluid_of_rig_toml_and_none() -> None:
+    assert liquid_of(None, G) is None
+    found = liquid_of(WATER, 9.8)
+    assert found is not None and found[0].gravity == 9.8 and found[0].gas_density == 0
+
+
+def test_errors_that_are_not_known_of_what_does_not_matter_add_nothing() -> None:
+    one = np.ones((2, 1))
+    unknown = (one, np.full((2, 1), np.inf))
+    value, sd = propagated(lambda a, b: a[..., 0], [(one, 0.5 * one), unknown])
+    assert value.tolist() == [1, 1] and sd.tolist() == [0.5, 0.5]
+
+
+def test_bodies_of_a_table_without_outlines_are_diameters() -> None:
+    tracks = pd.DataFrame({"frame": [0, 1], "particle": 7, "d_eq_mm": [3.0, np.nan]})
+    bodies, known = bodies_table(tracks, (), UP)
+    assert list(bodies) == BODY_COLUMNS and bodies["d_eq_mm"].tolist() == [3.0]
+    assert known.pairs == 0
+    assert not len(bodies_table(tracks.drop(columns="d_eq_mm").assign(d_eq_mm=np.nan), (), UP)[0])
+
+
+def test_the_mean_of_a_body_keeps_what_frames_have_in_common() -> None:
+    rng = np.random.default_rng(2)
+    ratio = []
+    for _ in range(300):
+        common, own = 0.02 * rng.standard_normal(), 0.01 * rng.standard_normal(400)
+        mean, sd = mean_of_body(3.0 + common + own, np.full(400, np.hypot(0.02, 0.01)))
+        ratio.append((mean - 3.0) / sd)
+    assert np.mean(np.square(ratio)) == pytest.approx(1.0, abs=0.25)
+    assert np.isnan(mean_of_body(np.full(3, np.nan), np.full(3, np.nan))[0])
+
+
+def series(
+    rng: np.random.Generator, f: float, amplitude: float, noise: float
+) -> tuple[object, ...]:
+    t = np.arange(750) / 500
+    kicks = noise * np.sqrt(1 - 0.98**2) * rng.standard_normal((750, 2))
+    wander = np.zeros((750, 2))
+    for i in range(1, 750):
+        wander[i] = 0.98 * wander[i - 1] + kicks[i]
+    angle = rng.uniform(0, 2 * np.pi)
+    swing = np.cos(2 * np.pi * f * t + angle)[:, None] * [0.6, 0.8]
+    return t, amplitude * swing + wander + 10 * t[:, None]
+
+
+def test_an_oscillation_is_found_with_its_errors() -> None:
+    rng = np.random.default_rng(3)
+    off = []
+    for _ in range(60):
+        f = rng.uniform(5, 7)
+        t, values = series(rng, f, 80.0, 10.0)
+        found = dominant_oscillation(t, values)
+        assert found is not None
+        off.append(((found.frequency_hz - f) / found.s_frequency_hz,
+                    (found.major - 80.0) / found.s_major))  # fmt: skip
+        assert found.minor < 5 * found.s_minor
+    nees = np.mean(np.square(off), 0)
+    assert nees.min() > 0.3 and nees.max() < 1.7
+
+
+def test_noise_and_short_records_have_no_oscillation() -> None:
+    rng = np.random.default_rng(4)
+    found = sum(dominant_oscillation(*series(rng, 6.0, 0.0, 10.0)) is not None for _ in range(40))
+    assert found <= 4
+    t, values = series(rng, 6.0, 80.0, 1.0)
+    assert dominant_oscillation(t[:100], values[:100]) is None  # 1.2 periods
+    assert dominant_oscillation(t[:5], values[:5]) is None
+    assert dominant_oscillation(t, np.full((750, 2), np.nan)) is None
+    holes = values.copy()
+    holes[200:260] = np.nan
+    assert dominant_oscillation(t, holes).frequency_hz == pytest.approx(6.0, abs=0.05)
+
+
+def test_a_bubble_is_summarised() -> None:
+    frames = frames_table(motion(400), body(400), UP, G, WATER)
+    liquid = liquid_of(WATER, G)
+    assert liquid is not None
+    found = summary_table(frames, UP, liquid[0])
+    assert list(found) == SUMMARY_COLUMNS and len(found) == 1
+    row = found.iloc[0]
+    assert row["rise_mm_s"] == pytest.approx(0.25) and row["lifetime_s"] == pytest.approx(399 / 500)
+    # 0.02 mm at both ends
+    assert row["s_rise_mm_s"] == pytest.approx(0.02 * 2**0.5 / row["lifetime_s"])
+    assert row["d_eq_mm"] == pytest.approx(3.0) and row["sd_eq_mm"] == pytest.approx(0.03)
+    assert np.isnan(row["zigzag_hz"]) and np.isnan(row["strouhal"])
+    assert row["drag"] == pytest.approx(frames["drag"].mean())
+    alone = summary_table(frames_table(motion(1), None, UP, G), UP)
+    assert alone.loc[0, "rise_mm_s"] == 250.0 and alone.loc[0, "s_rise_mm_s"] == 3.0
+    assert not len(summary_table(frames.iloc[:0], UP))

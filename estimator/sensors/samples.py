@@ -29,6 +29,12 @@ _ALONE, _QUIET = 12, 0.1
 """A spike stands alone: it exceeds the range of the 12 samples on each side, of which none is
 predicted badly. An impact rings."""
 
+_SHIFT_SIGMAS, _LONGEST_SHIFT = 12.0, 256
+_SHIFT_TAPS = 5
+_SHIFT_BACK, _SHIFT_QUIET = 0.15, 0.35
+"""A shift ends with the opposite of the jump with which it begins, up to this share of it, and no
+other jump nearby is larger than this share."""
+
 _LOCAL = 64
 _ROUNDS = 20
 
@@ -107,8 +113,12 @@ def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
     spikes &= ~clipped & ~frozen
     if spikes.any():
         warn(f"{np.count_nonzero(spikes)} of {len(t)} samples are spikes and are not used", spikes)
+    shifted = shifted_samples(np.delete(reading, list(unused), axis=1)) & ~clipped & ~frozen
+    if shifted.any():
+        words = f"{np.count_nonzero(shifted)} of {len(t)} samples are shifted against those before "
+        warn(f"{words}and after, as of a loose cable, and are not used", shifted)
     findings += _gaps(t, where)
-    kept = ~(clipped | frozen | spikes)
+    kept = ~(clipped | frozen | spikes | shifted)
     filled = reading
     if not kept.all() and kept.any():
         filled = np.stack([np.interp(t, t[kept], a[kept]) for a in reading.T], -1)
@@ -269,6 +279,48 @@ def _spikes(signal: Array) -> Bools:
         if last - first > _LONGEST_SPIKE or least < np.ptp(clean[near]) or not quiet:
             hit[first:last] = False
     return hit
+
+
+def shifted_samples(reading: ArrayLike) -> Bools:
+    """Return which samples (N, k), along k axes, lie in a stretch of at most 256 that is shifted.
+
+    A shift begins with a jump between two samples, of 12 standard deviations over all axes, and ends
+    with the opposite jump. No other jump near it is a third as large: an impact rings.
+    A jump is the difference of what straight lines through five samples on each side extrapolate.
+    """
+    from scipy.ndimage import maximum_filter1d
+
+    signal = np.asarray(reading, float)
+    out = np.zeros(len(signal), bool)
+    if len(signal) < 4 * _SHIFT_TAPS or not signal.shape[1]:
+        return out
+    distance = np.arange(_SHIFT_TAPS) + 0.5
+    weights = np.linalg.pinv(np.stack([np.ones(_SHIFT_TAPS), distance], -1))[0]
+    taps = np.concatenate([-weights[::-1], weights])
+    jump = np.zeros_like(signal)
+    inner = slice(_SHIFT_TAPS, len(signal) - _SHIFT_TAPS + 1)
+    jump[inner] = np.stack([np.correlate(a, taps, "valid") for a in signal.T], -1)
+    sd = np.stack([np.maximum(_local_sd(j), quantisation(a)) for j, a in zip(jump.T, signal.T)], -1)
+    relative = np.divide(np.abs(jump), sd, out=np.zeros_like(jump), where=sd > 0)
+    size = np.linalg.norm(relative, axis=1)
+    peak = size == maximum_filter1d(size, 2 * _SHIFT_TAPS - 1)
+    for first in np.flatnonzero(peak & (size > _SHIFT_SIGMAS)):
+        near = slice(max(first - _LONGEST_SHIFT, 0), first + 2 * _LONGEST_SHIFT)
+        others = size[near].copy()
+        others[_about(first - near.start)] = 0
+        last = near.start + int(others.argmax())
+        others[_about(last - near.start)] = 0
+        left = np.abs(jump[first] + jump[last])
+        opposite = left <= _SHIFT_BACK * np.abs(jump[first]).max() + 5 * sd[[first, last]].max(0)
+        quiet = others.max() < _SHIFT_QUIET * min(size[first], size[last])
+        if first < last <= first + _LONGEST_SHIFT and opposite.all() and quiet:
+            out[first:last] = True
+    return out
+
+
+def _about(jump: int) -> slice:
+    """Return the places at which a jump is seen as well."""
+    return slice(max(jump - _SHIFT_TAPS + 1, 0), jump + _SHIFT_TAPS)
 
 
 def _local_sd(residual: Array) -> Array:

@@ -17,6 +17,7 @@ from telerig.estimator.sensors.samples import (
     noise_density,
     sampling_rate,
     screened,
+    shifted_samples,
     spike_samples,
 )
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
@@ -78,6 +79,22 @@ def test_an_impact_is_no_spike() -> None:
     """A knock that rings on for 20 ms is motion."""
     ringing = np.where(T > 0.7, np.exp(-(T - 0.7) / 0.006) * np.sin(2 * np.pi * 300 * (T - 0.7)), 0)
     assert not spike_samples(shaken()[:, 0] + 20 * ringing).any()
+
+
+@pytest.mark.parametrize("length", [5, 20, 200])
+def test_a_shifted_stretch_is_masked(length: int) -> None:
+    reading = shaken()
+    reading[1000 : 1000 + length] += [0.5, -0.3, 0.4]
+    found, words = screen(reading)
+    assert np.flatnonzero(~found.kept).tolist() == list(range(1000, 1000 + length))
+    assert [f"{length} of 3000 samples are shifted" in one for one in words] == [True]
+
+
+def test_an_impact_and_a_jump_that_stays_are_no_shift() -> None:
+    after = np.maximum(T - 0.7, 0)
+    ringing = np.where(T > 0.7, np.exp(-after / 0.006) * np.sin(2 * np.pi * 300 * after), 0)
+    for added in (20 * ringing, 2.0 * (T > 0.7), 2.0 * ((T > 0.7) ^ (T > 1.2)), 30 * after**2):
+        assert not shifted_samples(shaken() + added[:, None] * [1.0, 0.3, -0.5]).any()
 
 
 @pytest.mark.parametrize("length", [10, 200])

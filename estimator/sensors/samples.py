@@ -284,9 +284,9 @@ def _spikes(signal: Array) -> Bools:
 def shifted_samples(reading: ArrayLike) -> Bools:
     """Return which samples (N, k), along k axes, lie in a stretch of at most 256 that is shifted.
 
-    A shift begins with a jump between two samples, of 12 standard deviations over all axes, and ends
-    with the opposite jump. No other jump near it is a third as large: an impact rings.
-    A jump is the difference of what straight lines through five samples on each side extrapolate.
+    A shift begins with a jump between two samples, of 12 standard deviations over all axes, and
+    ends with the opposite jump. No other jump near it is a third as large: an impact rings. A jump
+    is the difference of what straight lines through five samples on each side extrapolate.
     """
     from scipy.ndimage import maximum_filter1d
 
@@ -304,7 +304,7 @@ def shifted_samples(reading: ArrayLike) -> Bools:
     relative = np.divide(np.abs(jump), sd, out=np.zeros_like(jump), where=sd > 0)
     size = np.linalg.norm(relative, axis=1)
     peak = size == maximum_filter1d(size, 2 * _SHIFT_TAPS - 1)
-    for first in np.flatnonzero(peak & (size > _SHIFT_SIGMAS)):
+    for first in np.flatnonzero(peak & (size > _SHIFT_SIGMAS)).tolist():
         near = slice(max(first - _LONGEST_SHIFT, 0), first + 2 * _LONGEST_SHIFT)
         others = size[near].copy()
         others[_about(first - near.start)] = 0

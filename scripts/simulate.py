@@ -59,6 +59,13 @@ def simulate(
             help="Number of dots that each camera sees of a strip that is fixed to the tank [0]."
         ),
     ] = None,
+    accelerometers: Annotated[
+        str | None,
+        typer.Option(
+            help="What carries an accelerometer: names of cameras, for their arms, or carriage, "
+            "joined by commas; or none [none; S0 to S6: every arm]."
+        ),
+    ] = None,
     devices: Annotated[
         bool,
         typer.Option(
@@ -91,7 +98,8 @@ def simulate(
     from telerig.io.simulation.simulate import simulate as run
 
     run_only = {"frames": frames, "bubbles": bubbles}
-    stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale}
+    mounts = None if accelerometers is None else _mounts(preset, accelerometers)
+    stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale, "accelerometers": mounts}
     settings = _with_strip(preset, _settings(preset, run_only, stage), references, images)
     data = run(settings, rng=np.random.default_rng(seed), out=out, images=images)
     say(f"{preset}: {len(data.views)} views of {len(data.rig.cameras)} cameras in {data.path}")
@@ -116,6 +124,26 @@ def _settings(
     any_preset(name)
     given = [*changes, *(key.replace("axis_views", "stage_axis") for key in stage_changes)]
     raise _needs_run(name, " and ".join(given))
+
+
+def _mounts(preset: str, text: str) -> tuple[str, ...]:
+    """Return what carries an accelerometer. Raises InputError for an unknown name."""
+    from telerig.errors import suggestion
+    from telerig.io.rig_file.description import CARRIAGE
+    from telerig.io.simulation.presets import run_preset
+
+    if preset not in preset_names.RUNS or text == "none":
+        return ()
+    known = [*(camera.name for camera in run_preset(preset).calibration.cameras), CARRIAGE]
+    mounts = tuple(name.strip() for name in text.split(","))
+    for mount in mounts:
+        if mount not in known or mounts.count(mount) > 1:
+            raise InputError(
+                f"{mount!r} cannot carry an accelerometer, or stands twice",
+                where="--accelerometers",
+                todo=suggestion(mount, [*known, "none"]),
+            )
+    return mounts
 
 
 def _with_strip(

@@ -29,6 +29,8 @@ PAGES = [
 ]
 ALONE = ("docs/tutorial.md", "docs/tutorial-images.md", "docs/recording.md")
 """Pages that begin in an empty folder."""
+QUICK = ("docs/tutorial.md",)
+"""Pages that are run with all other tests."""
 
 
 @pytest.fixture(scope="session")
@@ -69,8 +71,9 @@ def measured_pixels(folder: Path) -> dict[str, object]:
     return {"uv_left_px": pixels[0], "uv_right_px": pixels[1]}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, marks=[] if p in QUICK else [pytest.mark.slow]) for p in PAGES]
+)
 def test_blocks_run(
     page: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,6 +127,28 @@ def test_output_is_compared() -> None:
     docs_pages.check_output(block, "first\nwritten: 12 mm, twice\n")
     with pytest.raises(AssertionError, match="a page:1"):
         docs_pages.check_output(block, "read: 12 mm\n")
+
+
+@pytest.mark.parametrize(
+    ("page", "printed", "same"),
+    [
+        ("scale 10.04 +- 0.02", "scale 10.049 +- 0.02 px", True),
+        ("scale 10.04 +- 0.02", "scale 10.06 +- 0.02 px", False),
+        ("12 views, RMS 0.0091 px (3.1 s)", "12 views, RMS 0.0092 px (7.9 s)", True),
+        ("12 views", "13 views", True),
+        ("12 views", "14 views", False),
+        ("chi-square 0.98", "chi-square 1.2", False),
+        ("stated 161 um", "stated 155 um", False),
+    ],
+)
+def test_numbers_of_the_tutorial_are_compared(page: str, printed: str, same: bool) -> None:
+    assert docs_pages.like(page, printed) == same
+    block = docs_pages.Block("docs/tutorial.md", 1, "text", f"{page} ...\n")
+    if same:
+        docs_pages.check_output(block, printed)
+        return
+    with pytest.raises(AssertionError, match=r"tutorial\.md:1"):
+        docs_pages.check_output(block, printed)
 
 
 @pytest.mark.slow

@@ -44,6 +44,9 @@ ELSEWHERE = {
 }
 """Pages whose blocks run in a test of their own."""
 
+COMPARED = ("docs/tutorial.md",)
+"""Pages whose numbers have to be those that are printed."""
+
 SENSOR = """
 [accelerometers.arm_left]
 mounted_on = "left"
@@ -167,8 +170,36 @@ def masked(line: str) -> str:
 
 
 def check_output(block: Block, said: str) -> None:
-    """Every line of the block begins a line of the output; numbers may differ, ``...`` ends it."""
-    printed = [masked(line) for line in said.splitlines()]
+    """Every line of the block begins a line of the output, ``...`` ends it; numbers may differ.
+
+    On the pages of `COMPARED` they are compared, see `like`.
+    """
+    printed = said.splitlines()
     for line in block.code.splitlines():
-        wanted = masked(line.removesuffix("...").rstrip())
-        assert any(p.startswith(wanted) for p in printed), f"{block.where}: {line!r} in\n{said}"
+        line = line.removesuffix("...").rstrip()
+        found = [p for p in printed if masked(p).startswith(masked(line))]
+        assert found, f"{block.where}: {line!r} in\n{said}"
+        if block.page in COMPARED:
+            assert any(like(line, p) for p in found), f"{block.where}: {line!r} is\n{found}"
+
+
+def like(line: str, printed: str) -> bool:
+    """Whether the numbers of a page's line are those that were printed.
+
+    A number before ``+- sd`` may differ by half of this standard deviation, a whole number by 1 or
+    2 % of it, seconds by anything, and every other number by 10 % or one unit of its last digit.
+    """
+    for match, other in zip(NUMBER.finditer(line), NUMBER.finditer(printed)):
+        text, after = match[0].strip(".,"), line[match.end() :]
+        value, seen = (float(m[0].rstrip(".,").replace(",", "")) for m in (match, other))
+        sd = re.match(r" \+- ([\d.e-]+\d)", after)
+        decimals = len(text.partition(".")[2])
+        if sd:
+            near = 0.5 * float(sd[1])
+        elif re.match(r" s\b", after):
+            continue
+        else:
+            near = max(10.0**-decimals, (0.1 if decimals else 0.02) * abs(value))
+        if abs(value - seen) > near + 1e-12:
+            return False
+    return True

@@ -44,10 +44,8 @@ def write_calibration(
     images: bool,
     complete: Callable[[RigDescription], RigDescription] = lambda rig: rig,
 ) -> tuple[Mapping[str, Camera], TrueTarget]:
-    """Write `rig.toml`, `calibration/` and `truth/`; the true cameras by name, and the target.
-
-    complete : adds to the rig file what only runs need.
-    """
+    """Write `rig.toml`, `calibration/` and `truth/`; return the true cameras by name, and the
+    target."""
     seed = seed_of(rng)
     scene_rng, dots_rng, image_rng = rng.spawn(3)
     cameras = true_cameras(settings)
@@ -108,10 +106,7 @@ def exact_dots(
     target: TrueTarget,
     views: list[View],
 ) -> pd.DataFrame:
-    """Noise-free pixels of the true centres, one row per view, camera and dot in the image.
-
-    `inside` is 1 where the whole dot lies in the image, ``border_px`` off its border.
-    """
+    """Return the true pixels of all dots in the images; `inside` is 1 for dots off the border."""
     row, column = config.target.row_column_from_id(target.ids)
     tables = []
     for view in views:
@@ -142,10 +137,7 @@ def measured_dots(
     cameras: Mapping[str, Camera],
     rng: np.random.Generator,
 ) -> pd.DataFrame:
-    """Return the rows of ``exact`` whose dot lies wholly inside the image, with noise and outliers.
-
-    exact : table of the true pixels of all dots; its column inside is 1 or 0.
-    """
+    """Return the rows of ``exact`` with inside = 1, with noise and outliers added."""
     dots = exact[exact["inside"] == 1].drop(columns="inside").reset_index(drop=True)
     uv = dots[["u_px", "v_px"]].to_numpy()
     size = np.array([cameras[name].image_size_px for name in dots["camera"]])
@@ -165,10 +157,7 @@ def write_images(
     folder: Path,
     rng: np.random.Generator,
 ) -> None:
-    """Render and write a TIFF image ``folder/<camera>/<view>.tif`` for each camera of each view.
-
-    Missing folders are made. rng : draws the light and the noise of the images.
-    """
+    """Render and write a TIFF image ``folder/<camera>/<view>.tif`` for each camera of each view."""
     import tifffile
 
     for view in views:

@@ -130,7 +130,7 @@ class SimulationConfig:
 
 @dataclass(frozen=True)
 class BubbleConfig:
-    """Sizes, shapes and looks; a range is drawn from evenly, once for each bubble.
+    """Sizes, shapes and looks of bubbles; a range is drawn from evenly, once for each bubble.
 
     d_eq_mm : diameter of the sphere of equal volume; aspect : large over small semi-axis, or
     "wellek" for that of contaminated bubbles in the run's liquid (Wellek 1966); the small one along
@@ -159,7 +159,7 @@ class BubbleConfig:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Paths of the bubbles in the lab.
+    """Paths of the bubbles in the laboratory.
 
     path : "forces" integrates the equation of motion in the run's liquid (`FluidConfig`): buoyancy,
     added mass, drag, and a lift across the velocity of ``lift`` times the buoyancy, which swings at
@@ -170,8 +170,8 @@ class MotionConfig:
     oscillations ``height_oscillation`` and ``lateral_oscillation``.
     wander_mm_s, wander_tau_s : Ornstein-Uhlenbeck velocity on every axis, added to any path.
     spread : half size (x, z) of the space in which bubbles start, over half the image's width.
-    pairs : bubbles come in pairs that share one path and pass each other at ``closest_mm``; they
-    are ``apart_mm`` apart ``apart_s`` later.
+    pairs : two bubbles share a path, pass at ``closest_mm``, and are ``apart_mm`` apart ``apart_s``
+    later.
     """
 
     path: Literal["zigzag", "helix", "stochastic", "forces"] = "zigzag"

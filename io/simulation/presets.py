@@ -1,7 +1,4 @@
-"""Named examples of simulated calibrations and runs.
-
-Every command and its help know a preset that is added here.
-"""
+"""Named examples of simulated calibrations and runs; every command knows a preset added here."""
 
 from __future__ import annotations
 
@@ -27,18 +24,12 @@ Config = TypeVar("Config", bound=SimulationConfig | RunConfig)
 
 
 def preset(name: str, **changes: Any) -> SimulationConfig:
-    """A named calibration with some fields replaced: ``preset("paper", angle_deg=40.0, views=8)``.
-
-    Raises InputError for an unknown name or field.
-    """
+    """A named calibration with fields replaced: ``preset("paper", angle_deg=40.0, views=8)``."""
     return _chosen(PRESETS, name, changes)
 
 
 def run_preset(name: str, **changes: Any) -> RunConfig:
-    """A named run with some fields replaced: ``run_preset("swarm", frames=20, bubbles=40)``.
-
-    Raises InputError for an unknown name or field.
-    """
+    """A named run with some fields replaced: ``run_preset("swarm", frames=20, bubbles=40)``."""
     return _chosen(RUN_PRESETS, name, changes)
 
 
@@ -207,10 +198,7 @@ _CALIBRATIONS = (
 def _scenario(
     name: str, frame_rate_hz: float, shake_hz: float, shake_mm: float, sigma_px: float
 ) -> RunConfig:
-    """A benchmark of the smoother: 0.1 mm/px, 1.5 s (S0: 59 frames), everything measured.
-
-    shake_mm : its amplitude. sigma_px : noise of the detections.
-    """
+    """A benchmark of the smoother: 0.1 mm/px, 1.5 s (S0: 59 frames), everything measured."""
     return RunConfig(
         name,
         _like_paper(name, (1024, 1024), 10.0, 1.0),

@@ -62,8 +62,8 @@ LEAST_ACCELEROMETER_SIGMA = 1e-4
 def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images: bool) -> None:
     """Write a whole dataset into an empty folder: the calibration and `runs/<preset>/`.
 
-    rng : its children draw calibration, run, sensors, pictures and detections apart, so that the
-    same seed gives the same bubbles with images or without.
+    The children of ``rng`` draw each part by itself, so that the same seed gives the same bubbles
+    with images or without.
     """
     seed = seed_of(rng)
     calibration_rng, scene_rng, sensor_rng, image_rng, table_rng, stage_rng = rng.spawn(6)
@@ -369,10 +369,10 @@ def write_stage_axis(
     *,
     images: bool,
 ) -> None:
-    """positions.csv with images or dots.csv in ``folder / "stage_axis"``, and the truth.
+    """Write positions.csv with images or dots.csv into ``folder / "stage_axis"``, and the truth.
 
-    The travel is ``stage.axis_travel_mm``, or less where the target would leave the images.
-    Raises InputError for fewer than three views, or when no pose keeps the target in them.
+    The travel is ``stage.axis_travel_mm``, or less where the target would leave the images. Raises
+    InputError for fewer than three views, or when no pose keeps the target in them.
     """
     if config.stage.axis_views < _LEAST_VIEWS:
         raise InputError(

@@ -26,15 +26,11 @@ def simulate(
 ) -> Dataset:
     """Write a dataset with known truth and load it: a calibration, or a run with its calibration.
 
-    config : the name of a preset, or a configuration
-        (`telerig.io.simulation.presets.preset`,
-        `telerig.io.simulation.presets.run_preset`).
-    rng : the only source of chance; the same seed gives the same bytes, and the same rig, target,
-        poses and bubbles with images or without.
+    config : the name of a preset, or a configuration (`telerig.io.simulation.presets`).
+    rng : the same seed gives the same bytes, and the same rig, target, poses and bubbles with
+    images or without.
     out : a new or empty folder; None makes a temporary one, which the caller may delete.
-    images : render TIFF images; False writes `calibration/dots.csv` with noisy true centres, and
-        the run's `detections.csv`.
-
+    images : render TIFF images; False writes dots.csv and detections.csv with noisy true centres.
     Raises InputError for an unknown preset, demands that no pose meets, or a folder in use.
     """
     settings = any_preset(config) if isinstance(config, str) else config

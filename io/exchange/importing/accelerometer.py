@@ -45,18 +45,13 @@ _SEEN_CELLS = 200
 
 @dataclass(frozen=True)
 class Layout:
-    """Hold where the readings are in a file, and what they mean.
+    """State where the readings are in a file, and what they mean; None uses what the file says.
 
-    channels : names or numbers from 0 of the channels x, y, z; None looks for common names.
-    time : name or number of the channel of times; None looks for a common name, or uses the file's
-    rate.
-    time_unit : one of `TIME_UNITS`; None uses the unit that the file states, or the one by which
-    the times agree with the stated rate or with a possible rate.
-    rate_hz : the sampling rate in Hz, in place of times; None uses what the file has.
+    channels : names or numbers from 0 of the channels x, y, z. time : that of the channel of times.
+    time_unit : one of `TIME_UNITS`. rate_hz : the sampling rate in Hz, in place of times.
     start_s : is added to every time (s), to bring the sensor's clock to that of the run.
-    unit : one of `ACCELERATION_UNITS`, also as "m/s2"; None uses the unit that the file states.
-    scale_m_s2 : the acceleration in m/s^2 that 1 in the file means, one number or three (WAV: for
-    full scale; volts: 9.80665 / (V per g)). It is given in place of ``unit``.
+    unit : one of `ACCELERATION_UNITS`. scale_m_s2 : in its place, the acceleration in m/s^2 that 1
+    in the file means, one number or three (WAV: full scale; volts: 9.80665 / (V per g)).
     group : the group of a TDMS file.
     """
 
@@ -72,11 +67,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Imported:
-    """Hold the readings of one accelerometer, and how the file was understood.
-
-    table : the columns t_s (s), sensor, ax_m_s2, ay_m_s2, az_m_s2 (m/s^2), in the order of time.
-    notes : sentences for the user: channels, unit, times, and what was left out.
-    """
+    """Hold the readings of one accelerometer, and sentences on how the file was understood."""
 
     table: pd.DataFrame
     notes: tuple[str, ...]
@@ -87,10 +78,8 @@ def read_accelerations(
 ) -> pd.DataFrame:
     """Read the recording of one accelerometer from a logger's text file, WAV, MAT or TDMS file.
 
-    sensor : the sensor's name in rig.toml. layout : None looks for common names and units.
     Returns the columns t_s (s), sensor, ax_m_s2, ay_m_s2, az_m_s2 (m/s^2), in the order of time.
-    Raises InputError, naming the file and what it holds, when a channel, the times or the unit are
-    missing, or when a value is not a finite number.
+    Raises InputError when a channel, the times or the unit are missing, or a value is not finite.
     """
     return import_accelerations(path, sensor, layout).table
 
@@ -296,12 +285,8 @@ def _stamps(recording: Recording, name: str) -> Array | None:
 
 
 def _unit_of_times(recording: Recording, values: Array, name: str) -> str:
-    """Return the unit of times that state none.
-
-    It is the one that agrees with the sampling rate that the file states; else the one that makes
-    them times since 1970; else seconds if these give a possible rate.
-    Raises InputError where none does.
-    """
+    """Return the unit of times that state none: by the stated rate, as times since 1970, or
+    seconds."""
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
     if step > 0:
         rates = {unit: 1 / (step * TIME_UNITS[unit]) for unit in ("s", "ms", "us", "ns")}
@@ -368,11 +353,7 @@ def _unit(recording: Recording, name: str, layout: Layout) -> str:
 
 
 def layout_from(options: dict[str, Any]) -> Layout:
-    """Return a `Layout` from the options of a command line.
-
-    channels is "2,3,4" or "x,y,z"; scale_m_s2 is one number or three, separated by commas.
-    Raises InputError for a scale that is not a number.
-    """
+    """Return a `Layout` from the options of a command line. Raises InputError for a bad scale."""
     values = {key: value for key, value in options.items() if value is not None}
     if "channels" in values:
         words = [w.strip() for w in str(values["channels"]).split(",")]
@@ -391,11 +372,7 @@ def layout_from(options: dict[str, Any]) -> Layout:
 
 
 def open_recording(path: Path, group: str | None = None) -> Recording:
-    """Read a file according to its ending, one of `RECORDINGS`.
-
-    group : the group of a TDMS file that has several; None where there is only one.
-    Raises InputError for a file that does not exist or cannot be read.
-    """
+    """Read a file by its ending, one of `RECORDINGS`. Raises InputError when it cannot be read."""
     ending = path.suffix.lower()
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), todo="check the path")

@@ -23,10 +23,7 @@ EXPORT_AGAIN = "export the recording again from the program that made it, or giv
 
 @contextmanager
 def _reading(path: Path, kind: str) -> Iterator[list[warnings.WarningMessage]]:
-    """Turn every error of a library that reads a damaged file into InputError.
-
-    Yields the list to which the library's warnings are added.
-    """
+    """Turn errors of a library that reads a damaged file into InputError; yield its warnings."""
     try:
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
@@ -58,10 +55,7 @@ def read_wav(path: Path) -> Recording:
 
 
 def read_mat(path: Path) -> Recording:
-    """Vectors by their names; the columns of an (N, k) matrix as name_0, name_1, ...
-
-    Fields of a struct are named ``struct.field``. Files of every version are read.
-    """
+    """Read vectors by name (``struct.field``); columns of matrices are name_0, name_1, ..."""
     with _reading(path, "MAT"):
         try:
             content = isolated(partial(loaded_mat, path))

@@ -51,11 +51,7 @@ _AXIS = re.compile(r"(?:^|[^a-z])(?P<a>a|acc|accel|acceleration|accelerometer|be
 
 
 def known_unit(text: str) -> str:
-    """Return the name of a unit of acceleration or time in `ACCELERATION_UNITS` or
-    `TIME_UNITS`.
-
-    text : as a file writes it, such as "m/(s^2)", "[g]" or "µs". Returns "" for anything else.
-    """
+    """Return the name in `ACCELERATION_UNITS` or `TIME_UNITS` of a text like "[µs]", or ""."""
     plain = _plain(text)
     return _SPELLINGS.get(plain, "")
 
@@ -69,10 +65,10 @@ def is_unit(text: str) -> bool:
 
 
 def unit_in(name: str) -> str:
-    """Return the unit that a channel's name states, as `known_unit` names it.
+    """Return the unit that a channel's name states, as `known_unit` names it, or "".
 
-    Returns the text itself for another unit in brackets (``Channel A (mV)``), and "" where the
-    name states none. A range is no unit: ``X (16g)``.
+    Another unit in brackets is returned as it stands: ``Channel A (mV)``. A range, ``X (16g)``, is
+    no unit.
     """
     inside = [match[1].strip() for match in _BRACKETS.finditer(name)]
     after_comma = _BRACKETS.sub("", name).rpartition(",")[2] if "," in name else ""
@@ -87,8 +83,8 @@ def unit_in(name: str) -> str:
 def axes_in(names: Iterable[str]) -> list[tuple[str, str, str]]:
     """Return every three channels whose names differ only in their axis x, y, z.
 
-    Names that speak of an acceleration go before those that are only ``x``, ``y``, ``z``; names of
-    other quantities, such as a gyroscope's, are left out.
+    Names that speak of an acceleration go before plain ``x``, ``y``, ``z``; those of other
+    quantities are left out.
     """
     found: dict[bool, dict[str, dict[str, str]]] = {True: {}, False: {}}
     for name in names:
@@ -126,10 +122,7 @@ def is_counter(name: str) -> bool:
 
 
 def time_unit_in(name: str, stated: Mapping[str, str]) -> str:
-    """Return the unit of a channel of times, one of `TIME_UNITS`, or "" where nothing states it.
-
-    stated : units by channel that the file states apart from the names.
-    """
+    """Return the unit of a channel of times, by its name or as stated, or ""."""
     for unit in (known_unit(stated.get(name, "")), unit_in(name), known_unit(_words(name))):
         if unit in TIME_UNITS:
             return unit

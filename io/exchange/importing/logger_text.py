@@ -49,11 +49,7 @@ _INTERVAL = re.compile(
 
 @dataclass(frozen=True)
 class _Shape:
-    """Hold what most rows have in common.
-
-    separator : one of `_SEPARATORS`. columns : number of cells in a row.
-    measured : for each column, whether its cells are numbers or stamps of a clock.
-    """
+    """Hold separator and number of cells of most rows, and which columns are numbers or stamps."""
 
     separator: str
     columns: int
@@ -76,14 +72,13 @@ class _Shape:
 
 
 def read_logger_text(path: Path) -> Recording:
-    """Read a logger's text file.
+    """Read a logger's text file (UTF-8, UTF-16 or Latin-1).
 
-    Text is UTF-8, UTF-16 or Latin-1. Cells are separated by commas, semicolons, tabs or spaces;
-    numbers may have decimal commas where commas do not separate the cells. Lines that begin with
-    one of `_COMMENTS` are not rows. A line of units below the header, and a sampling rate above it,
-    are used. Without a header the channels are named by their numbers from 0.
-    Raises InputError for a file without rows of numbers, and for a row with another number of
-    cells than most.
+    Cells are separated by commas, semicolons, tabs or spaces; other numbers may have decimal
+    commas. A line of units below the header, and a sampling rate above it, are used. Without a
+    header the channels are named by their numbers from 0.
+    Raises InputError for a file without rows of numbers, and for a row with another number of cells
+    than most.
     """
     text = _text(path)
     lines = text.split("\n")
@@ -244,10 +239,7 @@ def _column(cells: Sequence[str], separator: str) -> tuple[NDArray[Any], set[str
 
 
 def _stated_rate(above: Sequence[str]) -> tuple[float | None, list[str]]:
-    """Return the sampling rate in Hz that the lines above the table state, and a note about it.
-
-    Returns None where they state none, or several.
-    """
+    """Return the sampling rate in Hz that the lines above the table state, and a note about it."""
     found: dict[float, int] = {}
     for i, line in enumerate(above, 1):
         for match in _RATE.finditer(line):

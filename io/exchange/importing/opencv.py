@@ -36,12 +36,10 @@ def read_opencv_cameras(
 ) -> ImportedCameras:
     """Read a stereo calibration of OpenCV (YAML, XML or JSON): two pinhole cameras.
 
-    The world frame is that of OpenCV's first camera.
     paths : one file with everything, or several: intrinsics and extrinsics, or one file for each
     camera (in their order) and one with R and T.
     image_size_px : (width, height) in px; None where a file has image_width and image_height.
     unit_mm : the length in mm that was given to OpenCV as 1 (1000 for metres).
-    names : the names that the two cameras get.
     Raises InputError when something is missing, and for distortion beyond k1 k2 p1 p2 k3 s1..s4.
     """
     if not unit_mm > 0:

@@ -28,13 +28,10 @@ _WIDTHS = {"image size": 2, "camera matrix": 3, "rotation matrix": 3, "translati
 def read_openlpt_cameras(
     paths: Sequence[str | PathLike[str]], names: Sequence[str] | None = None
 ) -> ImportedCameras:
-    """Read the pinhole cameras of OpenLPT text files.
+    """Read the pinhole cameras of OpenLPT text files; names default to the files' names.
 
-    The rig frame is the first camera's; its origin lies where the first two optical axes come
-    closest (for one camera: at the depth of the world's origin).
-    names : the cameras' names; None takes the files' names without extension.
-    Raises InputError for files that cannot be read or contain another camera model, for distortion
-    that telerig's model cannot express exactly, and for cameras of unequal handedness.
+    Raises InputError for files that cannot be read or contain another camera model, and as
+    `cameras_from_pinholes` does.
     """
     files = [_read(Path(p)) for p in paths]
     if not files:

@@ -59,11 +59,11 @@ def read_openptv_cameras(
     sensor: Sensor,
     names: Sequence[str] | None = None,
 ) -> ImportedCameras:
-    """Cameras of `.ori` files (with the `.addpar` beside each).
+    """Read the cameras of `.ori` files, with the `.addpar` file beside each.
 
-    sensor : of all cameras; see `read_ptv_par`. names : default the files' names up to the first
-    point. Raises InputError for files that cannot be read and for distortion that cannot be
-    fitted within `WORST_FIT_PX`.
+    sensor : see `read_ptv_par`. names : by default the files' names up to the first point. Raises
+    InputError for files that cannot be read and distortion that cannot be fitted within
+    `WORST_FIT_PX`.
     """
     files = [_read(Path(p)) for p in paths]
     if not files:
@@ -90,10 +90,10 @@ def read_openptv_cameras(
 
 
 def read_ptv_par(path: str | PathLike[str]) -> Sensor:
-    """Image and pixel size of OpenPTV's ptv.par.
+    """Read image and pixel size from OpenPTV's ptv.par.
 
-    Raises InputError when it cannot be read, and for refraction (indices that differ): a pinhole
-    camera does not have it.
+    Raises InputError when it cannot be read, and for refraction, which a pinhole camera does not
+    have.
     """
     file = Path(path)
     lines = read_text(file).split("\n")

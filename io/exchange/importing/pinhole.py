@@ -36,7 +36,7 @@ class Pinhole:
     """One camera: pixel = camera_matrix (rotation X + translation), homogeneous.
 
     where : the file, for errors. camera_matrix (3, 3), rotation (3, 3), translation_mm (3,) from
-    the world. distortion : (up to 14,) in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 ...
+    the world. distortion : (up to 14,) in OpenCV's order.
     """
 
     where: str
@@ -204,11 +204,7 @@ def _camera(name: str, one: Pinhole, upper: Array, distance_mm: float, pose: Pos
 
 
 def nominal_toml(cameras: Sequence[Camera]) -> str:
-    """The tables [cameras.*] and [stereo] of rig.toml, for a calibration to start from.
-
-    docs/files.md says what else rig.toml needs. Raises InputError for more cameras than a
-    rig has.
-    """
+    """Return the tables [cameras.*] and [stereo] of rig.toml, for a calibration to start from."""
     if not 1 <= len(cameras) <= MOST_CAMERAS:
         todo = f"rig.toml describes one to {MOST_CAMERAS}"
         raise InputError(f"{len(cameras)} cameras", todo=todo)

@@ -14,14 +14,10 @@ from telerig.errors import InputError
 class Recording:
     """Hold the channels of a sensor's file before they are converted.
 
-    where : the file, for errors. channels : name -> (samples,) raw values; text where a channel
-    has no numbers.
-    units : name -> unit, for the channels that state one apart from their name.
-    rate_hz : sampling rate in Hz; None where the file does not state it.
-    offset_s : the time of the first sample in s.
-    lines : (samples,) the line of the file that each sample is in, from 1; None where the file
-    has no lines.
-    notes : sentences for the user about what was left out.
+    where : the file, for errors. channels : (samples,) raw values by name; text where a channel has
+    no numbers. units : by name, for channels that state one apart from their name.
+    rate_hz : None where the file states none. offset_s : the time of the first sample.
+    lines : (samples,) the line of the file of each sample, from 1. notes : for the user.
     """
 
     where: str

@@ -16,7 +16,6 @@ def merge_accelerations(table: pd.DataFrame, path: str | PathLike[str]) -> list[
     """Write ``table`` to `accelerometer.csv`, and keep the readings of other sensors in that file.
 
     Returns the names of the sensors whose earlier readings were replaced.
-    Raises InputError when the existing file cannot be read, or the new one cannot be written.
     """
     file = Path(path)
     replaced: list[str] = []
@@ -30,11 +29,7 @@ def merge_accelerations(table: pd.DataFrame, path: str | PathLike[str]) -> list[
 
 
 def imported_records(path: str | PathLike[str]) -> dict[str, pd.DataFrame]:
-    """Return the readings of each sensor in `accelerometer.csv`, in the order of the file.
-
-    Returns an empty mapping where the file does not exist. Raises InputError when it cannot be
-    read.
-    """
+    """Return the readings of each sensor in `accelerometer.csv`, {} where there is no file."""
     file = Path(path)
     if not file.is_file():
         return {}
@@ -43,7 +38,7 @@ def imported_records(path: str | PathLike[str]) -> dict[str, pd.DataFrame]:
 
 
 def remove_accelerations(sensor: str, path: str | PathLike[str]) -> int:
-    """Remove the readings of a sensor from `accelerometer.csv`, or the file if none are left.
+    """Remove the readings of a sensor from `accelerometer.csv`, and the file if none are left.
 
     Returns their number. Raises InputError when the file has none of this sensor.
     """

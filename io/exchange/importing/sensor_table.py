@@ -20,10 +20,8 @@ _MOSTLY = 0.9
 def sensor_toml(name: str, table: pd.DataFrame, cameras: Sequence[str]) -> str:
     """Return the table [accelerometers.<name>] for rig.toml.
 
-    table : the sensor's readings with the columns t_s and `AXES`. cameras : names of the rig's
-    cameras.
-    The axis that reads gravity points up, which is -y in the rig frame of a level first camera.
-    The directions of the other two, and the sensor's place, are the user's to state.
+    The axis that reads gravity points up, which is -y in the rig frame of a level first camera. The
+    user states the directions of the other two, and the sensor's place.
     """
     readings = table[AXES].to_numpy()
     rows = ", ".join(str(row) for row in _axes(readings.mean(0)))
@@ -55,8 +53,8 @@ def _axes(mean_m_s2: Array) -> list[list[int]]:
 
 
 def _noise_density(t_s: Array, readings_m_s2: Array) -> float:
-    """Return the noise density in micro-g per root hertz by which samples scatter about their
-    neighbours, that of the noisiest axis."""
+    """Return the noise density in micro-g per root hertz of the noisiest axis, from second
+    differences."""
     if len(t_s) < 4:
         return 100.0
     bend = np.abs(np.diff(readings_m_s2, 2, axis=0)) / np.sqrt(6)

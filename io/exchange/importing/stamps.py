@@ -29,9 +29,8 @@ def is_stamp(text: str) -> bool:
 def seconds_of(stamps: Sequence[str]) -> Array | None:
     """Return the (N,) times in s since the first stamp; None if a text is not a time of day.
 
-    stamps : dates with times of day, or times of day alone, which may go on beyond midnight.
-    In dates with slashes the order of day and month follows from the stamps: it is the one that is
-    possible and in which the record takes less time. A zone is not used.
+    Stamps may lack dates and go on beyond midnight. In dates with slashes the order of day and
+    month is the one that is possible and in which the record takes less time. A zone is not used.
     """
     matches = [_STAMP.fullmatch(text.strip()) for text in stamps]
     clock, dates = np.empty(len(matches)), []

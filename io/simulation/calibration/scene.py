@@ -48,10 +48,8 @@ def nominal_rotation(config: SimulationConfig, camera: int = 1) -> Array:
 
 
 def true_cameras(config: SimulationConfig) -> Mapping[str, Camera]:
-    """Return the true cameras of the simulated rig, by name.
-
-    The rig's origin is where the optical axes of the first two cameras come closest. A single
-    camera is the rig frame itself, so its optical axis passes through the origin.
+    """Return the true cameras by name; the rig's origin is where the first two optical axes come
+    closest.
 
     Raises InputError unless there are one to four cameras of different names.
     """
@@ -151,10 +149,7 @@ def hand_held_views(
     target: TrueTarget,
     rng: np.random.Generator,
 ) -> list[View]:
-    """Return views whose random poses of the target meet the demands of ``config``.
-
-    Raises InputError if no pose is found that meets them.
-    """
+    """Return random views that meet ``config``. Raises InputError if no such pose is found."""
     names = tuple(cameras)
     groups = config.seen_by or (names,)
     unknown = sorted({name for group in groups for name in group} - set(names))
@@ -177,11 +172,8 @@ def hand_held_views(
 def _plate_normals(
     config: SimulationConfig, cameras: list[Camera], rng: np.random.Generator
 ) -> Array:
-    """Return N allowed directions (N, 3) of the target's z axis in the rig frame.
-
-    They are spread evenly over the directions whose angle to the optical axis of each camera is
-    within ``tilt_deg`` of ``config``. Raises InputError if there are hardly any.
-    """
+    """Return directions (N, 3) of the target's z axis, evenly spread, within ``tilt_deg`` of each
+    camera."""
     directions = rng.standard_normal((_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     axes = np.array([camera.camera_from_rig.rotation[2] for camera in cameras])

@@ -17,9 +17,8 @@ _SPECK_REACH = 3.5
 class Screen:
     """Describe a smooth bright field that is known everywhere, so that it can move in the image.
 
-    level : grey level at the image's middle as a fraction of full scale.
-    gradient : (2,) relative change over half the image's diagonal, along u and v.
-    vignetting : relative loss in the corners; it does not move with the screen.
+    level : grey level at the image's middle as a fraction of full scale. gradient : (2,) relative
+    change over half the image's diagonal, along u and v. vignetting : relative loss in the corners.
     waves_per_px : (waves, 2) angular wave numbers of the texture in rad/px.
     amplitude, phase_rad : (waves,) relative amplitude and phase in rad of each wave.
     """
@@ -32,11 +31,9 @@ class Screen:
     phase_rad: Array
 
     def image(self, size_px: tuple[int, int], shift_px: Array) -> Float32:
-        """Return the image (height, width) of the screen as fractions of full scale.
+        """Return the image (height, width) with texture and gradient moved by shift_px (2,).
 
-        size_px : (width, height) in px. shift_px : (2,) displacement of texture and gradient in px.
-        Each plane wave is a product of two, so the image is one product of narrow matrices. The
-        gradient becomes flat far from the middle.
+        Each plane wave is a product of two, so the image is one product of narrow matrices.
         """
         width, height = size_px
         u, v = np.arange(width) - shift_px[0], np.arange(height) - shift_px[1]
@@ -66,11 +63,7 @@ def random_screen(
     texture: float,
     wavelength_px: tuple[float, float] = (60.0, 600.0),
 ) -> Screen:
-    """Draw a screen with waves and a gradient in random directions.
-
-    level, gradient, vignetting : see `Screen`. texture : RMS of the waves relative to the level.
-    wavelength_px : the shortest and the longest wavelength in px.
-    """
+    """Draw a screen with waves (RMS ``texture``, relative) and a gradient in random directions."""
     angle = rng.uniform(0, 2 * np.pi, _WAVES)
     length = _log_uniform(rng, wavelength_px, _WAVES)
     waves = 2 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -83,21 +76,16 @@ def random_screen(
 
 @dataclass(frozen=True)
 class Specks:
-    """Describe specks of dirt.
-
-    uv_px : (specks, 2) places in px without displacement. sigma_px : (specks,) radius (standard
-    deviation of a Gaussian) in px. depth : (specks,) share of the light that is absorbed.
-    """
+    """Describe specks of dirt: places (specks, 2), sd of a Gaussian (px), and share of light
+    absorbed."""
 
     uv_px: Array
     sigma_px: Array
     depth: Array
 
     def darken(self, image: Float32, shift_px: Array) -> None:
-        """Multiply ``image`` (height, width) in place by the transmission of the specks.
-
-        shift_px : (2,) displacement of all specks in px.
-        """
+        """Multiply ``image`` (height, width) in place by the transmission of the specks, moved by
+        shift_px."""
         height, width = image.shape
         reach = np.ceil(_SPECK_REACH * self.sigma_px)
         places = self.uv_px + shift_px
@@ -122,10 +110,7 @@ def random_specks(
     sigma_px: tuple[float, float],
     depth: tuple[float, float],
 ) -> Specks:
-    """Draw ``count`` specks, evenly distributed in the rectangle from low_px to high_px.
-
-    low_px, high_px : (2,) corners in px. sigma_px, depth : the smallest and the largest value.
-    """
+    """Draw ``count`` specks, evenly distributed in the rectangle between two corners (2,)."""
     places = rng.uniform(low_px, high_px, (count, 2))
     sigma = _log_uniform(rng, sigma_px, count)
     return Specks(places, sigma, rng.uniform(*depth, count))

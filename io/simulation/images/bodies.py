@@ -62,11 +62,8 @@ def bodies_about(
     *,
     d_eq_mm: ArrayLike | None = None,
 ) -> Bodies:
-    """Bodies whose centre of volume is ``centre_mm``, scaled to the diameter ``d_eq_mm`` if given.
-
-    centre_mm : (..., 3); rotation : (..., 3, 3); semi_axes_mm : (..., 3); modes : (..., 21);
-    d_eq_mm : (...). The semi-axes then give only proportions.
-    """
+    """Return bodies with the given centres of volume (..., 3), scaled to the diameters (...) if
+    given."""
     centre, turn = np.asarray(centre_mm, float), np.asarray(rotation, float)
     axes, amplitudes = np.asarray(semi_axes_mm, float), np.asarray(modes, float)
     volume, offset = _sphere_moments(amplitudes)
@@ -78,10 +75,7 @@ def bodies_about(
 
 
 def volume_mm3(bodies: Bodies) -> Array:
-    """Return the exact volumes (...) in mm^3.
-
-    The quadrature integrates polynomials of degree 23 exactly; the volume has degree 12.
-    """
+    """Return the volumes (...) in mm^3; the quadrature is exact."""
     return np.asarray(_sphere_moments(bodies.modes)[0] * np.prod(bodies.semi_axes_mm, -1))
 
 
@@ -98,10 +92,8 @@ def volume_centre_mm(bodies: Bodies) -> Array:
 
 
 def surface_modes(directions: Array) -> Array:
-    """Return the real spherical harmonics (..., 21) at unit vectors (..., 3).
-
-    Each has the greatest absolute value 1. Their order is that of `MODES`.
-    """
+    """Return the real spherical harmonics (..., 21) at unit vectors (..., 3), in the order of
+    `MODES`."""
     x, y, z = np.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     xy, minus = 2 * x * y, xx - yy
@@ -122,11 +114,11 @@ def surface_modes(directions: Array) -> Array:
 
 
 def outline_px(bodies: Bodies, camera: Camera, count: int = 128) -> Array:
-    """(..., count, 2) the silhouettes' outlines in a camera; ``bodies`` in the rig frame.
+    """Return the outlines (..., count, 2) of bodies in the rig frame, in px, even in a smooth
+    parameter.
 
     Points of the rim are found for the ray through the body's origin and projected one by one:
-    exact without residual perspective kappa, else within size * (kappa size)^2 / 8.
-    They follow each other evenly in a parameter in which the outline is smooth.
+    exact for kappa = 0, else within size * (kappa size)^2 / 8.
     """
     shape = bodies.origin_mm.shape[:-1]
     uv = camera.project(bodies.origin_mm.reshape(-1, 3))
@@ -135,10 +127,8 @@ def outline_px(bodies: Bodies, camera: Camera, count: int = 128) -> Array:
 
 
 def rim_mm(bodies: Bodies, direction: ArrayLike, count: int = 128) -> Array:
-    """Return the points (..., count, 3) in mm of the surface that form its outline.
-
-    direction : (..., 3) the direction of view, in the bodies' frame.
-    """
+    """Return the points (..., count, 3) in mm that form the outline seen along ``direction`` (...,
+    3)."""
     axes = _viewing_axes(bodies, np.asarray(direction, float))
     angle = np.arange(count) * 2 * np.pi / count
     across = axes[..., None, 0, :] * np.cos(angle)[:, None] + axes[..., None, 1, :] * np.sin(
@@ -155,9 +145,10 @@ def rim_mm(bodies: Bodies, direction: ArrayLike, count: int = 128) -> Array:
 
 
 def outline_moments(outline_px: ArrayLike) -> tuple[Array, Array, Array]:
-    """Area (...), centroid (..., 2) and second central moments per area (..., 2, 2) inside.
+    """Return area (...), centroid (..., 2) and central second moments per area (..., 2, 2) of
+    outlines.
 
-    Contour integrals with spectral derivatives: exact to rounding for smooth closed outlines
+    They are contour integrals with spectral derivatives, exact to rounding for closed outlines
     (..., N, 2) whose points are even in a smooth parameter.
     """
     points = np.asarray(outline_px, float)

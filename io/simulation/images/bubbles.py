@@ -28,14 +28,11 @@ _STILL_PX = 0.02
 
 @dataclass(frozen=True)
 class Look:
-    """How a bubble's inside looks, in transmission.
+    """Describe how a bubble's inside looks, in transmission; lengths are relative to its radius.
 
-    rim : of the dark part. heart : of the bright middle at its brightest (rim: no heart).
-    heart_radius : where the heart is half as bright, over the silhouette's radius.
-    heart_sharpness : exponent of the heart's fall; 2.5 as in real images, 20 and more a disc.
-    heart_offset : (2,) of the heart's middle from the silhouette's, over the radius.
-    ring : transmission of a faint ring at ring_radius, ring_width wide (over the radius), up to
-    twice as bright below and fading above.
+    rim : of the dark part. heart : of the bright middle (equal to rim: no heart), half as bright at
+    heart_radius, with the exponent heart_sharpness (2.5 as in real images, from 20 on a disc).
+    ring : of a faint ring at ring_radius, up to twice as bright below and fading above.
     """
 
     rim: float = 0.1
@@ -48,7 +45,7 @@ class Look:
     ring_width: float = 0.05
 
     def transmission(self, du: Array, dv: Array, axes: Array) -> Float32:
-        """(len(dv), len(du)) at offsets in px from the silhouette's centroid.
+        """Return (len(dv), len(du)) at offsets in px from the silhouette's centroid.
 
         axes : (2, 2) px, maps the unit circle to the ellipse of the silhouette's moments.
         """
@@ -79,11 +76,8 @@ def _square(du: Array, dv: Array, metric: Array) -> Float32:
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A bubble as one camera sees it in one frame.
-
-    outline_px : (N, 2) as `telerig.io.simulation.images.bodies.outline_px` gives it.
-    blur_px : Gaussian sigma, defocus included; smear_px : (2,) motion during the exposure.
-    """
+    """A bubble as one camera sees it: outline (N, 2), Gaussian blur with defocus, motion during
+    exposure."""
 
     outline_px: Array
     look: Look
@@ -168,10 +162,10 @@ def render_bubbles(
     lab_shift_px: Array | None = None,
     gain: float = 1.0,
 ) -> Float32:
-    """(height, width) noise-free grey levels as fractions of full scale.
+    """Return the grey levels (height, width) without noise, as fractions of full scale.
 
-    screen_shift_px, lab_shift_px : (2,) how far the screen and what is fixed to the lab (dirt on
-    the tank's windows) have moved in the image since stage position 0.
+    screen_shift_px, lab_shift_px : (2,) how far the screen and the tank's windows have moved in the
+    image since stage position 0.
     """
     image = screen.image(size_px, np.asarray(screen_shift_px, float))
     image *= transmission(size_px, bubbles)

@@ -32,8 +32,8 @@ class Light:
 
     gain : factor at the image's centre. gradient : (2,) relative change over half the diagonal,
     along u and v. vignetting : relative loss in the corners.
-    glare : (u_px, v_px, radius_px, strength) of a Gaussian spot, its strength as a fraction of full
-    scale; None for no glare.
+    glare : (u_px, v_px, radius_px, strength) of a Gaussian spot; the strength is a fraction of full
+    scale.
     """
 
     gain: float = 1.0
@@ -45,12 +45,7 @@ class Light:
 def render(
     camera: Camera, rig_from_target: Pose, plate: Plate, light: Light, *, blur_px: float
 ) -> Array:
-    """Render the image of a dotted plate without noise.
-
-    rig_from_target : the plate's pose. blur_px : standard deviation in px of the isotropic Gaussian
-    point spread function.
-    Returns (height, width) grey levels as fractions of full scale.
-    """
+    """Render a dotted plate without noise, (height, width) as fractions of full scale."""
     width, height = camera.image_size_px
     dots = disc_coverage(
         camera, rig_from_target, plate, plate.dots_mm, plate.diameter_mm, plate.hole_mm, blur_px
@@ -86,10 +81,7 @@ def disc_coverage(
     hole_mm: Array,
     blur_px: float,
 ) -> Array:
-    """(height, width) share of each pixel that discs cover, blurred; 1 well inside a disc.
-
-    centres_mm : (N, 3); diameter_mm, hole_mm : (N,). Each disc is traced in a window of its own.
-    """
+    """Return the share (height, width) of each pixel that N discs cover, blurred."""
     width, height = camera.image_size_px
     near = _near_image(camera, rig_from_target, plate, centres_mm, diameter_mm, blur_px)
     centres, diameter, hole = centres_mm[near], diameter_mm[near], hole_mm[near]
@@ -158,10 +150,10 @@ def _cell_coverage(nodes: Array, size: Ints, radius_mm: float) -> Array:
 
 
 def _half_plane_share(depth: Array, slope: Array) -> Array:
-    """(N,) share of a unit cell on the inner side of a straight edge.
+    """Return the share (N,) of a unit cell inside a straight edge.
 
-    depth : (N,) signed distance of the cell's centre inside the edge, in the units of slope;
-    slope : (N, 2) change of that distance per cell along u and v.
+    depth : (N,) distance of the cell's centre inside the edge. slope : (N, 2) its change per cell
+    along u and v.
     """
     steep = np.abs(slope).max(-1)
     flat = np.abs(slope).min(-1)
@@ -246,10 +238,8 @@ class Plate:
 def plate_from_pixel(
     camera: Camera, rig_from_target: Pose, uv_px: ArrayLike, plate: Plate, z_mm: ArrayLike = 0.0
 ) -> Array:
-    """Return where the rays of pixels (..., 2) meet the plane at height ``z_mm`` of the target.
-
-    The result is (..., 2), x and y in mm in the target's frame.
-    """
+    """Return where the rays of pixels (..., 2) meet the plane ``z_mm`` of the target, (..., 2) in
+    mm."""
     origin, direction = camera.unproject(uv_px)
     target_from_rig = rig_from_target.inverse()
     origin = target_from_rig.apply(np.atleast_2d(origin))
@@ -262,11 +252,10 @@ def plate_from_pixel(
 def pixel_from_plate(
     camera: Camera, rig_from_target: Pose, points_mm: ArrayLike, plate: Plate
 ) -> Array:
-    """Project points on the plate, (..., 3) in mm in the target's frame, to pixels (..., 2) in px.
+    """Project points on the plate, (..., 3) in mm in the target's frame, to pixels (..., 2).
 
-    A camera behind the plate sees them through the glass. A ray's shift by the glass depends on its
-    direction, which all rays share for kappa = 0; otherwise it is found by iteration, whose error
-    shrinks in each step by a factor of about kappa times the thickness.
+    A camera behind the plate sees them through the glass. The ray's shift depends on its direction;
+    for kappa != 0 it is found by iteration.
     """
     points = np.asarray(points_mm, float)
     uv = camera.project(rig_from_target.apply(points))

@@ -21,13 +21,11 @@ def digitise(
 ) -> Image:
     """Convert grey levels to the noisy integers that a camera delivers.
 
-    grey : (height, width) fractions of full scale. Noise is computed in its precision.
-    read_noise : standard deviation; shot_noise : standard deviation at full scale (it grows with
-    the root of the grey level). Both are fractions of full scale.
-    left_aligned : True puts data of fewer than 16 bits into the high bits of 16, as many cameras
-    do.
-    Returns (height, width) uint8 for 8 bits, otherwise uint16, clipped at full scale.
-    Raises InputError for a bit depth outside 8..16.
+    grey : (height, width) fractions of full scale. read_noise : standard deviation. shot_noise :
+    standard deviation at full scale, which grows with the root of the grey level. left_aligned :
+    puts data of fewer than 16 bits into the high bits of 16.
+    Returns (height, width) uint8 for 8 bits, otherwise uint16. Raises InputError outside 8 to 16
+    bits.
     """
     if not 8 <= bit_depth <= 16:
         raise InputError(f"a bit depth of {bit_depth}", todo="choose 8 to 16 bits")

@@ -82,10 +82,10 @@ def random_strips(scene: RunScene, rng: Generator) -> list[Strip]:
 def strip_places(
     camera: Camera, position_mm: Array, count: int, rng: Generator, *, at: float, jitter: float
 ) -> Array:
-    """(K, 3) lab places of a strip along the travel at uneven heights.
+    """Return (K, 3) lab places of a strip along the travel, ``count`` in view at a time.
 
-    count : in view at a time. at : where it stands, on a side drawn by ``rng``, from the image's
-    middle over half its width. jitter : of the heights, over their spacing.
+    at : where it stands, on a random side, from the image's middle over half its width. jitter : of
+    the heights, over their spacing.
     """
     size = np.array(camera.image_size_px) - 1
     height_mm = size[1] / camera["scale_px_per_mm"]
@@ -100,11 +100,7 @@ def strip_places(
 
 
 def references_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
-    """`references.csv`: marks fixed to the tank, which pass through the image as the stage moves.
-
-    Each camera has a strip of its own, at unknown uneven heights, so many in view at a time as
-    the configuration says.
-    """
+    """Return `references.csv`: marks on a strip for each camera, which pass through the image."""
     table = scene.config.table
     parts = []
     for j, (name, camera) in enumerate(scene.cameras.items()):
@@ -125,10 +121,9 @@ def references_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
 
 
 def strip_truth(scene: RunScene, strips: Sequence[Strip]) -> pd.DataFrame:
-    """`truth/runs/<run>/references.csv`: every dot that reaches into an image.
+    """Return `truth/runs/<run>/references.csv`: every dot that reaches into an image.
 
-    frame, camera, dot (its number in that camera's strip), u_px, v_px of the projected centre,
-    x_lab_mm, y_lab_mm, z_lab_mm, and whole: 1 when no part of it lies outside the image.
+    The column whole is 1 when no part of the dot lies outside the image.
     """
     parts = []
     for j, (name, strip) in enumerate(zip(scene.cameras, strips)):

@@ -25,10 +25,7 @@ MICRO_G_M_S2 = 1e-6 * GRAVITY_M_S2
 
 @dataclass(frozen=True)
 class LinearProcess:
-    """x' = drift x + input * w, w white noise of unit two-sided density.
-
-    drift : (n, n) 1/s; noise_input : (n,).
-    """
+    """The process x' = drift x + input * w, with w white noise of unit two-sided density."""
 
     drift: Array
     noise_input: Array
@@ -43,10 +40,10 @@ class LinearProcess:
         return np.asarray(solve_continuous_lyapunov(self.drift, -noise))
 
     def discretised(self, step_s: float) -> tuple[Array, Array]:
-        """Transition (n, n) and a square root (n, n) of the step's noise covariance.
+        """Return transition (n, n) and a square root (n, n) of the noise covariance of a step.
 
-        Van Loan's exponential holds e^(-F t), which is huge for fast states: it is taken for a
-        fraction of the step, and doubled.
+        Van Loan's exponential holds e^(-F t), huge for fast states: it is taken for a part of the
+        step, and doubled.
         """
         doublings = max(
             0, int(np.ceil(np.log2(np.linalg.norm(self._rates(), 2) * step_s + 1e-300)))
@@ -58,10 +55,10 @@ class LinearProcess:
         return transition, square_root(covariance)
 
     def _van_loan(self, step_s: float) -> tuple[Array, Array]:
-        """Transition and noise covariance (n, n) of a short step.
+        """Return transition and noise covariance (n, n) of a short step.
 
-        Integrals of white noise of different orders differ by powers of the step; they are
-        scaled before the exponential, else the smallest drown in rounding.
+        Integrals of white noise differ by powers of the step: they are scaled before the
+        exponential, else the smallest drown in rounding.
         """
         from scipy.linalg import expm
 
@@ -105,10 +102,8 @@ class LinearProcess:
         paths: int = 1,
         start_covariance: Array | None = None,
     ) -> Array:
-        """(paths, steps, n) samples every step_s from a random start.
-
-        start_covariance : (n, n) of the start; None for the stationary one.
-        """
+        """Return samples (paths, steps, n) from a random start, by default from the stationary
+        state."""
         start = self.stationary_covariance() if start_covariance is None else start_covariance
         transition, root = self.discretised(step_s)
         n = len(self.noise_input)
@@ -129,10 +124,8 @@ def square_root(covariance: Array) -> Array:
 
 
 def ornstein_uhlenbeck(sigma: float, tau_s: float) -> LinearProcess:
-    """States (integral, value): a velocity of RMS sigma that forgets within tau_s.
-
-    The integral, a displacement, has no stationary state: start it at 0.
-    """
+    """States (integral, value): a velocity of RMS sigma that forgets within tau_s. Start the
+    integral at 0."""
     return LinearProcess(
         np.array([[0.0, 1.0], [0.0, -1 / tau_s]]), np.array([0.0, sigma * np.sqrt(2 / tau_s)])
     )
@@ -146,10 +139,10 @@ def oscillator(rms: float, frequency_hz: float, damping: float) -> LinearProcess
 
 
 def rig_mode(rms: float, frequency_hz: float, damping: float, force_hz: float) -> LinearProcess:
-    """States (displacement, velocity, force, force's slope) of a structure's mode.
+    """States (displacement, velocity, force, its slope) of a structure's mode with displacement RMS
+    rms.
 
-    The force is white noise through two critically damped poles at force_hz; rms is that of the
-    displacement. The acceleration follows from the states, see `mode_acceleration`.
+    The force is white noise through two critically damped poles at force_hz.
     """
     w, f = 2 * np.pi * frequency_hz, 2 * np.pi * force_hz
     drift = np.array(
@@ -242,10 +235,11 @@ def stochastic_paths(
     height_oscillation: tuple[float, float, float],
     lateral_oscillation: tuple[float, float, float],
 ) -> Path:
-    """Bubbles' paths: steady rise, Ornstein-Uhlenbeck velocity and a stochastic oscillation.
+    """Return paths (B, steps) with steady rise, Ornstein-Uhlenbeck velocity and stochastic
+    oscillation.
 
-    rise_mm_s : (B,); the path's fields have the shape (B, steps) and (B, steps, 2). The
-    oscillations are (RMS mm, frequency Hz, damping), one vertical, one on each lateral axis.
+    rise_mm_s : (B,). The oscillations are (RMS mm, frequency Hz, damping), one vertical, one on
+    each lateral axis.
     """
     rise = np.asarray(rise_mm_s, float)
     count = len(rise)
@@ -352,8 +346,7 @@ def stage_trajectory(
 ) -> tuple[Array, Array, Array]:
     """Return position (mm), velocity (mm/s) and acceleration (mm/s^2) of a start from rest at 0 s.
 
-    t_s : times in s of any shape, which the three results have too. ramp_s : duration in s of the
-    acceleration; the velocity rises like half a cosine, so the acceleration has no step.
+    The velocity rises like half a cosine during ramp_s, so the acceleration has no step.
     """
     t = np.asarray(t_s, float)
     if ramp_s == 0:
@@ -367,10 +360,8 @@ def stage_trajectory(
 
 @dataclass(frozen=True)
 class Shake:
-    """Hold the cameras' offsets from the carriage, and their first and second derivative in time.
-
-    Each array is (cameras, steps, axes), in mm, mm/s and mm/s^2.
-    """
+    """Hold the cameras' offsets from the carriage and their derivatives, each (cameras, steps,
+    axes)."""
 
     offset_mm: Array
     velocity_mm_s: Array
@@ -390,10 +381,10 @@ def rig_shake(
     damping: float = 0.03,
     force_hz: float = 60.0,
 ) -> Shake:
-    """One common mode and one mode of each camera's arm, on each axis.
+    """Return the shake of one common mode and one mode of each camera's arm, on each axis.
 
-    rms_mm : (axes,) total of each camera; common_share : of the variance, at frequency_hz;
-    the arms' modes lie at arm_ratio times that.
+    rms_mm : (axes,) total of each camera. common_share : share of the variance at frequency_hz; the
+    arms' modes are at arm_ratio times that.
     """
     rms = np.asarray(rms_mm, float)
     offset = np.zeros((cameras, steps, len(rms)))
@@ -422,10 +413,10 @@ def accelerometer_readings(
     bias_m_s2: ArrayLike,
     gravity_m_s2: float = GRAVITY_M_S2,
 ) -> Array:
-    """(N, 3) accelerations in the rig frame -> (N, 3) readings in m/s^2: axes . (a - g) + bias.
+    """Return readings (N, 3) in m/s^2, axes . (a - g) + bias, of accelerations (N, 3) in the rig
+    frame.
 
-    up : (3,) away from gravity; axes : (3, 3) rows are the sensor's axes in rig coordinates.
-    gravity_m_s2 : of the laboratory. Noise per sample: density * sqrt(rate / 2).
+    up : (3,) away from gravity. axes : (3, 3) rows are the sensor's axes in rig coordinates.
     """
     force = np.asarray(acceleration_mm_s2, float) / 1000 + gravity_m_s2 * np.asarray(up, float)
     sigma = density_ug_sqrt_hz * MICRO_G_M_S2 * np.sqrt(rate_hz / 2)

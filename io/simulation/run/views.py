@@ -136,7 +136,8 @@ def _any_inside(points: Array, outline: Array, centre: Array) -> bool:
 
 
 def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dict[str, Any]:
-    """Columns of `truth/runs/<run>/bubbles.csv` for one frame: bubbles that any camera sees.
+    """Return the columns of `truth/runs/<run>/bubbles.csv` of one frame: bubbles that any camera
+    sees.
 
     Lab place and velocity of the centre of volume, and its acceleration and drag coefficient where
     they are known; its rig place is that in the carriage's frame, without any camera's shake. Per

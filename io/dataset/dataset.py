@@ -33,11 +33,9 @@ _LAYOUT = "put images at calibration/<camera>/<view>.tif, or dots in calibration
 
 @dataclass(frozen=True)
 class View:
-    """Hold one view: one position of the calibration target.
+    """One position of the calibration target; its name is that of its images or in the table.
 
-    name : the file name of its images without the extension, or the text in the column `view`.
-    image_paths : the image file of each camera that has one, by camera name. It is empty when the
-    dots are read from dots.csv.
+    image_paths : the image file by camera name; empty when the dots are read from dots.csv.
     """
 
     name: str
@@ -52,10 +50,7 @@ class Run:
     path: Path
 
     def load(self, **options: Any) -> RunData:
-        """Read the run's tables and open its frames with `telerig.io.dataset.run.load_run`.
-
-        options : passed on to `load_run`.
-        """
+        """Read the run's tables and open its frames with `telerig.io.dataset.run.load_run`."""
         from telerig.io.dataset.run import load_run
 
         return load_run(self.path, **options)
@@ -65,14 +60,9 @@ class Run:
 class Dataset(ShortText):
     """Hold what `load_dataset` found in a dataset folder.
 
-    path : the dataset folder.
-    rig : the content of its rig.toml.
     views : the calibration views in natural order of their names (2 before 10).
-    runs : the recordings by name.
-    source : "images" or "dots", the form in which the views are given. It is None when no views
-    were required and the folder has either no views or both forms.
-    notes : sentences that a user should read.
-    table : the dots as `read_dots_csv` returns them; None unless the source is "dots".
+    source : "images" or "dots"; None when no views were required and the folder has none or both.
+    notes : sentences that a user should read. table : the dots as `read_dots_csv` returns them.
     """
 
     path: Path
@@ -115,11 +105,9 @@ class Dataset(ShortText):
         return self.path / "results"
 
     def dots(self) -> pd.DataFrame:
-        """Return a copy of the table that was read from `calibration/dots.csv`.
+        """Return a copy of the table that `read_dots_csv` made of `calibration/dots.csv`.
 
-        Its columns are described in `telerig.io.dataset.tables.read_dots_csv`.
-        Raises InputError when no such table was read, because the views are images: their dots must
-        be detected first.
+        Raises InputError for a dataset of images, whose dots must be detected first.
         """
         if self.table is None:
             raise InputError(
@@ -130,13 +118,10 @@ class Dataset(ShortText):
         return self.table.copy()
 
     def image(self, view: View, camera: str | int) -> Image:
-        """Read the image of a view from one camera.
+        """Read the image of a view from one camera, given by name or index.
 
-        camera : name or index of the camera.
-        Returns the pixels, an array (height, width) of uint8, uint16 or float32, with the size that
-        `rig.toml` states.
-        Raises InputError when the camera has no image of the view, or when the image cannot be
-        used.
+        Returns pixels (height, width) of uint8, uint16 or float32, with the size that `rig.toml`
+        states. Raises InputError when there is no such image, or when it cannot be used.
         """
         name = self.rig.camera_name(camera)
         if name not in view.image_paths:
@@ -151,10 +136,9 @@ class Dataset(ShortText):
 
     @cached_property
     def truth(self) -> dict[str, Any] | None:
-        """Return the content of the simulator's `truth/truth.json`; None in a real dataset.
+        """The content of the simulator's `truth/truth.json`; None in a real dataset.
 
-        The file is read at the first use. It serves for comparison only; no estimator may use it.
-        Raises InputError when the file is not valid JSON.
+        It serves for comparison only; no estimator may use it.
         """
         file = self.path / "truth" / "truth.json"
         if not file.is_file():
@@ -168,16 +152,12 @@ def load_dataset(
     *,
     need_views: bool = True,
 ) -> Dataset:
-    """Read a dataset's rig.toml and, if there is one, its dots.csv, and list its views and runs.
+    """Read a dataset's rig.toml and dots.csv, and list its views and runs; no image is decoded.
 
-    No image is decoded and nothing is written.
-    path : the dataset folder.
     source : "images" or "dots"; needed when `calibration/` holds both. None takes the only one.
-    need_views : False for work on runs with a calibration from elsewhere. Then it is no error if
-    the dataset has no views, or has them in both forms.
-    Returns the `Dataset`.
-    Raises InputError when the folder is not a dataset, and when two views cannot be distinguished
-    by their names. Raises NoViewsError when views are needed and there are none.
+    need_views : False for work on runs with a calibration from elsewhere.
+    Raises InputError when the folder is not a dataset, and when two views have equal names, and
+    NoViewsError when views are needed and there are none.
     """
     folder = _dataset_folder(Path(path))
     rig = read_rig_toml(folder / "rig.toml")
@@ -227,10 +207,7 @@ def _dataset_folder(path: Path) -> Path:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """List the files and folders in a folder in natural order, without hidden ones.
-
-    Returns an empty list when the folder does not exist.
-    """
+    """List a folder's entries in natural order, without hidden ones; none if it does not exist."""
     if not folder.is_dir():
         return []
     found = (p for p in folder.iterdir() if not p.name.startswith("."))
@@ -272,11 +249,7 @@ def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> NoView
 
 
 def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tuple[View, ...]:
-    """Return the views whose images lie in calibration/<camera>/, in natural order of their names.
-
-    A sentence about every unused file, and about views of a single camera, is added to ``notes``.
-    Raises InputError for the folder of an unknown camera and for views with ambiguous names.
-    """
+    """Return the views with images in calibration/<camera>/; append to ``notes``."""
     by_view: dict[str, dict[str, Path]] = {}
     for entry in _entries(calibration):
         if not entry.is_dir():
@@ -300,11 +273,7 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
 
 
 def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
-    """Return the image files of one camera by view name, which is the file name without extension.
-
-    A sentence that names the files that are no images is added to ``notes``.
-    Raises InputError when two images have the same view name.
-    """
+    """Return a camera's image files by view name (without extension); append to ``notes``."""
     images = list_images(folder)
     unused = [p.name for p in _entries(folder) if p not in images]
     if unused:
@@ -326,10 +295,7 @@ def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
 
 
 def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
-    """Raise InputError when the names of two views differ only in upper and lower case.
-
-    Some file systems treat them as one name and others as two.
-    """
+    """Raise InputError when two views differ only in case, which file systems may ignore."""
     spelled: dict[str, str] = {}
     for view in by_view:
         other = spelled.setdefault(view.casefold(), view)
@@ -344,11 +310,7 @@ def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
 
 
 def _note_single(cameras_of: Mapping[Any, set[str]], rig: RigDescription, notes: list[str]) -> None:
-    """Add a sentence to ``notes`` about the views that only one camera has.
-
-    Such a view does not help to determine the pose of another camera.
-    cameras_of : the set of camera names by view name.
-    """
+    """Add a sentence to ``notes`` about the views that only one camera has."""
     for camera in rig.cameras if len(rig.cameras) > 1 else ():
         alone = sorted((str(v) for v, seen in cameras_of.items() if seen == {camera}), key=natural)
         if alone:

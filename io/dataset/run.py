@@ -39,22 +39,15 @@ RunSource = Literal["images", "detections"]
 class RunData:
     """Hold what `load_run` found in a run's folder; it has F frames.
 
-    name, path : the run's name and folder.
-    cameras : the names of the cameras that the run is read for.
-    frame_count : F.
-    t_s : (F,) the middle of each frame's exposure in s.
-    position_mm : (F,) the encoder position of the stage in mm at t_s, NaN outside the encoder's
-    record; None without stage.csv.
-    image_sizes_px : (width, height) of the image in px, by camera.
-    source : "images" or "detections".
-    rig : the content of rig.toml; None where there is no such file.
-    stage, accelerometers, references : the tables of the run; None where the file does not exist.
-    detections : the table of detections.csv; None when the source is images.
+    t_s : (F,) the middle of each frame's exposure in s. position_mm : (F,) the stage's position at
+    t_s, NaN outside the encoder's record; None without stage.csv.
+    image_sizes_px : (width, height) by camera. source : "images" or "detections".
+    rig, stage, accelerometers, references, detections : None where there is no such file.
     notes : sentences that a user should read. `image` adds one for each frame that it cannot read.
     skip_unreadable : True if `image` returns None for every frame that cannot be read, False if for
     none; None means that only the last frame of a recording may be unreadable.
-    sources : the opened frames by camera; empty when the source is detections.
-    positions : (F,) by camera, where in its source each frame lies; -1 where it is missing.
+    sources : the opened frames by camera; positions : (F,) where in it each frame lies, -1 for
+    none.
     """
 
     name: str
@@ -76,13 +69,11 @@ class RunData:
     positions: Mapping[str, Ints] = field(default_factory=dict, repr=False, compare=False)
 
     def image(self, camera: str | int, frame: int) -> Image | None:
-        """Read one frame of one camera.
+        """Read one frame of one camera, given by name or index: pixels (height, width) as stored.
 
-        camera : name or index. frame : counted from 0.
-        Returns the pixels as stored, an array (height, width); None when that camera misses the
-        frame, or when the frame cannot be read and ``skip_unreadable`` allows it.
-        Raises InputError for any other frame that cannot be read, for an image of another size, and
-        when the run was loaded from detections.
+        Returns None when that camera misses the frame, or when it cannot be read and may be left
+        out. Raises InputError for other unreadable frames, an image of another size, and a run of
+        detections.
         """
         name = self.camera_name(camera)
         if name not in self.sources:
@@ -114,10 +105,7 @@ class RunData:
         return image
 
     def first(self, frames: int) -> RunData:
-        """Return the run with its first frames only; the sensors' records stay whole.
-
-        Raises InputError when ``frames`` is not positive. If the run is shorter, it is returned.
-        """
+        """Return the run with its first frames only; the sensors' records stay whole."""
         if frames < 1:
             raise InputError(
                 f"the first {frames} frames are none", where=str(self.path), todo="give 1 or more"
@@ -142,10 +130,7 @@ class RunData:
         )
 
     def camera_name(self, camera: str | int) -> str:
-        """Return the camera's name from its name or its index.
-
-        Raises InputError for an unknown camera.
-        """
+        """Return the camera's name from its name or index. Raises InputError for another one."""
         return camera_named(camera, list(self.cameras), where=str(self.path))
 
     def _may_skip(self, camera: str, position: int) -> bool:
@@ -169,18 +154,18 @@ def load_run(
     path : `DATASET/runs/NAME`, or any folder that holds the same files.
     rig : the content of rig.toml; None looks for a `rig.toml` two folders above the run.
     source : "images" or "detections"; needed where the folder has both. None takes the only one.
-    cameras : names of the cameras, for example from a calibration. None takes the two cameras that
-    `[tracking]` in rig.toml names, or the first two; data of other cameras are left out.
-    image_sizes_px : (width, height) in px by camera; they replace those of rig.toml.
+    cameras : names of the cameras; None takes the two that `[tracking]` in rig.toml names, or the
+    first two. image_sizes_px : (width, height) by camera; they replace those of rig.toml.
     pair_by : how the images of several cameras are paired, see `pair_frames`.
     skip_unreadable : True leaves out every frame that cannot be read, False none. None leaves out
     only the last one of a recording, which is cut short when the disk is full or the power fails.
-    Returns the `RunData`. Nothing is written.
     Raises InputError, with the file, the row or frame, and what to do.
     """
     folder = _run_folder(Path(path))
     check_name(folder.resolve().name, str(folder), "run")
-    rig = rig or _rig_above(folder)
+    above = folder.parent.parent / "rig.toml"
+    if rig is None and above.is_file():
+        rig = read_rig_toml(above)
     names = list(cameras) if cameras else _cameras_of(rig, folder)
     every = list(rig.cameras) if rig and not set(names) - set(rig.cameras) else names
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()} if rig else {}
@@ -226,10 +211,7 @@ def load_run(
 
 
 def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
-    """Return the names of the tracking cameras.
-
-    Raises InputError without a rig or without cameras.
-    """
+    """Return the names of the tracking cameras."""
     if rig is None or not rig.cameras:
         raise InputError(
             "there is no rig.toml two folders up, so the cameras are not known",
@@ -246,10 +228,7 @@ def _of(names: list[str], table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _run_folder(path: Path) -> Path:
-    """Return the absolute path of the run's folder.
-
-    Raises InputError when there is no such folder.
-    """
+    """Return the absolute path of the run's folder."""
     if path.is_dir():
         return path.resolve()
     if path.exists():
@@ -262,12 +241,6 @@ def _run_folder(path: Path) -> Path:
         where=str(path),
         todo=suggestion(path.name, sorted(others)) if others else "check the path",
     )
-
-
-def _rig_above(folder: Path) -> RigDescription | None:
-    """Read the rig.toml two folders above the run; returns None when there is no such file."""
-    file = folder.parent.parent / "rig.toml"
-    return read_rig_toml(file) if file.is_file() else None
 
 
 def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSource:
@@ -301,11 +274,7 @@ def recordings(folder: Path) -> dict[str, Path]:
 
 
 def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str, FrameSource]:
-    """Open the frames of the cameras ``names``.
-
-    every : the names of all cameras of the rig.
-    Raises InputError for a camera without frames, and for frames of an unknown camera.
-    """
+    """Open the frames of the cameras ``names``, of ``every`` camera of the rig."""
     strangers = {name: p for name, p in recordings(folder).items() if name not in every}
     for name, entry in strangers.items():
         raise InputError(
@@ -331,12 +300,7 @@ def _paired(
     pair_by: Pairing,
     notes: list[str],
 ) -> dict[str, Ints]:
-    """Pair the frames of the cameras, and append what a user should know to ``notes``.
-
-    Dropped frames are taken from the column ``missing`` of frames.csv, if it exists.
-    Returns (F,) by camera: the position of each frame in the camera's source, -1 where it is
-    missing.
-    """
+    """Return `pair_frames`, with what frames.csv reports as missing; append to ``notes``."""
     file, missing = folder / "frames.csv", None
     if file.is_file():
         table = read_frames_csv(file, None, every)
@@ -361,11 +325,7 @@ def _detections(
     sizes: Mapping[str, tuple[int, int]],
     notes: list[str],
 ) -> pd.DataFrame:
-    """Read detections.csv and keep the rows of the cameras ``names``.
-
-    every : the names of all cameras of the rig. sizes : (width, height) in px, by camera.
-    Appends sentences to ``notes``. Raises InputError when no row is left.
-    """
+    """Read detections.csv and keep the rows of the cameras ``names``; append to ``notes``."""
     file = folder / "frames.csv"
     count = len(read_frames_csv(file, None, every)) if file.is_file() else None
     table = _of(names, read_detections_csv(folder / "detections.csv", every, sizes, count))
@@ -393,8 +353,6 @@ def _times(
     """Return the (F,) times in s of the frames from frames.csv, else from run.toml, else recorded.
 
     count : number of frames of the images; None when the detections decide.
-    recorded : a high-speed camera's file and the times in it.
-    Appends sentences to ``notes``. Raises InputError when neither file gives the times.
     """
     file, settings = folder / "frames.csv", folder / "run.toml"
     if file.is_file():
@@ -432,10 +390,7 @@ def _recorded_times(
 
 
 def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array:
-    """Return the (F,) stage positions in mm, interpolated from the encoder's record at ``t_s`` (s).
-
-    Positions outside the record are NaN. Appends sentences about gaps in the record to ``notes``.
-    """
+    """Return stage positions (F,) in mm at ``t_s``, NaN outside the record; append to ``notes``."""
     t, position = stage["t_s"].to_numpy(float), stage["position_mm"].to_numpy(float)
     at = np.interp(t_s, t, position, left=np.nan, right=np.nan)
     outside = np.flatnonzero(np.isnan(at))
@@ -454,10 +409,7 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
 
 
 def _outside_record(t_s: Array, outside: Ints) -> str:
-    """Return the words that say which frames lie outside the record of the stage's encoder.
-
-    t_s : (F,) times in s. outside : indices of those frames.
-    """
+    """Return the words that say which frames lie outside the record of the stage's encoder."""
     first, last = int(outside[0]), int(outside[-1])
     frames = f"frame {first}" if outside.size == 1 else f"{outside.size} frames ({first} to {last})"
     span = f"{t_s[first]:.6g} s" + ("" if first == last else f" to {t_s[last]:.6g} s")
@@ -470,10 +422,7 @@ def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | N
 
 
 def _with_ends_checked(run: RunData) -> RunData:
-    """Decode the first and the last image of each camera, so that wrong sizes show at once.
-
-    Returns the same run. Raises InputError as `RunData.image` does.
-    """
+    """Decode the first and the last image of each camera, so that wrong sizes show at once."""
     for name, positions in run.positions.items():
         present = np.flatnonzero(positions >= 0)
         for frame in present[[0, -1]] if present.size else ():
@@ -497,15 +446,11 @@ def pair_frames(
 ) -> tuple[dict[str, Ints], list[str]]:
     """Find which images of several cameras belong to the same frame.
 
-    sources : the opened frames by camera.
     pair_by : "numbers" pairs by the numbers in the file names, "order" by the order of the images,
     and "auto" by the numbers if they are plausible, otherwise by the order.
-    missing : (F,) by camera, True for the frames that frames.csv reports as dropped; None if it
-    reports none.
-    where : the place that errors name.
-    Returns (F,) by camera, the position of each frame in that camera's source, -1 where the frame
-    is missing; and a list of sentences for the user.
-    Raises InputError when the images cannot be paired safely.
+    missing : (F,) by camera, True for the frames that frames.csv reports as dropped; None for none.
+    Returns (F,) by camera, the position of each frame in that camera's source (-1: missing), and
+    sentences for the user. Raises InputError when the images cannot be paired safely.
     """
     if missing is not None:
         return _by_missing(sources, missing, where)
@@ -530,11 +475,9 @@ def pair_frames(
 
 
 def _trustworthy(numbers: Mapping[str, Ints], where: str) -> bool:
-    """Return whether the numbers in the file names can be used to pair the frames.
+    """Return whether the numbers in the file names have few gaps and largely agree between cameras.
 
-    They can if they have few gaps and are largely the same for every camera.
-    numbers : (images,) the number in each file name, by camera.
-    Raises InputError when the counts agree but the numbers are shifted, so that both pairings are
+    Raises InputError when the counts agree but the numbers are shifted: both pairings are
     plausible.
     """
     step = _step(numbers)
@@ -581,10 +524,7 @@ def _by_numbers(numbers: Mapping[str, Ints]) -> tuple[dict[str, Ints], list[str]
 
 
 def _in_order(counts: Mapping[str, int]) -> tuple[dict[str, Ints], list[str]]:
-    """Pair frames by their order; the returned values are those of `pair_frames`.
-
-    counts : the number of images of each camera.
-    """
+    """Pair frames by their order; the returned values are those of `pair_frames`."""
     frames = np.arange(max(counts.values()), dtype=np.int64)
     positions = {name: np.where(frames < count, frames, -1) for name, count in counts.items()}
     return positions, [note for name, p in positions.items() for note in _missing_note(name, p)]
@@ -593,10 +533,7 @@ def _in_order(counts: Mapping[str, int]) -> tuple[dict[str, Ints], list[str]]:
 def _by_missing(
     sources: Mapping[str, FrameSource], missing: Mapping[str, Bools], where: str
 ) -> tuple[dict[str, Ints], list[str]]:
-    """Pair frames by the column ``missing`` of frames.csv; returns and raises as `pair_frames`.
-
-    A camera may have an image for every frame, or only for those that it did not drop.
-    """
+    """Pair frames by the column ``missing``; a camera has images of all, or of those it kept."""
     positions, notes = {}, []
     for name, source in sources.items():
         gone = missing[name]
@@ -618,11 +555,7 @@ def _by_missing(
 
 
 def _missing_note(camera: str, positions: Ints) -> list[str]:
-    """Return a sentence that counts a camera's missing frames, in a list.
-
-    positions : (F,) as in `pair_frames`, -1 where the frame is missing.
-    Returns an empty list when no frame is missing.
-    """
+    """Return a list with a sentence that counts a camera's missing frames, if any."""
     gone = np.flatnonzero(positions < 0)
     if not gone.size:
         return []

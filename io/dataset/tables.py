@@ -36,15 +36,10 @@ DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *COVAR
 def choose_source(
     has: Mapping[AnySource, bool], source: str | None, folder: Path
 ) -> AnySource | None:
-    """Choose the form of the measurements that is used: images or a table.
+    """Return the form of the measurements that is used, "images" or that of a table, or None.
 
-    has : two entries; for each form ("images", and "dots" or "detections"), whether the folder has
-    it.
-    source : the form that the user asked for; None takes the only one that there is.
-    folder : named in errors.
-    Returns the form; None when the folder does not have it.
-    Raises InputError when ``source`` is another word, and when the folder has both forms and
-    ``source`` is None.
+    has : for each of the two forms, whether the folder has it. source : the one that the user asked
+    for; None takes the only one. Raises InputError for another word, and for both without a choice.
     """
     first, second = has
     if source is not None and source not in has:
@@ -63,15 +58,12 @@ def choose_source(
 def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFrame:
     """Read a CSV table of detected dots: `calibration/dots.csv` or `results/calibration/dots.csv`.
 
-    Returns one row per dot in the file's order. Its columns are `DOTS_COLUMNS` (and chi2_dof if the
-    file has it): view and camera (text), dot (its number on `rig.target`), row, column, the centre
-    u_px, v_px in px, and its covariance suu_px2, suv_px2, svv_px2 in px^2.
-    The covariance is read from these three columns; without them it follows from sigma_px, and
-    without that from `DEFAULT_SIGMA_PX`. ``attrs["sigma_known"]`` is True when the file stated it.
-    On an unbounded target the file's own dot numbers are ignored: the numbers are computed from row
-    and column, which the file must have.
-    Raises InputError, with the row (the header is row 1) and the column, for a value that is not
-    possible and for a dot that stands twice in one image.
+    Returns one row per dot with the columns `DOTS_COLUMNS`: view and camera (text), dot (its number
+    on `rig.target`), row, column, the centre u_px, v_px, its covariance suu_px2, suv_px2, svv_px2;
+    and chi2_dof if the file has it. The covariance is computed by `fill_covariance`, from
+    `DEFAULT_SIGMA_PX` where the file states none; ``attrs["sigma_known"]`` is True when it does.
+    On an unbounded target the numbers are computed from row and column, which the file must have.
+    Raises InputError, with row and column, for impossible values and a dot twice in one image.
     """
     file = Path(path)
     table = read_table(file, _columns(rig.target))
@@ -126,11 +118,7 @@ def check_names(table: pd.DataFrame, column: str, thing: str, names: list[str], 
 
 
 def check_pixels(table: pd.DataFrame, sizes_px: Mapping[str, tuple[int, int]], file: Path) -> None:
-    """Raise InputError for the first row whose pixel lies outside its camera's image.
-
-    sizes_px : (width, height) of the image in px, by camera name.
-    A pixel may lie `OUTSIDE_PX` outside.
-    """
+    """Raise InputError for the first pixel more than `OUTSIDE_PX` outside its camera's image."""
     sizes = np.array([sizes_px[name] for name in table["camera"]], float).reshape(-1, 2)
     for column, size in zip(("u_px", "v_px"), sizes.T):
         _check_inside(table, column, size, file)
@@ -148,10 +136,7 @@ def _check_inside(table: pd.DataFrame, column: str, size: Any, file: Path) -> No
 
 
 def _check_dots(table: pd.DataFrame, target: Target, file: Path) -> None:
-    """Check the dots' numbers against the target; fill in or check their row and column.
-
-    The table is changed in place. Raises InputError for the first row that is wrong.
-    """
+    """Check the dots' numbers against the target; fill in or check row and column, in place."""
     dot, ids = table["dot"].to_numpy(), target.ids()
     numbers = f"its {len(ids)} dots are numbered from {ids.min()} to {ids.max()}"
     rows_of(table, file).refuse(
@@ -192,14 +177,11 @@ def _check_repeats(table: pd.DataFrame, target: Target, file: Path) -> None:
 
 
 def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *, of: str) -> bool:
-    """Set the table's columns suu_px2, suv_px2, svv_px2 (px^2); the table is changed in place.
+    """Set the table's columns suu_px2, suv_px2, svv_px2 (px^2) in place, where the file lacks them.
 
-    The columns stay if the file has them. If it does not, they are computed from the column
-    sigma_px, or else from ``default_sigma_px`` (px).
-    of : to which point the standard deviation belongs, in words for the errors.
-    Returns whether the file stated the noise.
-    Raises InputError when only some of the three columns exist, and for values that are no
-    covariance.
+    They are computed from the column sigma_px, or else from ``default_sigma_px``. of : the point
+    that they are of, for errors. Returns whether the file stated the noise. Raises InputError when
+    only some of the columns exist, and for values that are no covariance.
     """
     given = [name for name in COVARIANCE if name in table]
     if 0 < len(given) < 3:
@@ -245,10 +227,9 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
     """Read `frames.csv`, which gives the time of every frame of a run.
 
     frame_count : how many frames the images have; None where the table decides.
-    cameras : names of the rig's cameras.
     Returns one row per frame, counted from 0 without gaps, with the columns frame, t_s (the middle
-    of the exposure in s) and all further columns of the file. The optional column ``missing`` names
-    the cameras that dropped the frame, joined by ``|``.
+    of the exposure in s) and all further ones. The optional column ``missing`` names the cameras
+    that dropped the frame, joined by ``|``.
     Raises InputError for times that do not increase, a frame without a time or without an image,
     and an unknown camera in ``missing``.
     """
@@ -280,10 +261,7 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
 
 
 def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> None:
-    """Raise InputError unless the column frame counts 0, 1, 2, ... up to the last image.
-
-    frame_count : how many frames the images have; None where the table decides.
-    """
+    """Raise InputError unless the column frame counts 0, 1, 2, ... up to the last image."""
     frame, expected = table["frame"].to_numpy(), np.arange(len(table))
 
     def refuse(bad: Bools, what: Callable[[int], str], todo: str) -> None:
@@ -312,9 +290,8 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
 
 
 def read_run_toml(path: Path) -> tuple[float, float]:
-    """Read `run.toml`, which gives equally spaced frame times.
+    """Read frame rate (Hz) and time of frame 0 (s, by default 0) from `run.toml`.
 
-    Returns the frame rate in Hz and the time of frame 0 in s (0 when the file does not state it).
     Raises InputError when the file is no TOML, has an unknown key, or has no positive frame rate.
     """
     raw = read_toml(path, "write frame_rate_hz = 500.0")
@@ -329,10 +306,7 @@ def read_run_toml(path: Path) -> tuple[float, float]:
 
 
 def _number(raw: dict[str, Any], key: str, path: Path) -> float | None:
-    """Return the finite number at ``key``; None without the key.
-
-    Raises InputError for any other value.
-    """
+    """Return the finite number at ``key``, None without the key; InputError for another value."""
     value = raw.get(key)
     if value is None:
         return None
@@ -343,10 +317,8 @@ def _number(raw: dict[str, Any], key: str, path: Path) -> float | None:
 
 
 def read_stage_csv(path: Path) -> pd.DataFrame:
-    """Read `stage.csv`, the record of the stage's encoder.
+    """Read `stage.csv`, the encoder's record: t_s, position_mm and all further columns.
 
-    Returns one row per reading with the columns t_s (s), position_mm (the encoder position in mm)
-    and all further columns of the file.
     Raises InputError for fewer than two rows and for times that do not increase.
     """
     table = read_table(path, [Column("t_s"), Column("position_mm")], extra=True)
@@ -363,11 +335,10 @@ def read_stage_csv(path: Path) -> pd.DataFrame:
 def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFrame:
     """Read `accelerometer.csv`, the readings of all accelerometers of a run.
 
-    sensors : the names of the sensors in rig.toml; None where there is no rig file, then any name
-    is accepted.
-    Returns one row per reading with the columns t_s (s), sensor (text), ax_m_s2, ay_m_s2, az_m_s2
-    (m/s^2 along the sensor's own axes) and all further columns of the file.
-    Raises InputError for an unknown sensor and for times of a sensor that do not increase.
+    sensors : the names of the sensors in rig.toml; None accepts any name.
+    Returns the columns t_s (s), sensor (text), ax_m_s2, ay_m_s2, az_m_s2 (m/s^2 along the sensor's
+    axes) and all further ones. Raises InputError for an unknown sensor and times that do not
+    increase.
     """
     axes = [Column(f"a{axis}_m_s2") for axis in "xyz"]
     table = read_table(path, [Column("t_s"), Column("sensor", "name"), *axes], extra=True)
@@ -394,13 +365,11 @@ def read_references_csv(
 ) -> pd.DataFrame:
     """Read `references.csv`, the image positions of the marks that are fixed to the tank.
 
-    cameras : names of the rig's cameras.
-    sizes_px : (width, height) of the image in px, by camera.
-    frame_count : number of frames of the run; None where it is not known.
+    sizes_px : (width, height) of the image by camera. frame_count : of the run; None if not known.
     Returns one row per mark, frame and camera with the columns frame, camera, mark (text), u_px,
-    v_px (px), suu_px2, suv_px2, svv_px2 (px^2) and all further columns of the file. The covariance
-    follows from sigma_px, or else from `REFERENCE_SIGMA_PX`, where the file has no such columns.
-    Raises InputError, with the row and the column, for values that are not possible.
+    v_px, suu_px2, suv_px2, svv_px2 and all further ones. The covariance is that of
+    `fill_covariance`, from `REFERENCE_SIGMA_PX` where the file states none. Raises InputError for
+    impossible values.
     """
     table = _pixel_table(path, [Column("mark", "name")], cameras, sizes_px, frame_count)
     _check_named_once(table, "mark", path)
@@ -413,17 +382,13 @@ def read_detections_csv(
 ) -> pd.DataFrame:
     """Read `detections.csv`, the bubbles that were found in the images.
 
-    cameras : names of the rig's cameras.
-    sizes_px : (width, height) of the image in px, by camera. If a camera is not in it, pixels are
-    not checked against the image size.
-    frame_count : number of frames of the run; None where the table decides.
-    Returns one row per bubble, frame and camera in the file's order, with the columns frame,
-    camera, the centre u_px, v_px (px), its covariance suu_px2, suv_px2, svv_px2 (px^2), particle
-    (text; "" where the bubble is not yet matched between the cameras) and all further columns of
-    the file. The semi-axes a_px, b_px (px) and angle_rad of the fitted ellipse may be NaN.
-    The covariance is read from its three columns; without them it follows from sigma_px, and
-    without that from `DETECTION_SIGMA_PX`. ``attrs["sigma_known"]`` is True when the file stated
-    it.
+    sizes_px : (width, height) of the image by camera; pixels of a camera without one are not
+    checked. frame_count : of the run; None where the table decides.
+    Returns one row per bubble, frame and camera, with the columns frame, camera, u_px, v_px, the
+    covariance suu_px2, suv_px2, svv_px2, particle (text; "" where not yet matched) and all further
+    ones; the ellipse's a_px, b_px, angle_rad may be NaN. The covariance is that of
+    `fill_covariance`, from `DETECTION_SIGMA_PX` where the file states none;
+    ``attrs["sigma_known"]`` is True when it does.
     Raises InputError, with the row and the column, for values that are not possible.
     """
     own = [
@@ -443,10 +408,7 @@ def read_detections_csv(
 def _pixel_table(
     path: Path, own: list[Column], cameras: list[str], sizes_px: Sizes, frame_count: int | None
 ) -> pd.DataFrame:
-    """Read a CSV table of pixels and check its cameras, pixels (px) and frames.
-
-    own : the columns that only this table has. frame_count : None where the number is not known.
-    """
+    """Read a CSV table of pixels with ``own`` columns; check its cameras, pixels and frames."""
     columns = [
         Column("frame", "whole"),
         Column("camera", "name"),

@@ -36,10 +36,8 @@ _OLD_S = 7 * 24 * 3600.0
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside ``path``, with the same suffix, and rename it at the end.
 
-    Missing parent folders are made. On an exception the temporary file is removed, and a file that
-    was at ``path`` before stays.
-    Raises InputError when the place cannot be written, also when the disk is full or the folder
-    disappears while the file is being written.
+    On an exception it is removed, and a file that was at ``path`` before stays. Raises InputError
+    when the place cannot be written, also when the disk is full or the folder disappears meanwhile.
     """
     final = Path(path)
     if final.is_dir():
@@ -63,10 +61,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield an empty temporary folder; its files are renamed into ``folder`` at the very end.
 
-    Until then ``folder`` is as before, so an interrupted command leaves the old files unchanged.
-    Files that are already in ``folder`` and are not written again stay.
-    Raises InputError when the place cannot be written, also when the disk is full or the temporary
-    folder disappears meanwhile.
+    An interrupted command leaves the old files unchanged; files that are not written again stay.
+    Raises InputError as `atomic_path` does.
     """
     final = Path(folder)
     with staged_folder(final) as temporary:
@@ -113,22 +109,16 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
 
 
 def write_json_atomic(path: str | os.PathLike[str], content: Any) -> None:
-    """Write a strict JSON file, completely or not at all.
+    """Write a strict JSON file, completely or not at all, with the types of `plain`.
 
-    NumPy arrays become lists, dataclasses become objects, NaN and infinity become null. Floats keep
-    every digit.
-    Raises TypeError for an object that JSON cannot represent, InputError when the file cannot be
-    written.
+    Raises TypeError for an object that JSON cannot represent, InputError when it cannot be written.
     """
     text = json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False)
     write_text_atomic(path, text + "\n")
 
 
 def plain(content: Any) -> Any:
-    """Return ``content`` in the types of JSON; numbers that are not finite become None.
-
-    Raises TypeError for an object that JSON cannot represent.
-    """
+    """Return ``content`` in the types of JSON; dataclasses become objects, NaN becomes null."""
     if isinstance(content, dict):
         return {str(key): plain(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):
@@ -158,11 +148,7 @@ def _machine() -> str:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files and folders of commands that were killed.
-
-    They are removed if their process on this computer has ended. Those of other computers, whose
-    processes cannot be seen, are removed after a week.
-    """
+    """Remove temporary files of killed commands; those of other computers after a week."""
     try:
         entries = [entry for entry in folder.iterdir() if entry.name.startswith(".")]
     except OSError:
@@ -212,10 +198,7 @@ def rename(source: Path, target: Path) -> None:
 
 @contextmanager
 def _write_errors_in_words(final: Path, temporary: Path) -> Iterator[None]:
-    """Raise InputError that names ``final`` for an error of the system in writing ``temporary``.
-
-    Errors of the system that have another cause, such as reading elsewhere, are left alone.
-    """
+    """Raise InputError that names ``final`` for an error of the system in writing ``temporary``."""
     try:
         yield
     except InputError as error:

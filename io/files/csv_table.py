@@ -39,12 +39,10 @@ LARGEST_NUMBER = 1e15
 
 @dataclass(frozen=True)
 class Column:
-    """Describe a column that a table may have.
+    """Describe a column that a table may have; a blank cell is read as NaN or "".
 
-    kind : "number" (float), "whole" (whole number), "text" or "name" (text that follows the rule
-    of `telerig.io.files.names`).
-    required : whether the table must have the column.
-    blank : whether cells may be empty; they are read as NaN (number, whole) or "" (text).
+    kind : "number" (float), "whole" (whole number), "text" or "name" (text that follows the rule of
+    `telerig.io.files.names`).
     """
 
     name: str
@@ -62,12 +60,10 @@ def read_table(
 ) -> pd.DataFrame:
     """Read a CSV table and check its header and its cells.
 
-    columns : the columns that the table may have or must have.
-    extra : True keeps further columns, as numbers if all their cells are numbers; False refuses
-    them.
-    empty : whether the table may have no rows.
-    Returns the columns that the file has, in the file's order. The index is the row in the file
-    (the header is row 1). "whole" columns are int64, or float64 where cells may be blank.
+    columns : the columns that the table may or must have. extra : keeps further columns, as numbers
+    if all their cells are numbers; otherwise they are refused. empty : allows no rows.
+    Returns the columns in the file's order. The index is the row in the file (the header is row 1).
+    "whole" columns are int64, or float64 where cells may be blank.
     Raises InputError for a missing or unknown column, more than `MOST_COLUMNS`, a cell that is no
     number up to `LARGEST_NUMBER`, a text with control characters, a row with too few or too many
     cells, and an empty table.
@@ -96,10 +92,8 @@ def read_table(
 def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = False) -> pd.DataFrame:
     """Read a CSV table of results and return those of its columns that ``columns`` names.
 
-    Other columns are left out; a text column that the file lacks is filled with "". A table without
-    rows is allowed, because a run may have no tracks.
-    optional : True treats a file that does not exist as a table without rows.
-    Raises InputError as `read_table` does.
+    A text column that the file lacks is filled with "". The table may have no rows; with
+    ``optional`` a missing file counts as such a table. Raises InputError as `read_table` does.
     """
     if optional and not file.is_file():
         table = pd.DataFrame({c.name: [] for c in columns if c.required})
@@ -113,11 +107,9 @@ def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = Fals
 
 
 def write_table(table: pd.DataFrame, path: str | PathLike[str]) -> None:
-    """Write a CSV table whose floats have exactly the same values when they are read again.
+    """Write a CSV table, completely or not at all; floats have the same values when read again.
 
-    NaN becomes a blank cell, truth values become 0 and 1, the index is left out. The file is
-    written completely or not at all.
-    Raises InputError when it cannot be written.
+    NaN becomes a blank cell, truth values become 0 and 1, the index is left out.
     """
     flags = {name: int for name, kind in table.dtypes.items() if kind.kind == "b"}
     with atomic_path(path) as temporary:
@@ -137,9 +129,7 @@ class Rows:
     def refuse(self, bad: Bools, column: str, what: str | Callable[[int], str], todo: str) -> None:
         """Raise InputError for the first bad row, and list further ones; do nothing without one.
 
-        bad : (rows,) True where a row is wrong. column : the column at fault; "" names none.
         what : what is wrong, or a function that returns it for the position of a row in the table.
-        todo : what to do about it.
         """
         positions = np.flatnonzero(bad)
         if not positions.size:
@@ -161,11 +151,7 @@ def rows_of(table: pd.DataFrame, file: Path) -> Rows:
 def _sound_table(
     file: Path, columns: Sequence[Column], others: Literal["refuse", "keep", "leave out"]
 ) -> pd.DataFrame | None:
-    """Read a CSV table with pandas' fast reader.
-
-    others : what happens to columns that are not in ``columns``.
-    Returns None for any unusual file; the slower `_cells` then finds the error.
-    """
+    """Read a CSV table with pandas' fast reader; None for an unusual file, left to `_cells`."""
     try:
         content = file.read_bytes()
         header = content.split(b"\n", 1)[0].decode("utf-8-sig").rstrip("\r").split(",")
@@ -218,10 +204,8 @@ def _sound_table(
 
 
 def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
-    """Read a CSV file as text; blank lines are skipped.
+    """Read a CSV file as text: header, cells of each column, number of each row in the file.
 
-    Returns the header, the cells of each column, and the number of each row in the file. A column
-    without a name, such as an index, gets the one that pandas gives it.
     Raises InputError for an empty file, another separator, and rows of different lengths.
     """
     lines = read_text(file, _EXPORT).split("\n")
@@ -249,10 +233,7 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
 
 
 def _split(line: str, where: str) -> list[str]:
-    """Return the cells of a line.
-
-    Raises InputError for control characters and for cells that are too long.
-    """
+    """Return the cells of a line. Raises InputError for control characters and too long cells."""
     if _CONTROL.search(line.encode("utf-8")):
         raise InputError("has a control character", where=where, todo="remove it")
     try:

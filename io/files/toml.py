@@ -18,20 +18,15 @@ LARGEST_NUMBER = 1e15
 
 
 def read_toml(file: Path, todo: str, missing: str = "check the path") -> dict[str, Any]:
-    """Read a TOML file and return its content.
-
-    todo : the advice for a file that is no TOML. missing : for a file that does not exist.
-    Raises InputError for a file that cannot be read, and as `toml_content` does.
-    """
+    """Read a TOML file; ``todo`` is the advice for a file that is no TOML, ``missing`` for none."""
     return toml_content(read_text(file, missing=missing), str(file), todo)
 
 
 def toml_content(text: str, where: str, todo: str) -> dict[str, Any]:
-    """Return the content of a TOML text.
+    """Return the content of a TOML text; ``where`` and ``todo`` are for errors.
 
-    where, todo : the place and the advice in errors.
-    Raises InputError for a text that is no TOML or is longer than `LONGEST`, for more than
-    `DEEPEST` tables or lists inside each other, and for a finite number beyond `LARGEST_NUMBER`.
+    Raises InputError for a text that is no TOML or longer than `LONGEST`, for nesting beyond
+    `DEEPEST`, and for a finite number beyond `LARGEST_NUMBER`.
     """
     if len(text) > LONGEST:
         what = f"has {len(text)} characters, more than the {LONGEST} that are read"
@@ -48,10 +43,7 @@ def toml_content(text: str, where: str, todo: str) -> dict[str, Any]:
 
 
 def _too_deep(text: str) -> int:
-    """Return the number of the first line that is nested too deep, or 0.
-
-    A string or a comment counts as if it were a key, because no sensible one comes near the limit.
-    """
+    """Return the number of the first line that is nested too deep (strings count as keys), or 0."""
     depth = 0
     for number, line in enumerate(text.split("\n"), 1):
         words = re.split(r"[,=\[\]{}]", line.replace(" ", "").replace("\t", ""))

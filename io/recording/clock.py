@@ -53,19 +53,13 @@ _TREND = 0.5
 
 @dataclass(frozen=True)
 class ClockFit:
-    """Hold how the host's time follows from the time of a device's clock.
+    """Describe how the host's time follows from the time of a device's clock.
 
     host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6), all times
-    in s.
-    drift_ppm : by how many parts in a million the device's clock runs faster than the host's.
-    sd_offset_us : scatter in microseconds of the least delays in parts of the record.
-    sd_drift_ppm : standard deviation of the drift, from a jackknife, or from that scatter if it is
-    larger; NaN where the drift was taken from a longer record.
-    delay_median_ms, delay_max_ms : median and largest delay in ms, above the least one.
-    wander_us : range in microseconds of the least delays of the parts after the fit.
-    readings : number of readings.
-    knots_s, bend_s : times in s from device_mean_s at which the rate changed, and the corrections
-    of the host time there in s; empty for a constant rate.
+    in s, and ``bend_s``, a correction at knots_s (from device_mean_s) where the rate changed.
+    sd_offset_us : scatter of the least delays in parts of the record; wander_us : their range.
+    sd_drift_ppm : from a jackknife, or from that scatter if it is larger; NaN for a drift that was
+    taken from a longer record. delay_* : above the least delay.
     """
 
     device_mean_s: float
@@ -82,10 +76,7 @@ class ClockFit:
     bend_s: tuple[float, ...] = ()
 
     def host_s(self, device_s: Array) -> Array:
-        """Return the host times in s of device times in s, in the same shape.
-
-        The device times must be unwrapped and belong to the count that was fitted.
-        """
+        """Return the host times in s of unwrapped device times in s, in the same shape."""
         slope = 1 / (1 + 1e-6 * self.drift_ppm)
         x = device_s - self.device_mean_s
         line = self.host_mean_s + self.offset_s + x * slope
@@ -94,12 +85,10 @@ class ClockFit:
 
 @dataclass(frozen=True)
 class ClockRecord:
-    """Hold the host times of a device's readings.
+    """Hold the host times (readings,) of a device's readings, NaN for a wrong stamp.
 
-    t_s : (readings,) host time in s; NaN for a reading with a wrong stamp.
-    segment : (readings,) index of the fit, -1 for a wrong stamp.
-    fits : one fit for each uninterrupted count of the device's clock.
-    wraps : how often the counter wrapped. wrong : number of wrong stamps.
+    segment : (readings,) index of the fit, -1 for a wrong stamp. fits : one for each uninterrupted
+    count. wraps : how often the counter wrapped. wrong : number of wrong stamps.
     """
 
     t_s: Array
@@ -112,9 +101,8 @@ class ClockRecord:
 def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockRecord:
     """Compute the host times of readings that a device stamps with its own clock.
 
-    host_s : (readings,) times of arrival in s, not decreasing.
-    device_s : (readings,) the device's stamps in s, modulo ``wrap_s``; 0 means that they never
-    wrap.
+    host_s : (readings,) times of arrival in s, not decreasing. device_s : (readings,) the stamps in
+    s, modulo ``wrap_s`` (0: they never wrap).
     A stamp is wrong if it repeats the previous one, or if it is neither between its neighbours nor
     the first of a clock that has restarted.
     """
@@ -135,10 +123,10 @@ def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockReco
 
 
 def stamp_rate(host_s: Array, device_s: Array) -> float | None:
-    """Compute how many of its stamps' seconds a device counts in a second of the host.
+    """Return how many of its stamps' seconds a device counts in a second; None for too few
+    readings.
 
-    Arguments are as in `host_times`. Returns None for too few readings. The rate is that of most
-    readings: wraps, restarts, lost readings and wrong stamps do not matter.
+    It is the rate of most readings: wraps, restarts, lost readings and wrong stamps do not matter.
     """
     lag = 1
     while 2 * lag + _RATE_READINGS <= len(host_s):
@@ -152,10 +140,7 @@ def stamp_rate(host_s: Array, device_s: Array) -> float | None:
 
 
 def check_unit(host_s: Array, stamps: Array, device: DeviceDescription) -> None:
-    """Raise InputError when a device's stamps count in another unit than its description states.
-
-    host_s : (readings,) times of arrival in s. stamps : (readings,) as sent.
-    """
+    """Raise InputError when a device's stamps (readings,) count in another unit than is stated."""
     rate = stamp_rate(host_s, stamps * device.time_unit_s)
     if rate is None or 1 - _WRONG_UNIT < rate < 1 / (1 - _WRONG_UNIT):
         return
@@ -173,10 +158,7 @@ def check_unit(host_s: Array, stamps: Array, device: DeviceDescription) -> None:
 
 
 def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
-    """Return the device's times (readings,) in s without wraps.
-
-    The host time between readings determines the number of wraps. Arguments are as in `host_times`.
-    """
+    """Return the device's times (readings,) in s without wraps, as many as the host time says."""
     if not wrap_s or not len(device_s):
         return np.array(device_s)
     ahead = device_s - host_s
@@ -185,11 +167,10 @@ def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
 
 
 def lower_line(x: Array, y: Array, at: float | None = None) -> tuple[float, float]:
-    """Return the line that lies below all points and is highest at ``at``: its y there, and slope.
+    """Return y at ``at`` (by default the mean of x) and slope of the line below all points, highest
+    there.
 
-    x, y : (points,); x must increase.
-    at : None takes the mean of x, where it is the line with the least sum of distances to the
-    points.
+    At the mean it is the line with the least sum of distances. x (points,) must increase.
     """
     hull = _lower_hull(x, y)
     middle = float(np.mean(x)) if at is None else at
@@ -252,10 +233,7 @@ def _in_order(u: Array, part: Ints) -> Bools:
 
 
 def fit_counts(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, ...]:
-    """Fit each uninterrupted count of a clock; short ones take the drift of the longest.
-
-    host_s, device_s : (readings,) as in `fit_clock`. number : (readings,) of the count, from 0.
-    """
+    """Fit each uninterrupted count of a clock; short ones take the drift of the longest."""
     edges = np.searchsorted(number, np.arange(int(number[-1]) + 2))
     parts = [slice(begin, end) for begin, end in pairwise(edges.tolist())]
     spans = [float(np.ptp(device_s[p])) for p in parts]
@@ -270,11 +248,7 @@ def fit_counts(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, 
 
 
 def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) -> ClockFit:
-    """Fit the line below all stamps of one count of a device's clock.
-
-    host_s, device_s : (readings,) times in s; ``device_s`` must increase.
-    drift_ppm : the drift if it is known; None estimates it.
-    """
+    """Fit the line below all stamps of one count, for times in s; None estimates the drift."""
     x_mean, y_mean = float(np.mean(device_s)), float(np.mean(host_s))
     x, late = device_s - x_mean, (host_s - y_mean) - (device_s - x_mean)
     edge, least = _least_delays(x, late)
@@ -325,10 +299,7 @@ def _lower_line_of_many(x: Array, late: Array) -> tuple[float, float]:
 
 
 def _curve(x: Array, delay: Array) -> tuple[Array, Array] | None:
-    """(knots_s, correction_s at them) below the delays, or None where a straight line serves.
-
-    x : (N,) increasing. delay : (N,) above the straight line.
-    """
+    """Return knots (s) and corrections (s) below the delays; None where a straight line serves."""
     parts = int(np.clip(np.ptp(x) / _CURVE_WINDOW_S, 1, len(x) // 20 + 1))
     edge, least = _least_delays(x, delay, parts)
     if len(edge) < 4 * _WINDOWS_PER_KNOT or np.ptp(least) < _LEAST_WANDER_S:
@@ -342,8 +313,7 @@ def _curve(x: Array, delay: Array) -> tuple[Array, Array] | None:
 
 
 def _highest_curve_below(x_s: Array, least_s: Array, knots: Array) -> Array:
-    """(K,) values at the knots of the piecewise linear curve below all points, the highest in the
-    sum."""
+    """Return the knots' values (K,) of the highest piecewise linear curve below all points."""
     from scipy.optimize import linprog
     from scipy.sparse import csr_array
 
@@ -384,10 +354,7 @@ def _least_delays(x: Array, late: Array, parts: int | None = None) -> tuple[Ints
 
 
 def _too_early(x: Array, late: Array, edge: Ints, least: Array) -> Bools:
-    """(N,) readings that came before they were made: wrong stamps that look right.
-
-    The least delays of the parts scatter; a single one far below the others is a wrong stamp.
-    """
+    """Return the readings (N,) that came before they were made, far below other least delays."""
     if len(edge) < 8:
         return np.zeros(len(x), bool)
     i, j = np.triu_indices(len(edge), len(edge) // 2)

@@ -35,10 +35,9 @@ _AROUND = 16
 
 
 def amid_garbage(spans: Ints, garbage: Ints) -> Bools:
-    """(N,) True for a reading around which more than half of the bytes are garbage.
+    """Return (N,) True for a reading around which more than half of the bytes are garbage.
 
-    spans, garbage : (N, 2) and (M, 2) first byte and number of bytes of the readings and of the
-    garbage, in increasing order.
+    spans, garbage : (N, 2) and (M, 2) first byte and number of bytes, in increasing order.
     """
     if not len(spans) or not len(garbage):
         return np.zeros(len(spans), bool)
@@ -70,15 +69,13 @@ def mostly_garbage(device: DeviceDescription, found: Readings) -> InputError | N
 
 
 def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) -> Bools:
-    """(N,) True for a reading with a value that is far from what its neighbours predict.
+    """Return (N,) True for a reading with a value that is far from what its neighbours predict.
 
     t_s : (N,) increasing times in s. values : (N,) each. most : the largest second derivative in
-    time that the values can have (an encoder's acceleration), which allows a value to differ.
-    A value is far if it is off a quartic through its neighbours by more than `_FAR_RESIDUALS`
-    times their largest residual and times the resolution of the values. Only readings are tested
-    that differ from those around them much more than these do, and those beside a gap or an end.
-    Readings that are found are taken away and the others tested again, because wrong readings near
-    each other hide each other.
+    time that the values can have, by which a value may differ.
+    A value is far if it is off a quartic through its neighbours by more than `_FAR_RESIDUALS` times
+    their largest residual and the resolution. Readings that are found are left out and the others
+    tested again, because wrong readings near each other hide each other.
     """
     far = _beyond_reach(t_s, values, most)
     for _ in range(_PASSES):
@@ -91,10 +88,7 @@ def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) 
 
 
 def _beyond_reach(t_s: Array, values: Sequence[Array], most: float) -> Bools:
-    """(N,) True for a value that nothing gets to and back from within `_REACH` readings.
-
-    Up to five wrong values in a row do not move the median of eleven.
-    """
+    """Return (N,) True for a value that nothing gets to and back from within `_REACH` readings."""
     far = np.zeros(len(t_s), bool)
     if not most or len(t_s) < 2 * _REACH + 1:
         return far
@@ -139,10 +133,10 @@ def _far_at_first(t_s: Array, values: Sequence[Array], most: float) -> Bools:
 
 
 def _roughness(t_s: Array, value: Array) -> Array:
-    """(N,) how far each value is from what the readings around it predict, at least.
+    """Return (N,) how far each value is, at least, from what the readings around it predict.
 
-    It is the smaller one of the distances to two medians: that of the lines through `_PAIRS` pairs
-    of readings, which two wrong readings do not spoil, and that of `_CUBICS`, which follow motion.
+    It is the smaller distance to two medians: that of lines through `_PAIRS` pairs of readings,
+    which two wrong readings do not spoil, and that of `_CUBICS`, which follow motion.
     """
     inner = slice(_PAIRS, len(value) - _PAIRS)
     out = np.zeros(len(value))

@@ -41,11 +41,7 @@ RECEIVED, SENT, LOST, FOUND, END = 1, 2, 3, 4, 5
 
 @dataclass(frozen=True)
 class Entry:
-    """Hold one entry of the raw log.
-
-    kind : `RECEIVED`, `SENT`, `LOST`, `FOUND` or `END`. device : index of the device in the header.
-    time_ns : the host's monotonic time in ns. data : the bytes that were received or sent.
-    """
+    """Hold one entry of the raw log: kind, index of the device in the header, time, bytes."""
 
     kind: int
     device: int
@@ -55,11 +51,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class LogHeader:
-    """Hold the header of a raw log.
-
-    start_ns : the host's monotonic time in ns at 0 s of the run. started : date and time then.
-    cameras : the names of the cameras. devices : the devices that were recorded.
-    """
+    """Hold the header of a raw log; start_ns : the host's monotonic time at 0 s of the run."""
 
     start_ns: int
     started: str
@@ -107,8 +99,8 @@ class RawLog:
     def flush(self) -> None:
         """Write the entries in memory and wait until they are on the disk.
 
-        Raises InputError when they cannot be written, or when somebody has deleted the file; then
-        the file is made again with everything that was recorded.
+        Raises InputError when they cannot be written, or when somebody has deleted the file, which
+        is then made again with everything that was recorded.
         """
         if not self._waiting:
             return
@@ -173,10 +165,7 @@ def packed(entry: Entry) -> bytes:
 
 
 def log_error(path: Path, error: OSError, *, recorded: bool = True) -> InputError:
-    """Return the error for a log that cannot be written.
-
-    recorded : whether a part of the recording is in the file already.
-    """
+    """Return the error for a log that cannot be written, after a part was written or before."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return InputError(
             "the disk is full: " + ("the recording ends here" if recorded else "nothing recorded"),
@@ -196,9 +185,9 @@ def log_error(path: Path, error: OSError, *, recorded: bool = True) -> InputErro
 class LogScan:
     """Hold what a first look at a raw log has found.
 
-    header : its header. damaged_bytes : number of bytes that belong to no undamaged entry of this
-    recording. ordered : whether the entries of each device are in the order of time, each once.
-    end_ns : time in ns of the entry that closed the recording; None if there is none.
+    damaged_bytes : number of bytes that belong to no undamaged entry of this recording. ordered :
+    whether each device's entries are in the order of time. end_ns : time of the closing entry, or
+    None.
     """
 
     header: LogHeader
@@ -241,9 +230,8 @@ def _belongs(entry: Entry, header: LogHeader) -> bool:
 def read_log(path: Path, scan: LogScan | None = None) -> Iterator[Entry]:
     """Read a raw log and yield every undamaged entry of the recording, in the order of time.
 
-    scan : the result of `scan_log`, if it is known. Damaged parts are skipped, and what comes after
-    the end of the recording. A log whose parts were exchanged or doubled is put in order, for which
-    it is held in memory. Raises InputError for a file that is no log.
+    A log whose parts were exchanged or doubled is put in order, for which it is held in memory.
+    Raises InputError for a file that is no log.
     """
     scan = scan or scan_log(path)
     _, start = _open(path)
@@ -265,10 +253,9 @@ def damaged_bytes(path: Path) -> int:
 
 
 def received_bytes(path: Path, scan: LogScan, spans: Sequence[Ints]) -> list[list[bytes]]:
-    """Read parts of what each device sent out of a raw log.
+    """Read the lines of each device that lie at ``spans`` (N, 2): first byte and number of bytes.
 
-    spans : for each device (N, 2): first byte and number of bytes, counted over all bytes that were
-    received from it, in increasing order. Returns the N pieces of each device.
+    Bytes are counted over all that were received from the device; spans increase.
     """
     found: list[list[bytes]] = [[] for _ in spans]
     waiting = [[tuple(span) for span in np.asarray(s).tolist()][::-1] for s in spans]
@@ -342,10 +329,7 @@ def _pieces(path: Path, start: int) -> Iterator[Entry | int]:
 
 
 def _entry(data: bytes, at: int, *, final: bool) -> tuple[Entry | int, int] | None:
-    """Return the entry at ``at``, or the length of a damaged part, and where the next piece begins.
-
-    Returns None when more data are needed, and at the end of the data.
-    """
+    """Return the entry, or the length of a damaged part, and where the next piece begins."""
     left = len(data) - at
     if left == 0 or (left < _LEAST and not final):
         return None

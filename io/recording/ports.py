@@ -42,10 +42,7 @@ def known_ports() -> list[str]:
 
 
 def open_port(device: DeviceDescription) -> Any:
-    """Open the serial port of a device and empty its input buffer; returns pyserial's port.
-
-    Raises InputError when it cannot be opened.
-    """
+    """Open a device's serial port (pyserial) and empty its buffer; InputError if that fails."""
     import serial
 
     place = f"devices.{device.name} port {device.port:.200}"
@@ -65,11 +62,7 @@ def open_port(device: DeviceDescription) -> Any:
 
 
 def read_chunk(port: Any) -> tuple[int, bytes]:
-    """Wait for the first byte at a port, and read all bytes that have arrived.
-
-    Returns the host's monotonic time in ns and the bytes. The time is taken after all of these
-    bytes have arrived, before they are copied. The bytes are empty if none came in time.
-    """
+    """Wait for the first byte, and return the host's time in ns and all bytes there were then."""
     first = port.read(1)
     if not first:
         return time.monotonic_ns(), b""
@@ -83,11 +76,7 @@ def _cannot_open(device: DeviceDescription, error: Exception) -> InputError:
     code = getattr(error, "errno", None)
     local = "://" not in device.port
     if code == errno.EACCES:
-        return InputError(
-            "you have no permission to open it",
-            where=place,
-            todo=NO_PERMISSION,
-        )
+        return InputError("you have no permission to open it", where=place, todo=NO_PERMISSION)
     if local and (code == errno.ENOENT or not Path(device.port).exists()):
         ports = known_ports()
         there = "ports there are: " + ", ".join(ports) if ports else "no serial port is there"
@@ -113,8 +102,7 @@ ANSWER_S = 0.5
 class Reader(threading.Thread):
     """Read a port in a thread until `stop` is called; a port that was unplugged is opened again.
 
-    index : the device's index in the log. device : its description. port : the open port.
-    emit : is called in this thread with every entry.
+    ``emit`` is called in this thread with every entry.
     """
 
     def __init__(

@@ -41,12 +41,11 @@ PACKETS: dict[Kind, list[tuple[str, str]]] = {
 class Readings:
     """Hold the readings of some bytes of a line, and the bytes that are no reading.
 
-    arrived_ns : (N,) the host's time in ns of each reading's last byte.
-    values : by the name of the group, (N,) numbers each.
+    arrived_ns : (N,) the host's time of each reading's last byte. values : (N,) numbers by group.
     spans : (N, 2) place of each reading in all bytes of the line: first byte, number of bytes.
-    malformed : (M,) arrival in ns of each line, or run of bytes, that is no reading.
-    malformed_spans : (M, 2) its place. garbage : (M,) False for text that a device may send between
-    its readings. samples : the first of the malformed bytes, for messages.
+    malformed, malformed_spans : (M,), (M, 2) arrival in ns and place of each line or run of bytes
+    that is no reading. garbage : (M,) False for text that a device may send between its readings.
+    samples : the first malformed bytes, for messages.
     """
 
     arrived_ns: Ints

@@ -46,11 +46,10 @@ _ACCELERATION_MM_S2 = 5000.0
 
 @dataclass(frozen=True)
 class Refused:
-    """Hold the lines of a device that are in no table.
+    """Hold the R lines of a device that are in no table.
 
-    spans : (R, 2) first byte and number of bytes, counted over all bytes of the device.
-    t_s : (R,) time in s, NaN where it is not known. arrived_s : (R,) when the host received them.
-    reason : (R,) why each was refused. lines : the R lines.
+    spans : (R, 2) first byte and number of bytes, counted over all bytes of the device. t_s : (R,)
+    time in s, NaN where it is not known. reason : (R,) why each was refused.
     """
 
     spans: Ints
@@ -68,9 +67,8 @@ class DeviceRecord:
     host received it. values : (N,) each, as sent. malformed_s : arrival of what could not be read.
     away_s : (lost, found) of each unplug; found is NaN if it never came back. faults : number of
     readings left out, by the reason. half_width_s : half the time from question to answer.
-    time_sd_s : standard deviation in s of the times, apart from the least delay of the line; None
-    where the clock fits state it. refused : the lines that are in no table.
-    error : why the readings cannot be used, or cannot be used as described; None if they can.
+    time_sd_s : standard deviation of the times, apart from the least delay of the line; None where
+    the clock fits state it. error : why the readings cannot be used as described, or None.
     """
 
     device: DeviceDescription
@@ -155,11 +153,10 @@ class _Line:
 
 
 def replay(path: Path, devices: Mapping[str, DeviceDescription] | None = None) -> Replay:
-    """The readings of a raw log. The same log gives the same numbers, to the last bit.
+    """Return the readings of a raw log; the same log gives the same numbers, to the last bit.
 
-    devices : descriptions by name that replace those in the log, for a recording that was made with
-    wrong ones. What is wrong with one device is stated in its record and does not affect others.
-    Raises InputError for a file that is no log.
+    devices : descriptions by name that replace those in the log. What is wrong with one device is
+    stated in its record. Raises InputError for a file that is no log.
     """
     scan = scan_log(path)
     named = devices or {}
@@ -257,10 +254,7 @@ def _arrival_times(line: _Line, arrived_s: Array, _: Array | None, slot: Ints, _
 
 
 def _judged(line: _Line, start_ns: int, times: Callable[..., _Timed]) -> DeviceRecord:
-    """The readings of a device without those that cannot be right.
-
-    Raises InputError for a device whose bytes are garbage, or whose stamps have another unit.
-    """
+    """Return the readings of a device without those that cannot be right."""
     device, found = line.device, joined(line.found)
     count = len(found.arrived_ns)
     arrived = _seconds(found.arrived_ns, start_ns)

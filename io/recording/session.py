@@ -47,10 +47,7 @@ class GarbageError(InputError):
 
 @dataclass
 class DeviceStatus:
-    """The status of a device for the screen. rate_hz : of readings since the last report.
-
-    lost : readings that are missing by the device's own stamps. gaps : steps that they lie in.
-    """
+    """The status of a device for the screen: counts, and what its stamps say is missing."""
 
     name: str
     connected: bool = True
@@ -106,9 +103,9 @@ def record(
     """Record all devices into ``folder``/recording.raw until ``stop`` is set or time is up.
 
     Returns the path of the log, from which `telerig.io.recording.tables.write_tables` makes the
-    tables of the run. Raises InputError for a port that cannot be opened, a log that cannot be
-    written, and a device that sends something else in the first `GARBAGE_S` than its description
-    states. Later nothing that one device does ends the recording of the others.
+    tables. Raises InputError for a port that cannot be opened, a log that cannot be written, and a
+    device whose first `GARBAGE_S` are not what is stated; later no device ends the recording of
+    others.
     """
     if not devices:
         raise InputError("no device to record", todo="add a table [devices.<name>] to rig.toml")

@@ -36,10 +36,7 @@ REFUSED_NAME = "refused.csv"
 
 @dataclass(frozen=True)
 class Recording:
-    """The tables of a log: the content of recording.json, and the rows of each table by name.
-
-    errors : by device, why its readings could not be used, or not as described.
-    """
+    """The tables of a log: the content of recording.json, rows by table, and errors by device."""
 
     folder: Path
     summary: dict[str, Any]
@@ -52,12 +49,10 @@ def write_tables(
     folder: str | PathLike[str] | None = None,
     devices: Mapping[str, DeviceDescription] | None = None,
 ) -> Recording:
-    """Write the tables of the log's devices into ``folder`` (by default the folder of the log).
+    """Write the tables of the log's devices into ``folder``, by default that of the log.
 
-    devices : descriptions by name that replace those in the log, as in `replay`.
-    All are written to temporary files and renamed at the end. Imported sensors in
-    `accelerometer.csv` (`telerig import`) stay in it. What is wrong with one device is stated in
-    recording.json and in `Recording.errors`, and all that can be had from it and from the others is
+    devices : as in `replay`. Sensors in `accelerometer.csv` that were imported stay in it. What is
+    wrong with one device is in recording.json and in `Recording.errors`; all that can be had is
     written. Raises InputError for a file that is no log, or a folder that cannot be written.
     """
     path = Path(log)
@@ -65,8 +60,13 @@ def write_tables(
     found = replay(path, devices)
     of = {k: [r for r in found.records if r.device.kind == k] for k in _TABLES}
     errors = {r.device.name: r.error for r in found.records if r.error is not None}
-    encoder, others = of["encoder"][:1], of["encoder"][1:]
-    errors |= {r.device.name: _second_encoder(r, encoder[0]) for r in others}
+    encoder = of["encoder"][:1]
+    for record in of["encoder"][1:]:
+        errors[record.device.name] = InputError(
+            f"a run has one stage.csv, which has the readings of {encoder[0].device.name}",
+            where=f"devices.{record.device.name}",
+            todo="keep one encoder in rig.toml",
+        )
     try:
         frames = frame_times(of["frames"])
     except InputError as error:
@@ -98,18 +98,16 @@ def write_tables(
             "devices": {
                 r.device.name: _device_summary(r, errors.get(r.device.name)) for r in found.records
             },
-            "frames": _frames_summary(frames) if "frames.csv" in rows else None,
+            "frames": {
+                "count": len(frames.t_s),
+                "missing": sum(map(bool, frames.missing)),
+                "interpolated": np.flatnonzero(frames.interpolated).tolist(),
+            }
+            if "frames.csv" in rows
+            else None,
         }
         write_json_atomic(beside / "recording.json", summary)
     return Recording(out, summary, rows, errors)
-
-
-def _second_encoder(record: DeviceRecord, first: DeviceRecord) -> InputError:
-    return InputError(
-        f"a run has one stage.csv, which has the readings of {first.device.name}",
-        where=f"devices.{record.device.name}",
-        todo="keep one encoder in rig.toml",
-    )
 
 
 def refuse_existing(folder: str | PathLike[str]) -> None:
@@ -256,14 +254,6 @@ def _rate_hz(t_s: Array) -> float | None:
     return round(1 / float(np.median(np.diff(t_s))), 6) if len(t_s) > 1 else None
 
 
-def _frames_summary(frames: FrameTimes) -> dict[str, Any]:
-    return {
-        "count": len(frames.t_s),
-        "missing": sum(map(bool, frames.missing)),
-        "interpolated": np.flatnonzero(frames.interpolated).tolist(),
-    }
-
-
 @dataclass(frozen=True)
 class FrameTimes:
     """t_s : (F,) of the frames from 0. missing : names of the cameras without it, joined by `|`.
@@ -277,10 +267,10 @@ class FrameTimes:
 
 
 def frame_times(records: list[DeviceRecord]) -> FrameTimes:
-    """All frames that the lines report, the first being 0.
+    """Return all frames that the lines report, the first being 0.
 
     A frame that a counter skips is missing from its cameras, if its line was undamaged meanwhile;
-    where bytes were damaged or the line was unplugged, only its time is interpolated.
+    otherwise only its time is interpolated.
     """
     records = [r for r in records if len(r.t_s)]
     if not records:
@@ -315,10 +305,10 @@ def frame_times(records: list[DeviceRecord]) -> FrameTimes:
 
 
 def frame_numbers(t_s: Array, counter: Array | None) -> Ints:
-    """(N,) frame of each reading of a line, from 0; from the times where the counter is wrong.
+    """Return the frame (N,) of each reading from 0; by the times where the counter is wrong.
 
-    A counter may fall behind the time (a pause of the camera), but not run ahead of it by more
-    than a tenth, nor go back: then it restarted, wrapped, or was damaged.
+    A counter may fall behind the time (a pause of the camera), but not run ahead by more than a
+    tenth, nor go back.
     """
     if len(t_s) < 2:
         return np.zeros(len(t_s), np.int64)

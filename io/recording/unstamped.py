@@ -34,11 +34,10 @@ _SEGMENT = 20
 
 @dataclass(frozen=True)
 class Spread:
-    """Hold the times of readings without stamps.
+    """Hold the times (N,) of readings without stamps, strictly increasing, and their sd in s.
 
-    t_s : (N,) times in s, strictly increasing. sd_s : their standard deviation in s, apart from
-    the least delay of the line. regular : whether the device samples regularly; if not, the
-    readings are spread evenly over the time since the arrival before.
+    regular : whether the device samples regularly; if not, the readings are spread evenly over the
+    time since the arrival before.
     """
 
     t_s: Array
@@ -47,10 +46,9 @@ class Spread:
 
 
 def spread_arrivals(arrived_s: Array, slot: Ints) -> Spread:
-    """Compute when readings were made that arrive in bunches.
+    """Compute when readings were made that arrive in bunches at arrived_s (N,).
 
-    arrived_s : (N,) arrival of each in s, not decreasing. slot : (N,) number of the line that it
-    came in, increasing; malformed lines are counted, too.
+    slot : (N,) number of the line of each, increasing; malformed lines are counted, too.
     """
     regular, even = _by_regular_clock(arrived_s, slot), _evenly(arrived_s)
     return regular if regular is not None and regular.sd_s < even.sd_s else even
@@ -91,10 +89,10 @@ def _period_s(arrived_s: Array, slot: Ints) -> float:
 
 
 def _begins(arrived_s: Array, slot: Ints, period_s: float) -> Ints:
-    """(N,) 1 where a count begins.
+    """Return (N,) 1 where a count begins.
 
-    The arrival minus the period times the line's number is a constant in each count, plus the
-    delay. Missing lines raise the constant; malformed ones that were no line lower it.
+    Arrival minus period times the line's number is a constant in each count, plus the delay.
+    Missing lines raise the constant; malformed ones that were no line lower it.
     """
     late_s = arrived_s - period_s * slot
     waited_least = np.diff(arrived_s, append=np.inf) > period_s / 2

@@ -50,12 +50,7 @@ class Table:
 
 @dataclass(frozen=True)
 class CameraDescription(Table):
-    """Hold what rig.toml states about one camera.
-
-    image_size_px : (width, height) in px. scale_px_per_mm : the nominal scale.
-    telecentricity_per_mm : nominal residual perspective kappa in 1/mm; None when the file does not
-    state it.
-    """
+    """What rig.toml states about one camera, with nominal scale and residual perspective."""
 
     name: str
     image_size_px: Annotated[
@@ -70,15 +65,11 @@ class CameraDescription(Table):
 
 @dataclass(frozen=True)
 class StageDescription(Table):
-    """Hold what rig.toml states about the stage.
+    """What rig.toml states about the stage.
 
-    axis : (3,) nominal direction of travel; up : (3,) direction against gravity. Both are unit
-    vectors in the rig frame.
-    position_sigma_mm : standard deviation of an encoder reading in mm.
-    scale_sigma : standard deviation of the encoder's relative scale error, 0 if the scale is exact;
-    None when the file does not state it.
-    gravity_m_s2 : gravity in the laboratory in m/s^2; on Earth's surface it is between 9.76 and
-    9.84.
+    axis : (3,) nominal direction of travel; up : (3,) direction against gravity; unit vectors in
+    the rig frame. position_sigma_mm : standard deviation of an encoder reading. scale_sigma : that
+    of the encoder's relative scale error; None when the file does not state it.
     """
 
     axis: Direction
@@ -100,16 +91,12 @@ class StageDescription(Table):
 
 @dataclass(frozen=True)
 class AccelerometerDescription(Table):
-    """Hold what rig.toml states about one accelerometer.
+    """What rig.toml states about one accelerometer.
 
-    mounted_on : a camera's name, or "carriage" for the stage itself.
-    axes : (3, 3) whose rows are the sensor's x, y, z axes as unit vectors in the rig frame.
-    noise_density_ug_sqrt_hz : noise density in micro-g per root hertz.
-    bias_sigma_m_s2 : prior standard deviation of the bias of each axis in m/s^2.
-    range_m_s2 : the largest acceleration that the sensor can read, at which it is clipped; None
-    when the file does not state it.
-    clock : "frames" if its times are those of the frames' clock, "unknown" if only the images can
-    show its offset; None when the file does not state it.
+    axes : (3, 3) whose rows are the sensor's axes as unit vectors in the rig frame. bias_sigma_m_s2
+    : prior standard deviation of the bias of each axis. range_m_s2 : reading at which it is
+    clipped. clock : "frames" if its times are those of the frames' clock, "unknown" if only the
+    images can show its offset.
     """
 
     name: str
@@ -162,11 +149,7 @@ class FluidDescription(Table):
 
 @dataclass(frozen=True)
 class FieldDescription(Table):
-    """Describe where in a camera's images bubbles are looked for; without both, everywhere.
-
-    region : corners (u, v) of a polygon, in px.
-    mask : path, from the folder of rig.toml, of an image that is not black there.
-    """
+    """Describe where in a camera's images bubbles are looked for: a polygon, or a mask."""
 
     camera: str
     region: Annotated[
@@ -180,14 +163,10 @@ class FieldDescription(Table):
 class WallDescription(Table):
     """Describe the plane glass between a camera and the water, in that camera's frame.
 
-    normal : (3,) unit vector that points away from the camera (z > 0).
-    indices : refractive indices of the medium on the camera's side, of the glass, and of the medium
-    behind it.
-    thickness_mm : thickness of the glass in mm.
-    distance_mm : distance in mm along the camera's axis from its origin to the near face, negative
-    if the face lies before the origin. None is allowed for kappa = 0, where only the image's place
-    depends on it.
-    normal_sigma_deg : standard deviation of the normal's direction in degrees, 0 if it is exact.
+    normal : (3,) unit vector that points away from the camera (z > 0). indices : refractive indices
+    on the camera's side, of the glass, and behind it. distance_mm : along the camera's axis from
+    its origin to the near face; None is allowed for kappa = 0, where only the image's place depends
+    on it. normal_sigma_deg : standard deviation of the normal's direction.
     """
 
     camera: str
@@ -205,10 +184,7 @@ class WallDescription(Table):
     normal_sigma_deg: Annotated[float, Field(ge=0, le=10, description="degrees from 0 to 10")] = 0.0
 
     def wall(self) -> Wall:
-        """Return the `Wall` for a camera.
-
-        Without a distance the near face is placed at the camera's origin.
-        """
+        """Return the `Wall`; without a distance its near face is at the camera's origin."""
         sigma_rad = float(np.radians(self.normal_sigma_deg))
         distance_mm = self.distance_mm or 0.0
         return Wall(np.array(self.normal), distance_mm, self.thickness_mm, self.indices, sigma_rad)
@@ -316,10 +292,7 @@ def rotvec_key(camera: str, first: str) -> str:
 
 
 def camera_named(camera: str | int, names: list[str], *, where: str) -> str:
-    """Return the name of a camera, given as one of ``names`` or as an index into them.
-
-    Raises InputError for an unknown camera.
-    """
+    """Return a camera's name from its name or index in ``names``; InputError for another one."""
     if isinstance(camera, int) and 0 <= camera < len(names):
         return names[camera]
     if isinstance(camera, str) and camera in names:

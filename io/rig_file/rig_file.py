@@ -76,10 +76,8 @@ class _TrackingTable(Table):
 
 
 def read_rig_toml(path: str | PathLike[str]) -> RigDescription:
-    """Read and check a rig.toml.
+    """Read and check a rig.toml; directions are returned as unit vectors.
 
-    Directions are returned as unit vectors, standard deviations with their default values filled
-    in.
     Raises one InputError that lists every fault with its table, its key and what to do.
     """
     file = Path(path)
@@ -88,20 +86,16 @@ def read_rig_toml(path: str | PathLike[str]) -> RigDescription:
 
 
 def write_rig_toml(rig: RigDescription, path: str | PathLike[str]) -> None:
-    """Write a rig.toml that `read_rig_toml` reads back without a change.
-
-    Raises InputError when the description is not valid, and when the file cannot be written.
-    """
+    """Write a rig.toml that reads back without a change; InputError for one that does not."""
     text = rig_toml(rig)
     description_from_toml(text, where=str(path))
     write_text_atomic(path, text)
 
 
 def description_from_toml(text: str, *, where: str, name: str = "rig") -> RigDescription:
-    """Return the rig that the text of a rig.toml describes.
+    """Return the rig that the text of a rig.toml describes; raises one InputError with every fault.
 
     where : the file that errors name. name : the rig's name, used when the text states none.
-    Raises one InputError that lists every fault.
     """
     raw = toml_content(text, where, _CORRECT)
     _check_schema(raw, where)
@@ -166,7 +160,12 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
     tracking = _tracking(raw, names, problems)
     stage = _stage(raw, names, problems)
     accelerometers = _accelerometers(raw, names, problems)
-    references = _references(raw, problems)
+    references = None
+    if "references" in raw:
+        content = raw["references"]
+        references = read_table(
+            ReferencesDescription, content, "references", problems, homes=_HOMES
+        )
     walls = _walls(raw, cameras, problems)
     bubbles = _bubbles(raw, names, problems)
     fluid = _fluid(raw, problems)

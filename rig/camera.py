@@ -19,16 +19,15 @@ from telerig.rig.windows import Wall
 
 @dataclass(frozen=True)
 class Camera:
-    """Describes one camera of the rig.
+    """One camera of the rig.
 
     intrinsics : (20,) parameters of the lens and the sensor, in the order of
-        `telerig.rig.lens_parameters.PARAMETERS`.
-    rho_mm : half the diagonal of the image, measured in object space at the nominal scale.
-        Coordinates are divided by this length before the distortion is computed.
-    camera_from_rig : pose that maps rig coordinates to camera coordinates. It is the identity for
-        the first camera, because that camera's frame is the rig frame.
+    `telerig.rig.lens_parameters.PARAMETERS`.
+    rho_mm : half the image's diagonal in object space at the nominal scale, by which coordinates
+    are divided before the distortion.
+    camera_from_rig : pose; the identity for the first camera, whose frame is the rig frame.
     wall : the window through which the camera looks, or None. With a window, all points are in the
-        water behind it.
+    water behind it.
     """
 
     name: str
@@ -50,11 +49,9 @@ class Camera:
     ) -> Camera:
         """Return a camera with the given parameters; all others are those of an ideal centred lens.
 
-        parameters : intrinsics by name, see `telerig.rig.lens_parameters`. One that is not given
-            is 0, the aspect ratio is 1, and the centre is the middle of the image.
-        rho_mm : see `Camera`; by default it follows from the image size and the scale.
-
-        Raises GeometryError for an unknown parameter.
+        parameters : intrinsics by name, see `telerig.rig.lens_parameters`. rho_mm : see `Camera`;
+        by default it follows from the image size and the scale. Raises GeometryError for an unknown
+        parameter.
         """
         unknown = set(parameters) - set(PARAMETERS)
         if unknown:
@@ -79,10 +76,7 @@ class Camera:
         return float(self.intrinsics[INDEX[parameter]])
 
     def with_parameters(self, **parameters: float) -> Camera:
-        """Return a copy of the camera with some intrinsics changed.
-
-        Raises KeyError for an unknown parameter.
-        """
+        """Return a copy with some intrinsics changed. Raises KeyError for an unknown parameter."""
         intrinsics = self.intrinsics.copy()
         for name, value in parameters.items():
             intrinsics[INDEX[name]] = value
@@ -113,8 +107,7 @@ class Camera:
     def project(self, points_rig_mm: ArrayLike) -> Array:
         """Return the pixels (..., 2) at which the camera sees the points (..., 3) of the rig frame.
 
-        Raises GeometryError for points behind the perspective centre (1 + kappa Z <= 0) and for
-        points that no ray reaches through the window.
+        Raises GeometryError for points behind the perspective centre, or that no ray reaches.
         """
         points = self.camera_from_rig.apply(np.atleast_2d(points_rig_mm))
         if self.wall is None and np.any(1 + self["kappa_per_mm"] * points[..., 2] <= 0):
@@ -135,12 +128,11 @@ class Camera:
         )
 
     def unproject(self, uv_px: ArrayLike) -> tuple[Array, Array]:
-        """Return the rays in the rig frame that the camera sees at the pixels (..., 2).
+        """Return the rays at pixels (..., 2): origins (..., 3) in mm and unit directions (..., 3).
 
-        Returns the origins (..., 3) in mm and the unit directions (..., 3). An origin lies in the
-        camera's plane Z = 0; a ray in water is extended backwards to this plane in a straight line.
-
-        Raises GeometryError for pixels at which the lens model cannot be inverted.
+        They are in the rig frame. An origin lies in the camera's plane Z = 0; a ray in water is
+        extended backwards to it in a straight line. Raises GeometryError where the lens model has
+        no inverse.
         """
         ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), self.intrinsics, self.rho_mm)
         if self.wall is not None:

@@ -15,10 +15,7 @@ from telerig.errors import CalibrationError
 
 
 class Scales(NamedTuple):
-    """The sizes of a camera to which priors and steps of its parameters refer.
-
-    rho_mm is the unit of length of the distortion, see `Camera`.
-    """
+    """The sizes of a camera to which priors and steps of its parameters refer."""
 
     px_per_mm: float
     rho_mm: float
@@ -32,13 +29,11 @@ class Scales(NamedTuple):
 
 @dataclass(frozen=True)
 class LensParameter:
-    """Describes one parameter of a camera. Its name ends with its unit.
+    """One parameter of a camera, whose name ends with its unit.
 
-    label : for reports.
     prior_sd : standard deviation of its weak prior, several times the values of usual telecentric
-        lenses. The prior only bounds a parameter that the data do not determine.
-    term : the kind of its term in the distortion; "" for none.
-    optional : whether it is 0 in a file that does not name it.
+    lenses, which only bounds a parameter that the data do not determine. term : the kind of its
+    term in the distortion; "" for none. optional : whether it is 0 in a file that does not name it.
     step : the change that moves a pixel at the image corner by about 1 px.
     """
 
@@ -139,8 +134,7 @@ name, or a sequence with one name for each camera."""
 def groups_of(name: str) -> tuple[str, ...]:
     """Return the groups of the model with this name, in the order of `GROUPS`.
 
-    Raises CalibrationError for an unknown name, and for affine together with tilt, because both
-    have the same effect on the image.
+    Raises CalibrationError for an unknown name, and for affine with tilt, which act alike.
     """
     found: set[str] = set()
     for part in name.split("+"):
@@ -177,11 +171,9 @@ def name_of(groups: Iterable[str]) -> str:
 def rich_groups(*, mono: bool, strong: bool) -> frozenset[str]:
     """Return the parameter groups that are tried for a camera whose model is chosen automatically.
 
-    mono : whether the rig has this camera only; kappa is then not tried.
-    strong : whether the lens has strong perspective. Then kappa and the image centre are always
-        free. A free centre makes the image on a tilted sensor equal to that of a rotated camera, so
-        s or a tilt cannot be distinguished from a rotation, and aspect and skew hardly from a
-        stretch of the target (docs/decisions/014).
+    mono : kappa is not tried for a rig of one camera. strong : with strong perspective kappa and
+    the image centre are free. A free centre makes a tilted sensor's image equal to a rotated
+    camera's, so s or a tilt cannot be distinguished from a rotation (docs/decisions/014).
     """
     if strong:
         return frozenset(PLAIN_GROUPS) - {"affine", "s"} | {"centre"}
@@ -194,10 +186,9 @@ def parameters_of(name: str) -> tuple[str, ...]:
 
 
 def models_by_camera(model: Model, cameras: Sequence[str]) -> tuple[str, ...]:
-    """Return the model's name for each camera, "auto" for a camera that ``model`` does not mention.
+    """Return the model's name for each camera, "auto" for one that ``model`` does not mention.
 
-    Raises CalibrationError for an unknown model or camera, and for a sequence whose length is not
-    the number of cameras.
+    Raises CalibrationError for an unknown model or camera, and for a wrong number of models.
     """
     if isinstance(model, str) and "=" in model:
         model = _by_camera(model)
@@ -230,11 +221,7 @@ def joint_name(names: Sequence[str], cameras: Sequence[str]) -> str:
 
 
 def checked_model(model: str) -> str:
-    """Return ``model`` unchanged after a check of its names. The cameras need not be known for
-    this.
-
-    Raises CalibrationError for an unknown name.
-    """
+    """Return ``model`` unchanged; CalibrationError for an unknown name. Cameras may be unknown."""
     for name in _by_camera(model).values() if "=" in model else [model]:
         if name != AUTO:
             groups_of(name)

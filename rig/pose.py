@@ -28,10 +28,7 @@ def across(direction: ArrayLike) -> Array:
 
 
 def rotation_from_rotvec(rotvec_rad: ArrayLike) -> Array:
-    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad.
-
-    This is Rodrigues' formula in a form that is also exact near zero.
-    """
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad (Rodrigues)."""
     w = np.asarray(rotvec_rad, float)
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     k = hat(w)
@@ -40,8 +37,7 @@ def rotation_from_rotvec(rotvec_rad: ArrayLike) -> Array:
 
 
 def rotvec_from_rotation(rotation: ArrayLike) -> Array:
-    """Return the rotation vectors (..., 3) of rotation matrices (..., 3, 3), with angles in [0,
-    pi].
+    """Return the rotation vectors (..., 3), of angles in [0, pi], of rotation matrices (..., 3, 3).
 
     The unit quaternion q is computed first (Shepperd, J. Guidance and Control 1, 1978): every
     column of 4 q q^T is a multiple of q, and the longest column is used.
@@ -64,10 +60,7 @@ def rotvec_from_rotation(rotation: ArrayLike) -> Array:
 
 
 def nearest_rotation(matrix: ArrayLike) -> Array:
-    """Return the proper rotation (..., 3, 3) that is nearest to each matrix (..., 3, 3).
-
-    Distance is measured by the Frobenius norm; the solution uses the singular value decomposition.
-    """
+    """Return the proper rotation (..., 3, 3) nearest to each matrix in the Frobenius norm."""
     u, _, vt = np.linalg.svd(np.asarray(matrix, float))
     u[..., :, 2] *= np.linalg.det(u @ vt)[..., None]
     return np.asarray(u @ vt)
@@ -75,12 +68,7 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """Describes the rigid transformation ``target_from_source``: x_target = rotation @ x_source +
-    translation.
-
-    rotation : (..., 3, 3).
-    translation_mm : (..., 3).
-    """
+    """The rigid transformation target_from_source: x_target = rotation @ x_source + translation."""
 
     rotation: Array
     translation_mm: Array
@@ -109,10 +97,7 @@ class Pose:
         return Pose(back, -np.einsum("...ij,...j->...i", back, self.translation_mm))
 
     def adjoint(self) -> Array:
-        """Return the adjoint matrices (..., 6, 6): T Exp(x) T^-1 = Exp(adjoint x).
-
-        T is this pose, and x is a tangent vector (rotation, translation).
-        """
+        """Return the matrices (..., 6, 6) with T Exp(x) T^-1 = Exp(adjoint x), x tangent vectors."""
         out = np.zeros((*self.rotation.shape[:-2], 6, 6))
         out[..., :3, :3] = out[..., 3:, 3:] = self.rotation
         out[..., 3:, :3] = hat(self.translation_mm) @ self.rotation

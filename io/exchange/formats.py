@@ -1,7 +1,6 @@
-"""List the formats of other programs: one entry for each export and for each importer.
+"""List the formats of other programs, which the commands and their help read.
 
-A new export or importer is one file in ``export`` or ``importing`` and one line here; `telerig
-export`, `telerig import` and their help read these tables.
+A new export or importer is one file in ``export`` or ``importing`` and one entry here.
 """
 
 from __future__ import annotations
@@ -26,11 +25,8 @@ if TYPE_CHECKING:
 class Format:
     """Describe one format, whose module is imported at its first use.
 
-    program : the program to which the format belongs.
-    function : "module:name" below ``telerig.io.exchange``.
-    description : words for the help text.
-    suffix : of an exported file; empty where files are written into a folder.
-    options : which of the command's options are passed to the function.
+    function : "module:name" below ``telerig.io.exchange``. description : for the help text. suffix
+    : of an exported file; "" for a folder. options : those of the command that the function takes.
     extra : the optional dependency that it needs, as in ``pip install 'telerig[tdms]'``.
     """
 
@@ -48,10 +44,7 @@ class Format:
         return function
 
     def __call__(self, *arguments: Any, **offered: Any) -> Any:
-        """Call the function with the arguments and with those offered options that it takes.
-
-        Returns what the function returns.
-        """
+        """Call the function with the arguments and with those offered options that it takes."""
         return self.load()(*arguments, **{key: offered[key] for key in self.options})
 
 
@@ -136,18 +129,14 @@ def export_results(
     accept: Collection[str] = (),
     **options: Any,
 ) -> list[str]:
-    """Write cameras or a run in the format ``to``.
+    """Write cameras or a run in the format ``to``, a name in `CAMERA_EXPORTS` or `RUN_EXPORTS`.
 
     source : a dataset, one of its results folders, or a calibration.json.
-    to : a name in `CAMERA_EXPORTS` or `RUN_EXPORTS`.
-    run : the run's name; None takes the only one with results.
-    calibration : a calibration that is used in place of the dataset's own; None uses that one.
-    out : the file or folder that is written; None writes into the dataset's results/export.
-    accept : ("stale",) also exports results whose inputs have changed since they were made.
-    options : as for `export_cameras`.
-    Returns lines of text that say what was written and where.
-    Raises InputError for an unknown format, and for results that are missing, stale or cannot be
-    used.
+    run : the run's name; None takes the only one with results. calibration : is used in place of
+    the dataset's own. out : the file or folder; None writes into the dataset's results/export.
+    accept : ("stale",) also exports results whose inputs have changed. options : of the format.
+    Returns lines of text that say what was written and where. Raises InputError for an unknown
+    format, and for results that are missing, stale or cannot be used.
     """
     from telerig.io.exchange.export.run_results import (
         cameras_of,
@@ -184,12 +173,9 @@ def export_cameras(
 ) -> list[str]:
     """Write the cameras in one of the formats `CAMERA_EXPORTS`.
 
-    out : the file or folder that is written.
-    volume : where errors are measured and polynomials fitted; None takes `working_volume`.
-    remarks : sentences that the file keeps as comments.
-    options : those that the format takes.
-    Returns lines of text with the volume and each camera's error.
-    Raises InputError for a volume that the cameras do not see, and when ``out`` cannot be written.
+    volume : where errors are measured and polynomials fitted; None takes `working_volume`. remarks
+    : sentences that the file keeps as comments. options : those that the format takes.
+    Returns lines of text. Raises InputError for a volume that the cameras do not see.
     """
     from telerig.io.exchange.export.volume import working_volume
 
@@ -212,11 +198,10 @@ def export_cameras(
 def export_run(
     results: RunResults, to: str, out: Path, cameras: Sequence[Camera] = ()
 ) -> list[str]:
-    """Write a run in one of the formats `RUN_EXPORTS` into the file ``out``.
+    """Write a run in one of the formats `RUN_EXPORTS`; return lines of text on what was written.
 
-    cameras : they are written too, if the format can hold them.
-    Returns lines of text that say what was written.
-    Raises InputError for data that the format cannot hold, and when ``out`` cannot be written.
+    Cameras are written too, if the format can hold them. Raises InputError for data that it cannot
+    hold.
     """
     RUN_EXPORTS[to](results, out, cameras=cameras)
     bubbles = counted(results.points["particle"].nunique(), "bubble")

@@ -1,7 +1,4 @@
-"""Random access to one camera's frames of a run: an image each, a multi-page TIFF, a video.
-
-Nothing but the frame asked for is held, so memory does not grow with the run.
-"""
+"""Random access to one camera's frames of a run; only the frame asked for is in memory."""
 
 from __future__ import annotations
 
@@ -37,8 +34,7 @@ PAGE_EXTENSIONS = (".tif", ".tiff")
 class FrameSource(Protocol):
     """Give access to one camera's frames by their position in the order of recording.
 
-    Frames are not yet paired with those of another camera.
-    path : the folder or the file. cut_short : whether the file ends within its last frame.
+    cut_short : whether the file ends within its last frame.
     """
 
     @property
@@ -50,10 +46,7 @@ class FrameSource(Protocol):
     def __len__(self) -> int: ...
 
     def read(self, position: int) -> Image:
-        """Read the frame at ``position`` (from 0); returns pixels (height, width) as `read_image`.
-
-        Raises InputError, naming file and frame, if it cannot be read.
-        """
+        """Read the frame at ``position`` (from 0); InputError names file and frame."""
 
     def where(self, position: int) -> str:
         """Return the names of file and frame, for errors."""
@@ -66,7 +59,7 @@ class FrameSource(Protocol):
 class ImageFiles:
     """Give access to a folder that holds one image file per frame, in natural order of the names.
 
-    Names are kept instead of paths, which need ten times the memory and are sent to every process.
+    Paths would need ten times the memory of names, and are sent to every process.
     """
 
     path: Path
@@ -94,10 +87,7 @@ class ImageFiles:
 
 
 class PageFrames:
-    """Give access to the pages of a multi-page TIFF, which are read one at a time.
-
-    Raises InputError when the file is not a TIFF with at least one complete page.
-    """
+    """Give access to the pages of a multi-page TIFF; InputError if no page is complete."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -158,11 +148,7 @@ class PageFrames:
 
 @dataclass(frozen=True)
 class _Stack:
-    """Hold where frames lie that follow each other after one page header, as ImageJ does it.
-
-    offset : first byte. count : number of frames. shape : (height, width) in px. dtype : of a
-    pixel.
-    """
+    """Hold where frames lie that follow each other after one page header, as ImageJ does it."""
 
     offset: int
     count: int
@@ -176,10 +162,7 @@ class _Stack:
 
 
 def _contiguous_stack(tiff: Any, pages: int, path: Path) -> _Stack | None:
-    """Return the stack if the file's description counts more frames than there are page headers.
-
-    Returns None for any other file.
-    """
+    """Return the stack if the file's description counts more frames than there are page headers."""
     page = tiff.pages[0]
     if page.samplesperpixel != 1 or page.photometric == 0:
         return None
@@ -231,12 +214,11 @@ def _found(offsets: list[int], path: Path) -> Ints:
 
 
 def open_frames(folder: Path, camera: str) -> FrameSource | None:
-    """Open the frames of one camera in a run's folder; none is decoded.
+    """Open the frames of one camera in a run's folder, None if it has none; no frame is decoded.
 
     They are `<camera>/*.tif|png|bmp|jpg`, or `<camera>.tif` (multi-page), or a video
-    `<camera>.avi|mp4|mov|mkv`, or a high-speed camera's `<camera>.cine` or `<camera>.mraw`.
-    Returns None when the camera has no frames.
-    Raises InputError when there is more than one of these, or when a file cannot be opened.
+    `<camera>.avi|mp4|mov|mkv`, or a high-speed camera's `<camera>.cine` or `<camera>.mraw`. Raises
+    InputError when there is more than one of these, or when a file cannot be opened.
     """
     found = camera_entries(folder, camera)
     if len(found) > 1:
@@ -303,10 +285,9 @@ _WIDE_GREY = {"gray9", "gray10", "gray12", "gray14", "gray16"}
 class VideoFrames:
     """Give access to the frames of a video by their position.
 
-    Successive frames are read at the decoder's speed; for other frames decoding starts at a key
-    frame. Grey formats are returned as stored (uint8, or uint16 for 9 to 16 bits), YUV formats as
-    their stored brightness; RGB frames must be grey.
-    Raises InputError when PyAV is not installed or the file is no video that can be decoded.
+    Successive frames are read at the decoder's speed; for others decoding starts at a key frame.
+    Grey formats are returned as stored (uint8, or uint16 for 9 to 16 bits), YUV formats as their
+    stored brightness; RGB frames must be grey. Raises InputError without PyAV and for other files.
     """
 
     def __init__(self, path: Path) -> None:
@@ -326,10 +307,6 @@ class VideoFrames:
         return None
 
     def read(self, position: int) -> Image:
-        """Read the frame at ``position`` (from 0); returns pixels (height, width).
-
-        Raises InputError, naming file and frame, if it cannot be read.
-        """
         with self._lock:
             try:
                 return image_from_pixels(self._pixels(position), self.path)

@@ -32,13 +32,10 @@ _TODO = "save it with 8, 12 or 16 bits of grey per pixel in the camera's softwar
 class HighSpeedFrames:
     """Give access to the frames of a high-speed camera's file.
 
-    path : the file with the pixels. width, height : of a frame, in px.
-    bits : per pixel in the file: 8, 10 (packed), 12 (packed) or 16.
-    bottom_up : whether the last row comes first.
-    offsets : (frames,) byte at which each frame's pixels begin.
-    first : number of the first frame, counted from the trigger.
-    t_s : (frames,) times in s, from 0.
-    cut_short : whether the file ends within its last frame.
+    bits : per pixel in the file: 8, 10 (packed), 12 (packed) or 16. bottom_up : whether the last
+    row comes first. offsets : (frames,) byte at which each frame's pixels begin. first : number of
+    the first frame, counted from the trigger. t_s : (frames,) times in s, from 0. cut_short :
+    whether the file ends within its last frame.
     """
 
     path: Path
@@ -61,10 +58,7 @@ class HighSpeedFrames:
         return self.first + np.arange(len(self), dtype=np.int64)
 
     def read(self, position: int) -> Image:
-        """Read the frame at ``position`` (from 0); returns pixels (height, width), uint8 or uint16.
-
-        Raises InputError, naming file and frame, if the file ends before the frame does.
-        """
+        """Read the frame at ``position`` (from 0); pixels (height, width), uint8 or uint16."""
         size = -(-self.width * self.height * self.bits // 8)
         with self.path.open("rb") as file:
             file.seek(int(self.offsets[position]))
@@ -95,10 +89,7 @@ def _unpacked(data: NDArray[np.uint8], bits: int) -> NDArray[np.uint8] | NDArray
 
 
 def open_high_speed(path: Path) -> HighSpeedFrames:
-    """Open a .cine or .mraw file; no frame is read.
-
-    Raises InputError for a file that is damaged or of a kind that is not read.
-    """
+    """Open a .cine or .mraw file; InputError if it is damaged or of a kind that is not read."""
     if path.suffix.lower() == ".cine":
         return _open_cine(path)
     return _open_mraw(path)
@@ -229,10 +220,7 @@ _LINES = {
 
 
 def _cih(file: Path) -> dict[str, str]:
-    """Return the values of a .cihx file (XML after some bytes) or a .cih file ("key : value").
-
-    The XML is searched for its few tags, not parsed, so that no entity is expanded.
-    """
+    """Return the values of a .cih file ("key : value") or of the tags of a .cihx file."""
     if file.stat().st_size > _MOST_HEADER_BYTES:
         raise damaged(file, "it is too large for a header")
     text = read_bytes(file).decode("utf-8", errors="replace")

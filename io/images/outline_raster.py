@@ -11,12 +11,10 @@ Window = tuple[slice, slice]
 
 
 def cell_coverage(polygon: Array, size: tuple[int, int]) -> Array:
-    """Compute the exact share of each unit cell that lies inside a closed polygon.
+    """Return the exact share (rows, columns) of each unit cell inside a closed polygon (points, 2).
 
-    polygon : (points, 2) x and y in cells; it must lie inside the grid. size : (rows, columns).
-    Returns (rows, columns) shares from 0 to 1. The cell (row i, column j) spans j..j+1 in x and
-    i..i+1 in y. Each edge is cut at the cells' borders; a piece adds its height to all cells to its
-    right.
+    The polygon's x and y in cells must lie inside the grid. Each edge is cut at the cells' borders;
+    a piece adds its height to all cells to its right.
     """
     rows, columns = size
     start, end = _pieces(polygon)
@@ -72,11 +70,10 @@ def pixel_weights(
     shift_px: float = 0.0,
     kind: type[np.floating] = np.float64,
 ) -> Array:
-    """(pixels + 2 pad, pixels * per_pixel): Gaussian blur and integration over pixels of a row of
-    fine cells, as numbers of ``kind``.
+    """Return the weights (pixels + 2 pad, pixels * per_pixel) of a row's fine cells in pixels.
 
-    The row starts at the left edge of its first pixel and is displaced by shift_px. Averaging
-    inside a cell blurs by its width squared over 12, which is taken off.
+    They blur and integrate. The row starts at the left edge of its first pixel and is displaced by
+    shift_px. Averaging inside a cell blurs by its width squared over 12, which is taken off.
     """
     centre = (np.arange(pixels * per_pixel) + 0.5) / per_pixel + shift_px
     border = np.arange(-pad, pixels + pad + 1)[:, None]
@@ -88,11 +85,9 @@ def pixel_weights(
 def overlap(
     shape: tuple[int, ...], patch_shape: tuple[int, ...], row: int, column: int
 ) -> tuple[Window, Window]:
-    """Return where a patch lies in an image, and which part of the patch lies in the image.
+    """Return the slices (rows, columns) of a patch in an image, and of that part in the patch.
 
-    shape, patch_shape : (rows, columns) of the image and of the patch. row, column : the patch's
-    first pixel in the image, which may be negative.
-    Both results are a pair of slices (rows, columns); they may be empty.
+    row, column : the patch's first pixel in the image, which may be negative.
     """
     first = np.maximum([row, column], 0)
     end = np.maximum(np.minimum(np.add([row, column], patch_shape), shape), first)

@@ -40,10 +40,10 @@ def read_image(
 ) -> Image:
     """Read one grey image from a TIFF, PNG, BMP or JPEG file.
 
-    expected_size_px : (width, height) in px that the image must have; None accepts any size.
-    Returns the pixels (height, width) as the file holds them: uint8, uint16, or float32 (float
-    TIFF). Three equal channels count as grey and an opaque alpha channel is removed. There is no
-    EXIF rotation, no gamma and no scaling.
+    expected_size_px : (width, height) that the image must have; None accepts any size.
+    Returns the pixels (height, width) as the file holds them: uint8, uint16, or float32. Three
+    equal channels count as grey and an opaque alpha channel is removed. There is no EXIF rotation,
+    no gamma and no scaling.
     Raises InputError for a file that is missing, truncated or of an unknown format, that holds
     several pages, colour or values that are not finite, or has another size.
     """
@@ -58,19 +58,12 @@ def read_image(
 
 
 def image_from_pixels(pixels: NDArray[Any], file: Path) -> Image:
-    """Convert decoded pixels as `read_image` does, with the same checks; for pages and videos.
-
-    pixels : (height, width) or (height, width, channels). file : named in errors.
-    Returns the grey image (height, width). Raises InputError as `read_image` does.
-    """
+    """Convert decoded pixels of a page or a video as `read_image` does, with the same checks."""
     return _native(_grey(pixels, file), file)
 
 
 def list_images(folder: str | PathLike[str]) -> list[Path]:
-    """List the image files in a folder, by their extensions, in natural order (2 before 10).
-
-    Hidden files are left out. Raises InputError when there is no such folder.
-    """
+    """List the image files in a folder in natural order (2 before 10), without hidden files."""
     place = Path(folder)
     if not place.is_dir():
         raise InputError("is not a folder", where=str(place), todo="check the path")
@@ -100,10 +93,7 @@ def damaged(path: Path, detail: str) -> InputError:
 
 
 def refuse_too_large(width: int, height: int, bytes_per_pixel: int, file: Path) -> None:
-    """Raise InputError if an image would need more than `MOST_BYTES` when it is decoded.
-
-    The size is that of the file's header, so a file that states a wrong one costs no memory.
-    """
+    """Raise InputError if an image, by its header's size, would need more than `MOST_BYTES`."""
     needed = width * height * bytes_per_pixel
     if needed > MOST_BYTES:
         what = f"is {width} x {height} px, {needed / 1e9:.3g} GB when it is decoded"
@@ -113,11 +103,7 @@ def refuse_too_large(width: int, height: int, bytes_per_pixel: int, file: Path) 
 
 @contextmanager
 def decoding(file: Path, what: str = "") -> Iterator[None]:
-    """Turn every error of a decoder into the InputError of a damaged file.
-
-    Decoders raise errors of many kinds for damaged files, and warn in addition.
-    what : words before the decoder's own.
-    """
+    """Turn every error of a decoder into the InputError of a damaged file; drop its warnings."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -205,10 +191,10 @@ def tiff_reader() -> Any:
 
 
 def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
-    """(height, width) or (height, width, channels) of tifffile's ``page``.
+    """Return the pixels of tifffile's ``page``, (height, width) or (height, width, channels).
 
-    file_size : bytes. Raises InputError when the file ends before the page does, or white is 0;
-    and what tifffile raises.
+    Raises InputError when the file ends before the page does, or white is 0; and what tifffile
+    raises.
     """
     bits = np.max(page.bitspersample)
     bytes_per_pixel = max(int(bits) // 8, 1) * page.samplesperpixel * page.imagedepth

@@ -43,11 +43,10 @@ def ordered_map(
     workers: int,
     meanwhile: Callable[[], object] | None = None,
 ) -> Iterator[Result]:
-    """``function`` of each task, in the order of the tasks, by ``workers`` processes.
+    """Yield ``function`` of each task, in the order of the tasks, by ``workers`` processes.
 
-    function : a module's function or a `functools.partial` of one. An error raised in a process
-        is raised here.
-    meanwhile : called once in this process while copies of it work.
+    function : a module's function or a `functools.partial` of one. meanwhile : is called once in
+    this process while copies of it work.
     """
     if workers <= 1:
         yield from map(function, tasks)
@@ -126,11 +125,10 @@ class Answer:
 
 @contextmanager
 def assistant(prepare: Callable[[], object]) -> Iterator[Assistant]:
-    """A copy of this process that calls ``prepare`` at once, and functions when it is asked to.
+    """Yield a copy of this process that calls ``prepare`` at once, and functions when asked to.
 
-    Libraries that only the end of a command needs are loaded in it while this process, whose
-    start leaves the other cores idle, gets on. Where a copy does not pay, or it died, functions
-    are called in this process.
+    It loads libraries that only the end of a command needs. Where a copy does not pay, or it died,
+    functions are called in this process.
     """
     if cores() < 2 or not can_fork():
         yield Assistant()
@@ -179,9 +177,9 @@ ISOLATED_S = 60.0
 def isolated(function: Callable[..., Result], *arguments: Any) -> Result:
     """Call a module's function in a copy of this process, which a crash of a C library may end.
 
-    Where a copy would not be safe (`can_fork`), the function is called in this process.
-    Raises ChildProcessError if the copy died or took longer than `ISOLATED_S`, and what the
-    function raises.
+    Where a copy would not be safe (`can_fork`), it is called in this process. Raises
+    ChildProcessError if the copy died or took longer than `ISOLATED_S`, and what the function
+    raises.
     """
     if not can_fork():
         return function(*arguments)

@@ -70,10 +70,8 @@ p2 are exchanged, and the power of length in HALCON's unit of it."""
 class HalconCamera:
     """Hold one camera's parameters in HALCON's names, order and units (m, px, degrees).
 
-    camera : the camera's name. kind : HALCON's camera type.
-    camera_from_rig : HALCON's external parameters, here in mm.
-    misfit : distance in px to telerig's camera over the working volume.
-    notes : what was fitted or left out; empty where HALCON's camera is equal to telerig's.
+    kind : HALCON's camera type. camera_from_rig : its external parameters, here in mm. misfit : to
+    telerig's camera over the working volume. notes : what was fitted or left out.
     """
 
     camera: str
@@ -84,10 +82,9 @@ class HalconCamera:
     notes: tuple[str, ...]
 
     def project(self, points_mm: ArrayLike) -> Array:
-        """Project points in the rig frame, (..., 3) in mm, to pixels (..., 2) by HALCON's model.
+        """Project rig points (..., 3) in mm to (column, row) (..., 2) in px by HALCON's model.
 
-        The pixels are (column, row) in px. Raises GeometryError where HALCON's distortion has no
-        inverse.
+        Raises GeometryError where HALCON's distortion has no inverse.
         """
         points = self.camera_from_rig.apply(np.atleast_2d(points_mm)) * 1e-3
         return _pixel_from_camera(points, self.parameters).reshape(*np.shape(points_mm)[:-1], 2)
@@ -98,9 +95,7 @@ def export_halcon(
 ) -> list[str]:
     """Write the HALCON files of all cameras into the folder ``out``.
 
-    volume : the box over which errors are measured. remarks : see `hdevelop_lines`.
-    Returns one line of text per camera with its type, notes and misfit. Raises InputError as
-    `halcon_cameras` and `write_halcon` do.
+    Returns one line of text per camera. Raises InputError as `halcon_cameras` does.
     """
     exported = halcon_cameras(cameras, volume)
     write_halcon(exported, out, remarks)
@@ -113,12 +108,11 @@ def export_halcon(
 def halcon_cameras(
     cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[HalconCamera, ...]:
-    """Convert every camera to HALCON's model.
+    """Convert every camera to HALCON's model, with its misfit over ``volume`` (`working_volume`).
 
-    A camera is exported as telecentric unless that moves points of the volume by more than
-    `PERSPECTIVE_PX`.
-    volume : the box over which errors are measured; None takes `working_volume`.
-    Raises InputError when the cameras do not see the volume, and for an unknown lens parameter.
+    A camera becomes telecentric unless that moves points of the volume by more than
+    `PERSPECTIVE_PX`. Raises InputError when the cameras do not see the volume, and for an unknown
+    lens parameter.
     """
     refuse_unknown_parameters(cameras, "HALCON")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
@@ -271,11 +265,9 @@ _DAT = {
 def write_halcon(
     cameras: Sequence[HalconCamera], folder: str | PathLike[str], remarks: Sequence[str] = ()
 ) -> list[str]:
-    """Write cameras.hdev.txt, and <camera>.dat and <camera>_pose.dat for each camera, in a folder.
+    """Write cameras.hdev.txt and each camera's <camera>.dat and _pose.dat; return the names.
 
-    remarks : see `hdevelop_lines`.
-    Returns the names of the files. A camera with a tilted sensor gets no `.dat` file, because its
-    layout is not documented. Raises InputError when the folder cannot be written.
+    A camera with a tilted sensor gets no `.dat` file, because its layout is not documented.
     """
     names = []
     for camera in cameras:
@@ -290,10 +282,7 @@ def write_halcon(
 
 
 def hdevelop_lines(cameras: Sequence[HalconCamera], remarks: Sequence[str] = ()) -> str:
-    """Return assignments to paste into HDevelop: CamParam<i> (camera type first) and Pose<i>.
-
-    remarks : sentences of one line each that become comments at the top.
-    """
+    """Return assignments for HDevelop: CamParam<i> (type first) and Pose<i>, below ``remarks``."""
     lines = [
         *(f"* {remark}" for remark in remarks),
         "* World: telerig's rig frame, the first camera's.",
@@ -316,10 +305,7 @@ def hdevelop_lines(cameras: Sequence[HalconCamera], remarks: Sequence[str] = ())
 
 
 def pose_tuple(pose: Pose) -> Array:
-    """Return a pose (6,) as HALCON writes it: translation in m, then three angles in degrees.
-
-    The rotation is R = Rx Ry Rz (HALCON's pose type 0: Rp+T, gba).
-    """
+    """Return a pose (6,) in HALCON's form (type 0, R = Rx Ry Rz): m, then degrees."""
     r = pose.rotation
     beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))
     alpha = np.arctan2(-r[1, 2], r[2, 2]) if np.hypot(r[1, 2], r[2, 2]) > 1e-9 else 0.0

@@ -35,12 +35,10 @@ _POINTS_PER_EDGE = 25
 
 @dataclass(frozen=True)
 class Matrices:
-    """Hold the matrices of one camera; they map (x, y, z, 1), in mm in the rig frame, to pixels.
+    """Hold the matrices of one camera, which map (x, y, z, 1) in mm in the rig frame to pixels.
 
-    A pixel is the first two components of the product divided by the third one.
-    undistorted : (3, 4) exact except for the lens distortion; its misfit is the effect of omitting
-    it.
-    affine : (3, 4) the best matrix with last row 0 0 0 1, and its misfit.
+    undistorted : (3, 4) exact except for the distortion, whose effect is its misfit. affine : (3,
+    4) the best matrix with last row 0 0 0 1.
     camera_matrix (3, 3), distortion (12,) : for cv2.undistortPoints with P = camera_matrix; None
     where OpenCV's model cannot express this camera's skew or sensor tilt.
     """
@@ -60,10 +58,7 @@ def export_opencv(
 ) -> list[str]:
     """Write the matrices of all cameras into the YAML file ``out``.
 
-    volume : the box over which errors are measured and the affine matrices fitted.
-    remarks : sentences for the file's entry ``remarks``.
-    Returns one line of text per camera with the errors of its matrices.
-    Raises InputError as `camera_matrices` and `write_opencv` do.
+    Returns one line of text per camera. Raises InputError as `camera_matrices` does.
     """
     matrices = camera_matrices(cameras, volume)
     write_opencv(matrices, out, remarks)
@@ -75,10 +70,9 @@ def export_opencv(
 
 
 def undistorted_matrix(camera: Camera) -> Array:
-    """Return the projection matrix (3, 4) of the camera without its distortion, in closed form.
+    """Return the projection matrix (3, 4), mm to px, of the camera without its distortion.
 
-    It maps homogeneous points in mm in the rig frame to homogeneous pixels in px. Behind a
-    refractive window it is exact for kappa = 0 only.
+    Behind a refractive window it is exact for kappa = 0 only.
     """
     q = np.array([camera["tilt_x"], camera["tilt_y"]])
     tilt = np.eye(3)
@@ -129,11 +123,9 @@ def projected(matrix: Array, points_mm: Array) -> Array:
 def camera_matrices(
     cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[Matrices, ...]:
-    """Compute the matrices of every camera.
+    """Compute the matrices of every camera; misfits are over what all see of ``volume``.
 
-    Misfits are measured over the part of the volume that all cameras see.
-    volume : None takes `working_volume`.
-    Raises InputError when the cameras do not see the volume, and for an unknown lens parameter.
+    Raises InputError when the cameras do not see it, and for an unknown lens parameter.
     """
     refuse_unknown_parameters(cameras, "OpenCV")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
@@ -171,11 +163,7 @@ def _opencv_distortion(camera: Camera) -> tuple[Array | None, Array | None]:
 def write_opencv(
     matrices: Sequence[Matrices], path: str | PathLike[str], remarks: Sequence[str] = ()
 ) -> None:
-    """Write one YAML file for OpenCV with an entry for each camera; floats keep all their digits.
-
-    remarks : sentences for the entry ``remarks``; without one there is no such entry.
-    Raises InputError when it cannot be written.
-    """
+    """Write one YAML file for OpenCV with an entry for each camera; floats keep every digit."""
     import cv2
 
     with atomic_path(path) as temporary:

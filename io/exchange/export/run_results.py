@@ -40,7 +40,6 @@ _UNITS = {
 class RunResults:
     """Hold the results of a run for export.
 
-    name : the run's name.
     frame : the frame of the positions in words: `LAB` (smoothed) or `RIG` (tracked only).
     points : one row per frame and bubble, sorted by particle, then frame; see docs/files.md.
     shake : the table of shake.csv, the cameras' shake; None where the run was not smoothed.
@@ -63,9 +62,8 @@ class RunResults:
 def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -> RunResults:
     """Read `trajectories.csv` of a smoothed run, or else `tracks.csv`, from its results folder.
 
-    accept : ("stale",) also reads results whose inputs have changed since they were made.
-    Raises InputError when the folder has neither, when the results are stale, or when a table
-    cannot be read.
+    accept : ("stale",) also reads results whose inputs have changed. Raises InputError when there
+    is neither, for stale results, and for a table that cannot be read.
     """
     place = Path(folder)
     names = [n for n in _TRAJECTORIES if (place / n).is_file()]
@@ -102,10 +100,7 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
 
 
 def _whole_particles(points: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with whole numbers as particle ids if all ids are such; otherwise with text.
-
-    An id like "007" counts as text.
-    """
+    """Return the table with whole numbers as particle ids if all are such; "007" is not one."""
     text = points["particle"].astype(str)
     if text.str.fullmatch(r"0|-?[1-9]\d{0,17}").all():
         return points.assign(particle=text.astype(np.int64))
@@ -122,18 +117,14 @@ def _verdict(file: Path) -> str:
 
 
 def unit_of(column: str) -> str:
-    """Return the UDUNITS name of a column's unit, from the end of the column's name.
-
-    Returns "1" for a column without a unit.
-    """
+    """Return the UDUNITS name of a column's unit, "1" for none, from the end of its name."""
     return next((unit for end, unit in _UNITS.items() if column.endswith(end)), "1")
 
 
 def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:
-    """Return a whole number for each row's particle, (rows,), and the names of the particles.
+    """Return a whole number for each row's particle (rows,), and the names in that order.
 
-    The names are in the order of the numbers. Ids that are whole numbers already stay as they are,
-    and the list of names is empty.
+    There are no names if the ids are whole numbers already, which stay as they are.
     """
     if points["particle"].dtype.kind == "i":
         return points["particle"].to_numpy(np.int64), []
@@ -163,9 +154,8 @@ def identifier(name: str) -> str:
 
 
 def results_root(source: Path) -> Path:
-    """Return the folder DATASET/results that belongs to ``source``.
+    """Return the folder DATASET/results that belongs to a dataset or to something in its results.
 
-    source : a dataset, one of its results folders, or a file in one of them.
     Raises InputError when ``source`` does not exist, or is a folder of another kind.
     """
     if not source.exists():
@@ -188,10 +178,7 @@ def results_root(source: Path) -> Path:
 
 @dataclass(frozen=True)
 class CalibratedCameras:
-    """Hold calibrated cameras, which include their refractive windows.
-
-    accepted : why the calibration is stale, if it was read although it is.
-    """
+    """Hold calibrated cameras with their windows, and why they are stale if they were read so."""
 
     cameras: tuple[Camera, ...] = ()
     accepted: tuple[str, ...] = ()
@@ -200,13 +187,10 @@ class CalibratedCameras:
 def cameras_of(
     source: Path, calibration: Path | None, *, required: bool, accept: Collection[str] = ()
 ) -> CalibratedCameras:
-    """Read the calibrated cameras.
+    """Read the calibrated cameras of ``calibration``, or of ``source``, or of its dataset.
 
-    They come from ``calibration`` (a calibration.json or its folder), or else from ``source``, or
-    else from the dataset of ``source``.
-    required : True raises InputError when no calibration is found; False then returns no camera.
-    accept : ("stale",) also reads a calibration whose inputs have changed since it was made.
-    Raises InputError for a calibration that is stale or cannot be read.
+    required : raise InputError when there is none; otherwise no camera is returned. accept : as in
+    `read_results`. Raises InputError for a calibration that is stale or cannot be read.
     """
     trials = [results_root(source) / "calibration" / "calibration.json"]
     if source.suffix == ".json":
@@ -230,10 +214,9 @@ def cameras_of(
 
 
 def run_folder(source: Path, run: str | None) -> Path:
-    """Return the results folder of the run named ``run``.
+    """Return the results folder of a run; None takes ``source``, or the only run with results.
 
-    run : None takes ``source`` itself, or else the only run with results.
-    Raises InputError when run is None and no run or several runs have results.
+    Raises InputError when that is no run, or several.
     """
 
     def holds(folder: Path) -> bool:

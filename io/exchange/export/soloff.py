@@ -36,13 +36,10 @@ CHECK_POINTS_PER_EDGE = 34
 
 @dataclass(frozen=True)
 class Soloff:
-    """Hold the polynomial that was fitted to one camera.
+    """Hold the polynomial that was fitted to one camera over a volume.
 
-    camera : the camera's name.
-    coefficients : (19, 2), or (20, 2) with the term `CUBIC_Z` last. The columns give u and v in px
-    for x, y, z in mm in the rig frame.
-    misfit : distance to the calibrated camera in px, at points that were not used in the fit.
-    volume : the box in which the polynomial is valid.
+    coefficients : (19, 2), or (20, 2) with the term `CUBIC_Z` last; the columns give u and v in px
+    for x, y, z in mm in the rig frame. misfit : at points that were not used in the fit.
     """
 
     camera: str
@@ -62,10 +59,8 @@ def export_soloff(
 ) -> list[str]:
     """Fit a polynomial to each camera and write it to soloff_<camera>.csv in the folder ``out``.
 
-    volume : the box over which it is fitted. full_cubic : see `fit_soloff`. first_pixel, remarks :
-    see `write_soloff`.
-    Returns one line of text per camera with the number of terms and the misfit.
-    Raises InputError when the cameras do not see the volume, and when a file cannot be written.
+    full_cubic : see `fit_soloff`. first_pixel, remarks : see `write_soloff`. Returns one line of
+    text per camera. Raises InputError when the cameras do not see the volume.
     """
     fits = fit_soloff(cameras, volume, full_cubic=full_cubic)
     with atomic_folder(out) as folder:
@@ -75,10 +70,7 @@ def export_soloff(
 
 
 def terms(points_mm: Array, count: int = len(POWERS)) -> Array:
-    """Return the monomials (..., count) of points (..., 3) in mm, in the order of `POWERS`.
-
-    count : 19, or 20 to add `CUBIC_Z`.
-    """
+    """Return the monomials (..., count) of points (..., 3) in mm, in the order of `POWERS`."""
     powers = np.array([*POWERS, CUBIC_Z][:count])
     return np.asarray(np.prod(points_mm[..., None, :] ** powers, axis=-1))
 
@@ -88,10 +80,8 @@ def fit_soloff(
 ) -> tuple[Soloff, ...]:
     """Fit one polynomial per camera by least squares, over the part of the volume that all see.
 
-    volume : None takes `working_volume`.
-    full_cubic : True adds the term z^3 (20 terms), for programs that take the exponents from the
-    file.
-    Raises InputError when the cameras do not see the volume.
+    full_cubic : adds z^3 (20 terms), for programs that take the exponents from the file. Raises
+    InputError when the cameras do not see the volume.
     """
     box = volume or working_volume(cameras)
     fitted = seen_points(cameras, box, FIT_POINTS_PER_EDGE)
@@ -116,13 +106,10 @@ def write_soloff(
     first_pixel: float = 0.0,
     remarks: Sequence[str] = (),
 ) -> None:
-    """Write a CSV file of the polynomial's terms below a header in words.
+    """Write a CSV file of the terms, below a header on volume, units, pixel origin and misfit.
 
-    The header states volume, units, pixel origin and misfit.
     first_pixel : the coordinate in px that the other program gives to the centre of the top-left
     pixel: 0 as in telerig, 0.5 where it counts from the pixel's corner, 1 in MATLAB.
-    remarks : sentences of one line each for the header.
-    Raises InputError when the file cannot be written.
     """
     shifted = fit.coefficients.copy()
     shifted[0] += first_pixel

@@ -23,11 +23,9 @@ from telerig.rig.windows import Wall
 def write_hdf5(
     results: RunResults, path: str | PathLike[str], cameras: Sequence[Camera] = ()
 ) -> None:
-    """Write an HDF5 file with the groups ``trajectories``, ``shake`` and ``cameras``.
+    """Write an HDF5 file with the groups ``trajectories``, ``shake`` (if any) and ``cameras``.
 
-    Each column of a table is a dataset with the attribute ``units``; each camera is a group with
-    attributes. ``shake`` is left out for a run that was not smoothed.
-    Raises InputError when the file cannot be written.
+    Each column of a table is a dataset with the attribute ``units``; cameras are in attributes.
     """
     import h5py
 
@@ -54,9 +52,8 @@ def write_mat(
 ) -> None:
     """Write a MATLAB 5 file with the structs ``info``, ``trajectories``, ``shake`` and ``cameras``.
 
-    Each column of a table is a field. Names that MATLAB does not accept are changed (`identifier`);
-    text columns become cells. ``shake`` is left out for a run that was not smoothed.
-    Raises InputError when two names become equal, or when the file cannot be written.
+    Each column of a table is a field, named by `identifier`; text columns become cells. Raises
+    InputError when two names become equal.
     """
     from scipy.io import savemat
 
@@ -105,10 +102,9 @@ def _wall(wall: Wall) -> dict[str, Any]:
 
 
 def trackpy_table(results: RunResults) -> pd.DataFrame:
-    """Return the trajectories with the columns frame, particle, x, y, z, then all other columns.
+    """Return the trajectories with the columns frame, particle, x, y, z (mm), then all others.
 
-    x, y, z are in mm, so trackpy's mpp is 1. Particles with names instead of numbers are numbered;
-    the column ``particle_name`` keeps their names.
+    Named particles are numbered; the column ``particle_name`` keeps their names.
     """
     points = results.points
     numbers, names = numbered(points)

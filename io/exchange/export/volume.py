@@ -36,10 +36,7 @@ class Volume:
 
 @dataclass(frozen=True)
 class Misfit:
-    """Hold the distance in px between two projections of the same points.
-
-    rms_px : its root mean square; max_px : its maximum; points : the number of points.
-    """
+    """Hold the distance (RMS and maximum, px) between two projections of the same points."""
 
     rms_px: float
     max_px: float
@@ -79,7 +76,7 @@ def refuse_unknown_parameters(cameras: Sequence[Camera], program: str) -> None:
 
 
 def volume_of(bounds_mm: ArrayLike) -> Volume:
-    """Return the box with the bounds ((x_low, x_high), (y_low, y_high), (z_low, z_high)) in mm.
+    """Return the box ((x_low, x_high), (y_low, y_high), (z_low, z_high)) in mm.
 
     Raises InputError when the bounds have another shape or the box is empty.
     """
@@ -95,9 +92,8 @@ def volume_of(bounds_mm: ArrayLike) -> Volume:
 def working_volume(cameras: Sequence[Camera]) -> Volume:
     """Return a cube around the point where the rays of the image centres come closest.
 
-    Its edge is the shortest image edge of any camera, converted to mm with the camera's scale.
-    Parts of the cube may lie outside an image: see `seen_points`.
-    Raises InputError without cameras.
+    Its edge is the shortest image edge in mm. Parts of it may lie outside an image: see
+    `seen_points`.
     """
     if not cameras:
         raise InputError("no camera", todo="give at least one")
@@ -113,9 +109,8 @@ def working_volume(cameras: Sequence[Camera]) -> Volume:
 
 
 def seen_points(cameras: Sequence[Camera], volume: Volume, per_edge: int) -> Array:
-    """Return the points of the volume's grid that every camera sees, (points, 3) in mm.
+    """Return the points (points, 3) in mm of the volume's grid that every camera sees.
 
-    per_edge : number of grid points along each edge of the volume.
     Raises InputError when fewer than 100 points are seen.
     """
     points = volume.grid(per_edge)

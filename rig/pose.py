@@ -97,7 +97,7 @@ class Pose:
         return Pose(back, -np.einsum("...ij,...j->...i", back, self.translation_mm))
 
     def adjoint(self) -> Array:
-        """Return the matrices (..., 6, 6) with T Exp(x) T^-1 = Exp(adjoint x), x tangent vectors."""
+        """Return the matrices (..., 6, 6) with T Exp(x) T^-1 = Exp(adjoint x), for tangents x."""
         out = np.zeros((*self.rotation.shape[:-2], 6, 6))
         out[..., :3, :3] = out[..., 3:, 3:] = self.rotation
         out[..., 3:, :3] = hat(self.translation_mm) @ self.rotation

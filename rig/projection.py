@@ -48,10 +48,7 @@ _WALL = slice(INDEX["wall_x_rad"], INDEX["wall_y_rad"] + 1)
 
 
 def intrinsics_from(parameters: Mapping[str, float]) -> Array:
-    """Return the intrinsics (20,) in the order of `PARAMETERS`, from a mapping from name to value.
-
-    Raises KeyError if a parameter is missing that is not optional.
-    """
+    """Return the intrinsics (20,) from a mapping by name. Raises KeyError if one is missing."""
     missing = {name: 0.0 for name, known in LENS_PARAMETERS.items() if known.optional}
     return np.array([(missing | dict(parameters))[name] for name in PARAMETERS], float)
 
@@ -67,10 +64,8 @@ def pixel_from_camera(
 ) -> Array:
     """Return the pixels (..., 2) of points (..., 3) in camera coordinates.
 
-    intrinsics : (20,) in the order of `PARAMETERS`.
-    wall : the window between the camera and the points, which are then in the water; or None.
-
-    Raises the errors of `windows.ideal_from_water`.
+    With a window the points are in the water behind it. Raises the errors of
+    `windows.ideal_from_water`.
     """
     if wall is None:
         telecentric = points_mm[..., :2] / (1 + intrinsics[_KAPPA] * points_mm[..., 2:3])
@@ -82,10 +77,7 @@ def pixel_from_camera(
 
 
 def ideal_from_pixel(uv_px: Array, intrinsics: Array, rho_mm: float) -> Array:
-    """Return the telecentric coordinates (..., 2) in mm of pixels (..., 2).
-
-    The telecentric coordinates of a pixel are the point at which its ray in air crosses depth 0.
-    """
+    """Return the telecentric coordinates (..., 2) in mm: where a ray in air crosses depth 0."""
     v = (uv_px[..., 1] - intrinsics[_CV]) / (intrinsics[_SCALE] * intrinsics[_ASPECT])
     u = (uv_px[..., 0] - intrinsics[_CU]) / intrinsics[_SCALE] - intrinsics[_SKEW] * v
     distorted = distorted_from_sensor(np.stack([u, v], -1), intrinsics)
@@ -132,10 +124,8 @@ def pixel_jacobians(
 ) -> tuple[Array, Array, Array]:
     """Return the pixels of points and their derivatives.
 
-    points_mm : (..., 3) in camera coordinates.
-    free : indices into `PARAMETERS` of the F intrinsics for which derivatives are wanted.
-    wall : as in `pixel_from_camera`.
-
+    points_mm : (..., 3) in camera coordinates. free : indices into `PARAMETERS` of the F intrinsics
+    for which derivatives are wanted.
     Returns the pixels (..., 2), their derivative (..., 2, 3) with respect to the point, and their
     derivative (..., 2, F) with respect to the free intrinsics.
     """
@@ -170,10 +160,10 @@ def pixel_jacobians(
 def _lens_jacobians(
     ideal: Array, intrinsics: Array, rho_mm: float, free: Sequence[int]
 ) -> tuple[Array, Array, Array]:
-    """Return pixels (..., 2) and their derivatives, starting from telecentric coordinates (..., 2).
+    """Return pixels (..., 2) of telecentric coordinates (..., 2), and their derivatives.
 
-    The derivatives are (..., 2, 2) with respect to these coordinates and (..., 2, F) with respect
-    to the F free intrinsics; the columns of kappa and of the window stay 0 for the caller to fill.
+    These are (..., 2, 2) by the coordinates and (..., 2, F) by the free intrinsics; the columns of
+    kappa and of the window stay 0 for the caller to fill.
     """
     normal, coefficients = ideal / rho_mm, intrinsics[_DISTORTION]
     distorted = distort(normal, coefficients) * rho_mm
@@ -220,11 +210,9 @@ def _product(left: Array, right: Array) -> Array:
 
 
 def tilt_jacobians(xy_mm: Array, intrinsics: Array) -> tuple[Array, Array, Array]:
-    """Return the coordinates on the tilted sensor and their derivatives, from distorted
-    coordinates.
+    """Return coordinates (..., 2) on the tilted sensor and their derivatives.
 
-    Returns the coordinates (..., 2), their derivative (..., 2, 2) with respect to the distorted
-    coordinates, and (..., 2, 3) with respect to tilt_x, tilt_y and w.
+    These are (..., 2, 2) by the distorted coordinates and (..., 2, 3) by tilt_x, tilt_y and w.
     """
     q, w = intrinsics[_TX : _TY + 1], intrinsics[_W]
     root = np.sqrt(1 + q @ q)
@@ -253,10 +241,7 @@ _NEWTON_STEPS = 40
 
 
 def components_first(batch: tuple[int, ...], *components: int) -> Array:
-    """Return zeros of shape (*batch, *components) in which each component is contiguous in memory.
-
-    Arithmetic on one component of many points is then faster, because it reads memory in order.
-    """
+    """Return zeros (*batch, *components); each component is contiguous, for faster arithmetic."""
     first, last = len(components), len(components) + len(batch)
     return np.zeros((*components, *batch)).transpose(*range(first, last), *range(first))
 
@@ -279,10 +264,7 @@ def _split(coefficients: Array) -> tuple[list[Array], list[Array], list[Array]]:
 
 
 def distort(xy: Array, coefficients: Array) -> Array:
-    """Return the distorted coordinates (..., 2) of ideal coordinates (..., 2), both normalised.
-
-    coefficients : (..., 9) in the order of `COEFFICIENTS`.
-    """
+    """Return distorted coordinates (..., 2) of ideal ones, with coefficients (..., 9)."""
     x, y = xy[..., 0], xy[..., 1]
     radial, tangential, prism = _split(coefficients)
     r2 = x * x + y * y
@@ -343,12 +325,9 @@ def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
 
 
 def coefficient_jacobian(xy: Array, which: Sequence[int] = range(len(COEFFICIENTS))) -> Array:
-    """Return the derivative (..., 2, k) of `distort` with respect to k of its coefficients.
+    """Return the derivative (..., 2, k) of `distort`, which is linear, by k of its coefficients.
 
-    `distort` is linear in its coefficients, so the derivative does not depend on their values.
-
-    xy : (..., 2) ideal coordinates.
-    which : the k indices into `COEFFICIENTS`.
+    xy : (..., 2) ideal coordinates. which : the k indices into `COEFFICIENTS`.
     """
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -371,8 +350,7 @@ def coefficient_jacobian(xy: Array, which: Sequence[int] = range(len(COEFFICIENT
 def undistort(xy_distorted: Array, coefficients: Array) -> Array:
     """Return the ideal coordinates (..., 2) of distorted ones (..., 2), to machine precision.
 
-    `distort` is inverted by Newton's method. Raises GeometryError where it cannot be inverted,
-    which is beyond the radius at which the map folds over.
+    Newton's method. Raises GeometryError beyond the radius at which the map folds over.
     """
     target = np.asarray(xy_distorted, float)
     if not np.any(coefficients):

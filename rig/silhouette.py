@@ -39,10 +39,7 @@ _THINNEST = 0.05
 
 
 def third_degree(directions: Array) -> Array:
-    """Return the 7 real spherical harmonics of degree 3 (..., 7) at unit vectors (..., 3).
-
-    Each harmonic has unit mean square over the sphere.
-    """
+    """Return the 7 real spherical harmonics (..., 7) of degree 3, of unit mean square."""
     x, y, z = np.moveaxis(directions, -1, 0)
     zonal = [np.sqrt(7) / 2 * c * (5 * c * c - 3) for c in (x, y, z)]
     planar = [p * (q * q - r * r) for p, q, r in ((x, y, z), (y, z, x), (z, x, y))]
@@ -51,9 +48,7 @@ def third_degree(directions: Array) -> Array:
 
 
 def third_degree_traces(frames: Array) -> tuple[Array, Array]:
-    """Return the traces of `third_degree` on the circle W (cos phi, sin phi).
-
-    frames : (..., 3, 2) W, with orthonormal columns.
+    """Return the traces of `third_degree` on the circle W (cos phi, sin phi), W (..., 3, 2).
 
     Returns two arrays (..., 2, 7): the coefficients of (cos phi, sin phi) and those of (cos 3 phi,
     sin 3 phi). A trace of degree 3 has no other harmonics.
@@ -70,10 +65,8 @@ def third_degree_traces(frames: Array) -> tuple[Array, Array]:
 def zonal_traces(projection: Array) -> tuple[Array, Array]:
     """Return the traces of h(s) = P_3(s . n), which is axisymmetric about the unit vector n.
 
-    projection : (..., 2) q = W^T n, the position of the pole n in the unit circle.
-
-    Returns two arrays (..., 2), the coefficients of the first and of the third harmonic as in
-    `third_degree_traces`: (15/8 |q|^2 - 3/2) q, and 5/8 q^3 with q taken as a complex number.
+    projection : (..., 2) q = W^T n. Returns two arrays (..., 2), the coefficients of the first and
+    of the third harmonic: (15/8 |q|^2 - 3/2) q, and 5/8 q^3 with q taken as a complex number.
     """
     x, y = projection[..., 0], projection[..., 1]
     first = (1.875 * (x * x + y * y) - 1.5)[..., None] * projection
@@ -83,16 +76,15 @@ def zonal_traces(projection: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class EllipsePair:
-    """Holds the elliptic silhouettes of one ellipsoid in two affine cameras, in mm.
+    """The elliptic silhouettes of one ellipsoid in two affine cameras, in mm.
 
-    shared : (..., 3) unit vector perpendicular to both viewing directions. Both cameras measure the
-        coordinate along it.
-    sides : two arrays (..., 3) of unit vectors, each perpendicular to ``shared`` and to the viewing
-        direction of its camera.
+    shared : (..., 3) unit vector perpendicular to both viewing directions; both cameras measure the
+    coordinate along it. sides : two arrays (..., 3) of unit vectors, perpendicular to ``shared``
+    and to the viewing direction of each camera.
     moments_mm2 : two arrays (..., 2, 2), A A^T of the ellipse in the axes (shared, side).
     rims : two arrays (..., 2, 2) in the components (cos phi, sin phi). Column 0 is the point of the
-        rim on the unit sphere that reaches farthest along the shared coordinate. Column 1 lies a
-        quarter turn from it, on the positive side.
+    rim on the unit sphere that reaches farthest along the shared coordinate. Column 1 lies a
+    quarter turn from it, on the positive side.
     """
 
     shared: Array
@@ -103,11 +95,9 @@ class EllipsePair:
     def frames(self, coupling: Array) -> tuple[Array, Array]:
         """Return W (..., 3, 2) of both cameras; the rim in a camera is W (cos phi, sin phi).
 
-        Both rims contain the direction of the shared coordinate, which is the first unit vector
-        here. The other direction is (0, 1, 0) for the first rim and (0, r, sqrt(1 - r^2)) for the
-        second.
-
-        coupling : (...) the number r. Silhouettes do not determine it; see `coupling_of`.
+        The first unit vector is the shared coordinate; the other direction is (0, 1, 0) for the
+        first rim and (0, r, sqrt(1 - r^2)) for the second, with r (...) the coupling (see
+        `coupling_of`).
         """
         zero, one = np.zeros_like(coupling), np.ones_like(coupling)
         second = np.stack([zero, coupling, np.sqrt(1 - coupling**2)], -1)
@@ -119,8 +109,7 @@ class EllipsePair:
     def coupling_of(self, moments_mm2: Array) -> Array:
         """Return the coupling (...) of ellipsoids A A^T (..., 3, 3).
 
-        The coupling is the partial correlation of the two side coordinates, given the shared
-        coordinate.
+        It is the partial correlation of the two side coordinates, given the shared coordinate.
         """
         basis = np.stack([self.shared, *self.sides], -2)
         return _coupling(basis @ moments_mm2 @ basis.mT)
@@ -129,9 +118,8 @@ class EllipsePair:
 def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> EllipsePair:
     """Return the pair of silhouettes that one ellipsoid has in two cameras.
 
-    jacobians : two arrays (..., 2, 3), the derivative of the pixels with respect to the point
-        (px/mm).
-    axes_px : two arrays (..., 2, 2) whose columns are the semi-axes of the ellipse in the image.
+    jacobians : two arrays (..., 2, 3), px/mm. axes_px : two arrays (..., 2, 2) whose columns are
+    the semi-axes of the ellipse in the image.
     """
     across = [np.cross(j[..., 0, :], j[..., 1, :]) for j in jacobians]
     view = [d / np.linalg.norm(d, axis=-1, keepdims=True) for d in across]
@@ -162,13 +150,11 @@ def most_spherical(pair: EllipsePair) -> Array:
 
 
 def oblate_spheroid(pair: EllipsePair) -> tuple[Array, Array]:
-    """Return the pole and A A^T of the oblate spheroid that is nearest to these silhouettes.
+    """Return pole (..., 3) and A A^T (..., 3, 3), in mm and mm^2, of the nearest oblate spheroid.
 
     The long semi-axis of every silhouette is the radius of the equator. The short one gives the
     inclination of the pole in that view except for its sign, which follows from the shared
     coordinate.
-
-    Returns the pole (..., 3) in mm relative to the centre, and A A^T (..., 3, 3) in mm^2.
     """
     equator2, leaning = [], []
     for moments in pair.moments_mm2:
@@ -197,10 +183,7 @@ def _coupling(moments: Array) -> Array:
 
 
 def _rim(extents: Array) -> Array:
-    """Return `EllipsePair.rims` (..., 2, 2) from the extents of an ellipse (..., 2, 2).
-
-    extents : row 0 along the shared coordinate, row 1 along the side.
-    """
+    """Return `EllipsePair.rims` (..., 2, 2) from extents along shared coordinate and side."""
     shared = extents[..., 0, :] / np.linalg.norm(extents[..., 0, :], axis=-1, keepdims=True)
     across = np.stack([-shared[..., 1], shared[..., 0]], -1)
     sign = np.sign((across * extents[..., 1, :]).sum(-1, keepdims=True))
@@ -208,10 +191,7 @@ def _rim(extents: Array) -> Array:
 
 
 def _joined(flat: tuple[Array, Array]) -> Array:
-    """Return second moments (..., 3, 3) in the axes (shared, first side, second side).
-
-    The moment between the two sides is left at 0, because silhouettes do not determine it.
-    """
+    """Return second moments (..., 3, 3) in the axes (shared, first side, second side)."""
     shared2 = np.sqrt(flat[0][..., 0, 0] * flat[1][..., 0, 0])
     moments = np.zeros((*shared2.shape, 3, 3))
     moments[..., 0, 0] = shared2
@@ -225,11 +205,8 @@ def _joined(flat: tuple[Array, Array]) -> Array:
 def _most_spherical(moments: Array, gram: Array) -> Array:
     """Return the second moment between both sides that makes the ellipsoid most spherical.
 
-    It makes det(moments) / trace(gram moments)^3 stationary, with a positive determinant.
-
-    moments : (..., 3, 3) second moments in the axes (shared, first side, second side).
-    gram : (..., 3, 3) the matrix with which the trace is taken, because these axes are not
-        orthogonal.
+    It makes det(moments) / trace(gram moments)^3 stationary, with a positive determinant. moments :
+    (..., 3, 3) as `_joined`. gram : (..., 3, 3), because these axes are not orthogonal.
     """
     p, b, c = moments[..., 0, 0], moments[..., 0, 1], moments[..., 0, 2]
     d, e = moments[..., 1, 1], moments[..., 2, 2]

@@ -1,5 +1,4 @@
-"""Describes the flat target: the nominal positions of its dots, and the numbers (ids) by which dots
-are known.
+"""The flat target: the nominal positions of its dots, and the numbers (ids) of dots.
 
 The dot in row r and column c is nominally at (c * pitch_x, r * pitch_y, 0); z = x cross y.
 """
@@ -29,20 +28,18 @@ QUARTER_TURNS: tuple[Ints, ...] = tuple(
 
 @dataclass(frozen=True)
 class Target:
-    """Holds the nominal geometry of the target, as `[target]` in `rig.toml` states it.
+    """The nominal geometry of the target, as `[target]` in `rig.toml` states it.
 
-    layout : "grid", or "points" for dots at listed positions.
-    rows, columns : size of the grid. On an unbounded grid, size of the block in which the ids in
-        ``scale_dots`` are counted.
+    layout : "grid", or "points" for dots at listed positions points_mm (N, 2).
+    rows, columns : size of the grid, or of the block in which ``scale_dots`` are counted.
     pitch_mm : (pitch_x, pitch_y), the distances between neighbouring columns and rows.
-    points_mm : (N, 2) positions of the N dots for the layout "points"; None for a grid.
     marks : (row, column) of each mark; (0, dot) for the layout "points".
     print_sigma_mm, flatness_sigma_mm : standard deviations of a dot's true position from the
-        nominal one, in the plane and perpendicular to it.
+    nominal one, in the plane and perpendicular to it.
     scale_dots : ids of two dots whose distance ``scale_distance_mm`` +- ``scale_sigma_mm`` is
-        known; None if the nominal pitch sets the scale.
-    two_sided : whether the plate is transparent and may be seen from behind, through
-        ``plate_thickness_mm`` of a material with refractive index ``plate_index``.
+    known; None if the nominal pitch sets the scale.
+    two_sided : whether the plate may be seen from behind, through ``plate_thickness_mm`` of a
+    material with refractive index ``plate_index``.
     """
 
     layout: Layout = "grid"
@@ -82,10 +79,7 @@ class Target:
         return every
 
     def id_from_row_column(self, row: ArrayLike, column: ArrayLike) -> Ints:
-        """Return the ids (...) of the dots in the given rows and columns (...).
-
-        On an unbounded grid rows and columns may be negative.
-        """
+        """Return the ids (...) of the dots in rows and columns (...), which may be negative."""
         r, c = np.asarray(row, np.int64), np.asarray(column, np.int64)
         if self.layout == "points":
             return c.copy()
@@ -172,8 +166,7 @@ class Target:
         return np.array(self.marks, np.int64).reshape(-1, 2)[:, ::-1]
 
     def _unchanged_by(self, turn: Ints) -> bool:
-        """Return whether ``turn`` (2, 2), a rotation or reflection of (column, row), keeps the
-        marks in place."""
+        """Return whether a rotation or reflection (2, 2) of (column, row) keeps the marks."""
         marks, swapped = self.marks_column_row(), turn[0, 0] == 0
         if swapped and not np.isclose(*self.pitch_mm):
             return False

@@ -43,16 +43,14 @@ _ROWS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 class Triangulation(ShortText):
     """Holds triangulated points with their covariance.
 
-    points_mm : (..., 3) in the rig frame.
-    covariance_mm2 : (..., 3, 3) covariance of the points. If a calibration triangulates, it
-        contains the calibration's own uncertainty.
-    measurement_covariance_mm2 : (..., 3, 3) the part of it that comes from the noise of the pixels.
-    ray_miss_mm : (...) signed distance from the first ray to the second, along their common
-        perpendicular (first direction x second direction). `triangulate_views` gives (..., C)
-        instead, the distance of the point from the ray of each of the C cameras, NaN for a camera
-        that does not see it.
+    points_mm : (..., 3) in the rig frame. covariance_mm2 : (..., 3, 3), with the calibration's own
+    uncertainty if a calibration triangulates; measurement_covariance_mm2 : its part from the noise
+    of the pixels.
+    ray_miss_mm : (...) signed distance from the first ray to the second, along first direction x
+    second direction. `triangulate_views` gives (..., C), the distance of the point from each
+    camera's ray, NaN for a camera that does not see it.
     seen_by : (...) number of cameras that saw each point; None if two cameras saw all points. A
-        point that fewer than two cameras saw has NaN in all other arrays.
+    point that fewer than two cameras saw is NaN.
     """
 
     points_mm: Array
@@ -112,13 +110,10 @@ class Triangulation(ShortText):
 def midpoint(
     origin_a: Array, direction_a: Array, origin_b: Array, direction_b: Array
 ) -> tuple[Array, Array]:
-    """Return the middle (..., 3) of the shortest segment between two rays, and its signed length
-    (...).
+    """Return the middle (..., 3) of the shortest segment between two rays, and its signed length.
 
-    origin_a, origin_b : (..., 3) a point on each ray.
-    direction_a, direction_b : (..., 3) unit direction of each ray.
-
-    Raises GeometryError if two rays are parallel.
+    Rays are a point (..., 3) and a unit direction (..., 3). Raises GeometryError if they are
+    parallel.
     """
     normal = cross(direction_a, direction_b)
     sine2 = (normal**2).sum(-1)
@@ -145,10 +140,8 @@ def pixel_covariance(sigma_px: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return covariances (..., 2, 2) in px^2 from standard deviations or from covariances.
 
     sigma_px : one standard deviation, an array of them (...), or covariances (..., 2, 2). An array
-        whose shape equals ``shape`` is read as standard deviations, even if that shape is (2, 2).
-    shape : the shape (...) of the array of points.
-
-    Raises InputError for a standard deviation that is not positive.
+    of the points' ``shape`` holds standard deviations, even if that is (2, 2). Raises InputError
+    for a standard deviation that is not positive.
     """
     sigma = np.asarray(sigma_px, float)
     if sigma.shape != shape and sigma.ndim >= 2 and sigma.shape[-2:] == (2, 2):
@@ -166,15 +159,12 @@ def triangulate(
     *,
     rays: Sequence[tuple[Array, Array]] | None = None,
 ) -> Triangulation:
-    """Return the points that two cameras see at the given pixels.
+    """Return the points that two cameras see at the given pixels, two arrays (..., 2).
 
-    uv_px : two arrays (..., 2), one for each camera.
-    sigma_px : noise of the pixels as in `pixel_covariance`; a tuple of two gives each camera its
-        own.
+    sigma_px : noise as in `pixel_covariance`; a tuple of two gives each camera its own.
     method : "ml" minimises the whitened reprojection error by Gauss-Newton steps from the
-        mid-point; "midpoint" takes the middle of the shortest segment between both rays.
+    mid-point; "midpoint" takes the middle of the shortest segment between both rays.
     rays : what ``unproject`` of each camera gives for the pixels, if it is known.
-
     Raises InputError for unequal shapes, pixels that are not finite or an unknown method, and
     GeometryError for parallel rays.
     """
@@ -213,14 +203,11 @@ def triangulate_views(
 ) -> Triangulation:
     """Return the points that C cameras see at the given pixels; each needs at least two of them.
 
-    uv_px : C arrays (..., 2), with NaN where a camera does not see a point.
-    sigma_px : noise of the pixels as in `pixel_covariance`; a tuple of C gives each camera its own.
-    method : "ml" as in `triangulate`, but started at the point nearest to all rays; "midpoint"
-        returns that point.
-
+    uv_px : C arrays (..., 2), with NaN where a camera does not see a point. sigma_px : as in
+    `triangulate`. method : "ml" as there, but from the point nearest to all rays; "midpoint"
+    returns that point.
     A point that fewer than two cameras see gets NaN; ``seen_by`` of the result counts the cameras.
-    Raises InputError for unequal shapes or an unknown method, and GeometryError if all rays of a
-    point are parallel.
+    Raises InputError for unequal shapes or an unknown method, and GeometryError for parallel rays.
     """
     pixels = [np.asarray(uv, float) for uv in uv_px]
     shapes = {uv.shape for uv in pixels}
@@ -273,10 +260,7 @@ def triangulate_views(
 def triangulate_any(
     cameras: Sequence[Camera], uv_px: Sequence[ArrayLike], sigma_px: float
 ) -> Triangulation:
-    """Return `triangulate` for two cameras and `triangulate_views` for more.
-
-    uv_px : for each camera an array (..., 2).
-    """
+    """Return `triangulate` for two cameras and `triangulate_views` for more."""
     if len(cameras) == 2:
         return triangulate((cameras[0], cameras[1]), (uv_px[0], uv_px[1]), sigma_px)
     return triangulate_views(cameras, uv_px, sigma_px)
@@ -285,9 +269,7 @@ def triangulate_any(
 def nearest_to_rays(origins: Array, directions: Array) -> Array:
     """Return the points (..., 3) with the least sum of squared distances from C rays each.
 
-    origins, directions : (C, ..., 3) a point on each ray and its unit direction.
-
-    Raises GeometryError if all rays of a point are parallel.
+    Rays are points and unit directions (C, ..., 3). Raises GeometryError if all are parallel.
     """
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     total = across.sum(0)
@@ -306,11 +288,7 @@ def _distance(points: Array, origin: Array, direction: Array) -> Array:
 
 
 def seen_covariance(sigma_px: ArrayLike, seen: NDArray[np.bool_]) -> Array:
-    """Return `pixel_covariance` (..., 2, 2) of the pixels that are seen, and 1 px^2 for the other
-    pixels.
-
-    seen : (...) whether each pixel was seen.
-    """
+    """Return `pixel_covariance` (..., 2, 2) of the pixels that are seen, 1 px^2 for others."""
     sigma = np.asarray(sigma_px, float)
     if sigma.shape == seen.shape:
         sigma = np.where(seen, sigma, 1.0)
@@ -319,10 +297,7 @@ def seen_covariance(sigma_px: ArrayLike, seen: NDArray[np.bool_]) -> Array:
 
 
 def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Array, Array]:
-    """Return the pixels of rig points (..., 3) in C cameras, and their derivatives.
-
-    Returns the pixels (..., 2C) and their derivative (..., 2C, 3) with respect to the rig point.
-    """
+    """Return pixels (..., 2C) of rig points (..., 3) in C cameras, and derivatives (..., 2C, 3)."""
     pixels, jacobians = [], []
     for camera in cameras:
         in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
@@ -338,13 +313,9 @@ def _maximum_likelihood(
     covariances: list[Array],
     points: Array,
 ) -> tuple[Array, Array]:
-    """Return the most likely points (..., 3) in mm and their covariances (..., 3, 3) in mm^2.
+    """Return the most likely points (..., 3) and their covariances, from pixels and a start.
 
-    The points are found by Gauss-Newton steps, in blocks that fit into the processor's cache.
-
-    uv_px : for each camera the measured pixels (..., 2).
-    covariances : for each camera the covariances (..., 2, 2) of its pixels in px^2.
-    points : (..., 3) rig points in mm from which the iteration starts.
+    Gauss-Newton steps are done in blocks that fit into the processor's cache.
     """
     flat = points.reshape(-1, 3).T
     measured = np.concatenate([uv.reshape(-1, 2) for uv in uv_px], -1).T
@@ -371,9 +342,8 @@ def _gauss_newton(
 ) -> tuple[Array, Array]:
     """Return the most likely N rig points (3, N) in mm and their covariances (N, 3, 3) in mm^2.
 
-    measured : (2C, N) measured pixels in C cameras: u and v of the first camera, then of the next.
-    weights : (C, 3, N) in 1/px^2, for each camera as `_weights` returns them.
-    points : (3, N) rig points in mm from which the iteration starts.
+    measured : (2C, N) u and v of the first camera, then of the next. weights : (C, 3, N) in 1/px^2,
+    as `_weights` returns them. points : (3, N) from which the iteration starts.
     """
     points = np.ascontiguousarray(points)
     inverse = np.empty((6, points.shape[1]))
@@ -396,10 +366,7 @@ def _gauss_newton(
 
 
 def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
-    """Return the pixels (2, N) of N rig points (3, N), and the derivative (2, 3, N) by the point.
-
-    Lenses without a sensor tilt are evaluated by shorter formulas, because speed matters here.
-    """
+    """Return pixels (2, N) of N rig points (3, N), and derivatives (2, 3, N); fast without tilt."""
     pose = camera.camera_from_rig
     x, y, z = pose.rotation @ points + pose.translation_mm[:, None]
     kappa = camera["kappa_per_mm"]
@@ -430,8 +397,7 @@ def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
 
 
 def _symmetric_inverse(matrix: Array) -> Array:
-    """Return the inverses of N symmetric 3x3 matrices, both as entries (6, N) in the order of
-    `_UPPER`."""
+    """Return the inverses of N symmetric 3x3 matrices; entries (6, N) as in `_UPPER`."""
     a, b, c, d, e, f = matrix
     cofactors = np.array(
         [d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b]
@@ -442,10 +408,7 @@ def _symmetric_inverse(matrix: Array) -> Array:
 def _midpoint_covariance(
     cameras: tuple[Camera, ...], points: Array, covariances: list[Array]
 ) -> Array:
-    """Return the covariance (N, 3, 3) of mid-points to first order in the noise.
-
-    The mid-point is the least-squares point of the distances from the rays in object space.
-    """
+    """Return the covariance (N, 3, 3) of mid-points to first order in the noise."""
     projectors, gains = [], []
     for camera in cameras:
         _, direction = camera.unproject(camera.project(points))
@@ -458,10 +421,7 @@ def _midpoint_covariance(
 
 
 def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
-    """Return points (steps^3, 3) in mm of a cubic grid round the rig's origin: the working volume.
-
-    steps : number of points along each edge.
-    """
+    """Return points (steps^3, 3) in mm of a cubic grid round the rig's origin."""
     field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
     axis = np.linspace(-0.5, 0.5, steps) * VOLUME_SHARE * field
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -470,11 +430,7 @@ def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
 def rig_jacobian(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
-    """Return the derivative (..., 2C, P) of the pixels in C cameras with respect to the rig block.
-
-    free : for each camera the names of its free intrinsics.
-    points_mm : (..., 3) rig points.
-    """
+    """Return the derivative (..., 2C, P) of rig points' pixels in C cameras by the rig block."""
     lens = np.cumsum([0, *map(len, free)])
     out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), lens[-1] + 6 * (len(cameras) - 1)))
     for c, camera in enumerate(cameras):
@@ -494,12 +450,9 @@ def aligned_covariance(
     covariance: Array,
     points_mm: Array,
 ) -> Array:
-    """Return the covariance (3 N, 3 N) of N rig points due to the calibration, without rigid
-    motion.
+    """Return the covariance (3 N, 3 N) of N rig points due to the calibration.
 
-    A rigid motion that is common to all points is projected out; see `aligned_shift`.
-
-    covariance : (P, P) of the rig block.
+    Rigid motions are projected out as in `aligned_shift`. covariance : (P, P) of the rig block.
     """
     inner = aligned_shift(cameras, free, points_mm)
     return np.asarray(inner @ covariance @ inner.T)
@@ -508,12 +461,12 @@ def aligned_covariance(
 def aligned_shift(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
-    """Return the derivative (3 N, P) of N triangulated points with respect to the rig block,
-    without rigid motion.
+    """Return the derivative (3 N, P) of triangulated points, without rigid motion, by the rig
+    block.
 
-    A rigid motion that is common to all points is projected out, because the place of the rig frame
-    is a matter of definition (Baarda's S-transformation to the points' own frame). The result
-    describes errors of shapes, distances and motions inside the rig.
+    A motion that is common to all points is projected out, because the place of the rig frame is a
+    matter of definition (Baarda's S-transformation to the points' own frame). The result describes
+    errors of shapes, distances and motions inside the rig.
     """
     rows = 2 * len(cameras)
     information = np.broadcast_to(np.eye(rows), (len(points_mm), rows, rows))
@@ -531,7 +484,7 @@ def point_shift_jacobian(
     points_mm: Array,
     information_px: Array,
 ) -> Array:
-    """Return the derivative (..., 3, P) of triangulated points with respect to the rig block.
+    """Return the derivative (..., 3, P) of triangulated points by the rig block.
 
     information_px : (..., 2C, 2C) inverse covariance of the pixels.
     """

@@ -35,13 +35,12 @@ Newton's method."""
 
 @dataclass(frozen=True)
 class Wall:
-    """Describes a plane window in the camera's frame.
+    """A plane window in the camera's frame.
 
-    normal : (3,) unit vector that points away from the camera (z > 0).
-    distance_mm : where the camera's axis meets the near face, measured from the camera's origin;
-        negative if that is behind the origin.
-    indices : refractive indices on the camera's side, of the glass, and behind the glass.
-    normal_sigma_rad : prior standard deviation of the normal; 0 if the normal is exact.
+    normal : (3,) unit vector that points away from the camera (z > 0). distance_mm : from the
+    camera's origin to where its axis meets the near face. indices : refractive indices on the
+    camera's side, of the glass, and behind it. normal_sigma_rad : prior standard deviation of the
+    normal.
     """
 
     normal: Array
@@ -62,21 +61,14 @@ class Wall:
         return float(self.normal[2] * self.distance_mm)
 
     def turned(self, tangent: Array) -> Wall:
-        """Return the window after a small rotation of its normal.
-
-        tangent : (2,) rad. The new normal is normal + ``tangent_basis(normal) @ tangent``,
-            normalised.
-        """
+        """Return the window with a normal turned by ``tangent`` (2,) rad in its `tangent_basis`."""
         if not np.any(tangent):
             return self
         normal = self.normal + tangent_basis(self.normal) @ np.asarray(tangent, float)
         return replace(self, normal=normal / np.linalg.norm(normal))
 
     def turn_jacobian(self, tangent: Array) -> Array:
-        """Return the derivative (2, 2) of the turned normal with respect to ``tangent`` (2,).
-
-        The change of the turned normal is expressed in its own `tangent_basis`.
-        """
+        """Return the derivative (2, 2) of the turned normal, in its `tangent_basis`."""
         turned, length = self.turned(tangent), float(np.sqrt(1 + np.sum(np.square(tangent))))
         return np.asarray(tangent_basis(turned.normal).T @ tangent_basis(self.normal) / length)
 
@@ -92,10 +84,7 @@ class Wall:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Wall:
-        """Return the window that `as_dict` has described.
-
-        Raises KeyError, TypeError or ValueError for other contents.
-        """
+        """Return the window of `as_dict`; KeyError, TypeError or ValueError for other contents."""
         normal = np.array(data["normal"], float).reshape(3)
         if not (0 < np.linalg.norm(normal) < np.inf and normal[2] > 0):
             raise ValueError("the normal of a window has no direction away from the camera (z > 0)")
@@ -111,12 +100,10 @@ class Wall:
 
 @dataclass(frozen=True)
 class IdealPrediction:
-    """Holds telecentric coordinates of points in water, and their derivatives.
+    """Telecentric coordinates (..., 2) of points in water, in mm, and their derivatives.
 
-    value : (..., 2) mm, where the ray in air crosses depth 0.
-    by_point : (..., 2, 3) with respect to the point.
-    by_kappa : (..., 2) with respect to kappa.
-    by_wall : (..., 2, 3) with respect to the two tangents of `Wall.turned` and to the distance.
+    by_point : (..., 2, 3), by_kappa : (..., 2), by_wall : (..., 2, 3); the last with respect to the
+    two tangents of `Wall.turned` and to the distance.
     """
 
     value: Array
@@ -127,14 +114,10 @@ class IdealPrediction:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Holds rays in air and in the water, with the symbols of the module's docstring.
+    """Rays in air and in the water, with the symbols of the module's docstring.
 
-    entry : (..., 3) H, the point on the near face.
-    direction : (..., 3) direction in air, not normalised.
-    along : (...) n.d.
-    tangential : (..., 3) T.
-    spread, slope : (...) A, and its derivative dA / d(T.T).
-    water : (...) m_w / sqrt(1 - m_w^2 T.T).
+    entry : (..., 3) H. direction : (..., 3) in air, not normalised. along : (...) n.d. tangential :
+    (..., 3) T. spread, slope : (...) A and dA / d(T.T). water : (...) m_w / sqrt(1 - m_w^2 T.T).
     reached : (..., 3) the point that the ray reaches in the water.
     """
 
@@ -149,20 +132,16 @@ class _Rays:
 
 
 def tangent_basis(normal: Array) -> Array:
-    """Return two orthonormal vectors along the window, the columns of (3, 2).
-
-    They are the camera's x and y axes if the normal is its z axis.
-    """
+    """Return two orthonormal vectors (3, 2) along the window: x and y for a normal along z."""
     x, y, z = normal
     f = 1 / (1 + z)
     return np.array([[1 - f * x * x, -f * x * y], [-f * x * y, 1 - f * y * y], [-x, -y]])
 
 
 def affine_map(wall: Wall) -> tuple[Array, Array]:
-    """Return the affine map from a point in water to its telecentric coordinates for kappa = 0.
+    """Return matrix (2, 3) and offset (2,) in mm from points in water to telecentric coordinates.
 
-    Returns the matrix (2, 3) and the offset (2,) in mm: coordinates = matrix @ point + offset, with
-    the point in the camera's frame in mm.
+    The map is exact for kappa = 0.
     """
     tangential = _tangential_of_axis(wall)
     glass, water = (_sideways(m, 1 - wall.normal[2] ** 2) for m in wall.ratios)
@@ -174,17 +153,11 @@ def affine_map(wall: Wall) -> tuple[Array, Array]:
 
 
 def ideal_from_water(points_mm: Array, kappa: float, wall: Wall) -> Array:
-    """Return the telecentric coordinates (..., 2) in mm of points in water.
+    """Return the telecentric coordinates (..., 2) in mm of points (..., 3) in water.
 
     They are the x and y at which the point's ray in air, prolonged without refraction if need be,
-    crosses depth 0. Depth 0 is the plane z = 0 of the camera's frame, through the camera's origin
-    and perpendicular to its axis.
-
-    points_mm : (..., 3) in the camera's frame, in mm.
-    kappa : residual perspective in 1/mm.
-    wall : the window between camera and water, in the camera's frame.
-
-    Raises GeometryError for points that no ray of the camera reaches.
+    crosses the plane z = 0 of the camera's frame. Raises GeometryError for points that no ray
+    reaches.
     """
     matrix, offset = affine_map(wall)
     ideal = points_mm @ matrix.T + offset
@@ -241,10 +214,7 @@ def water_from_ideal(ideal_mm: Array, kappa: float, wall: Wall) -> tuple[Array, 
 
 
 def _sideways(ratio: float, tau: Array) -> Array:
-    """Return m / sqrt(1 - m^2 T.T): how far a ray moves sideways along T per mm of travel along n.
-
-    ratio : m.
-    tau : (...) T.T.
+    """Return m / sqrt(1 - m^2 T.T) for tau = T.T (...): mm sideways along T per mm along n.
 
     Raises GeometryError for total reflection.
     """
@@ -263,20 +233,14 @@ def _tangential_of_axis(wall: Wall) -> Array:
 
 
 def air_rays(ideal_mm: Array, kappa: float) -> tuple[Array, Array]:
-    """Return the rays in air, in the camera's frame, of telecentric coordinates (..., 2).
-
-    Returns the origins (..., 3) at depth 0 and the directions (..., 3) (kappa x, kappa y, 1).
-    """
+    """Return origins (..., 3) at depth 0 and directions (kappa x, kappa y, 1) of rays in air."""
     shape = (*ideal_mm.shape[:-1], 1)
     origin = np.concatenate([ideal_mm, np.zeros(shape)], -1)
     return origin, np.concatenate([kappa * ideal_mm, np.ones(shape)], -1)
 
 
 def _enter(ideal: Array, kappa: float, wall: Wall) -> tuple[Array, Array, Array]:
-    """Return where rays meet the near face (..., 3), their directions (..., 3), and n.d (...).
-
-    The directions are (kappa x, kappa y, 1), not normalised.
-    """
+    """Return where rays meet the near face (..., 3), their directions (..., 3), and n.d (...)."""
     origin, direction = air_rays(ideal, kappa)
     normal_part = direction @ wall.normal
     if not np.all(normal_part > 0):
@@ -302,11 +266,7 @@ def _refract(ideal: Array, points: Array, kappa: float, wall: Wall) -> _Rays:
 
 
 def _ray_jacobians(ideal: Array, rays: _Rays, kappa: float, wall: Wall) -> tuple[Array, Array]:
-    """Return the derivatives of the reached points with respect to the telecentric coordinates and
-    kappa.
-
-    The first is (..., 3, 2), the second (..., 3).
-    """
+    """Return derivatives of the reached points by coordinates (..., 3, 2) and kappa (..., 3)."""
     normal, length = wall.normal, np.linalg.norm(rays.direction, axis=-1)
     unit = rays.direction / length[..., None]
     along_ray = np.eye(3) - unit[..., None] * normal / rays.along[..., None, None]
@@ -323,10 +283,7 @@ def _ray_jacobians(ideal: Array, rays: _Rays, kappa: float, wall: Wall) -> tuple
 
 
 def _wall_jacobian(rays: _Rays, points: Array, wall: Wall) -> Array:
-    """Return the derivative (..., 3, 3) of (reached point minus point) with respect to the window.
-
-    The columns are the two tangents of the normal and the distance.
-    """
+    """Return the derivative (..., 3, 3) of (reached point minus point) by tangents and distance."""
     normal, basis = wall.normal, tangent_basis(wall.normal)
     unit = rays.direction / np.linalg.norm(rays.direction, axis=-1, keepdims=True)
     near = wall.distance_mm * basis[2]

@@ -461,8 +461,7 @@ def aligned_covariance(
 def aligned_shift(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
-    """Return the derivative (3 N, P) of triangulated points, without rigid motion, by the rig
-    block.
+    """Return the derivative (3 N, P) of triangulated points by the rig block, less rigid motion.
 
     A motion that is common to all points is projected out, because the place of the rig frame is a
     matter of definition (Baarda's S-transformation to the points' own frame). The result describes

@@ -69,17 +69,12 @@ _SCALE = INDEX["scale_px_per_mm"]
 
 @dataclass(frozen=True)
 class FittedModel:
-    """Holds a fitted lens model of all cameras.
+    """A fitted lens model of all cameras.
 
-    lenses : parameter groups of each camera.
-    parameters : number of free intrinsics of all cameras together.
-    cost : half the sum of squared whitened residuals and priors.
-    rows : number of measured coordinates.
-    rms_px : RMS of the residuals.
-    per_view : (V,) mean squared whitened residual of each of the V views, predicted by a fit
-        without that view. It is NaN if too few views would remain, and infinite if the model was
-        not cross-validated.
-    state : the estimate.
+    lenses : parameter groups of each camera. parameters : number of free intrinsics. cost : half
+    the sum of squared whitened residuals and priors. rows : number of measured coordinates.
+    per_view : (V,) mean squared whitened residual of each view, predicted by a fit without it; NaN
+    if too few views would remain, infinite if the model was not cross-validated.
     """
 
     lenses: Lenses
@@ -103,15 +98,12 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class Step:
-    """Describes one step of the model choice, which adds a group of parameters to one camera's
-    model and is kept or not.
+    """One step of the model choice, which adds a group of parameters to one camera's model, or not.
 
-    camera, added : index of the camera and names of the added parameters; -1 and () for the first
-        step, which is the simplest model.
-    gain : decrease of chi-square, in units of the residuals' variance.
-    bic_gain : the gain minus the penalty of the information criterion.
-    fit : the fitted model; None if the gain was predicted without a fit.
-    undetermined : whether the views do not determine the added parameters.
+    camera, added : of the added parameters; -1 and () for the first step, the simplest model.
+    gain : decrease of chi-square, in units of the residuals' variance; bic_gain : minus the penalty
+    of the information criterion. fit : None if the gain was predicted without a fit. undetermined :
+    whether the views do not determine the added parameters.
     """
 
     camera: int
@@ -126,19 +118,13 @@ class Step:
 
     @property
     def p_value(self) -> float:
-        """The probability of such a gain if the added parameters are truly zero; NaN for the first
-        step."""
+        """The probability of such a gain if the added parameters are zero; NaN for the first step."""
         return float(chdtrc(len(self.added), self.gain)) if self.added else float("nan")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Holds the chosen lens model and the steps that led to it.
-
-    steps : the steps up to the chosen model, then those that were not taken.
-    chosen : the fitted model.
-    words : the choice in sentences for the user.
-    """
+    """The chosen lens model, the steps that led to it and those not taken, and sentences on them."""
 
     steps: tuple[Step, ...]
     chosen: FittedModel
@@ -148,8 +134,8 @@ class Choice:
 def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
     """Return the choice among the models that the problem's free parameters contain.
 
-    problem, rich : the problem with the richest model, and its solution.
-    models : for each camera "auto", or the name of a model that is kept.
+    problem, rich : the problem with the richest model, and its solution. models : for each camera
+    "auto", or the name of a model that is kept.
     """
     whole = tuple(_lens_of(free) for free in problem.free)
     allowed = [possible(lens) if m == AUTO else [lens] for lens, m in zip(whole, models)]
@@ -195,8 +181,7 @@ def _determined(quadratic: QuadraticCost, allowed: list[list[Lens]]) -> Lenses:
 def _alternatives(
     quadratic: QuadraticCost, wanted: Lenses, allowed: list[list[Lens]]
 ) -> list[Lenses]:
-    """Return further models to fit: the best one without a tilt, and the richest one without
-    kappa."""
+    """Return more models to fit: the best without a tilt, and the richest without kappa."""
     out = []
     if any("tilt" in lens for lens in wanted):
         flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
@@ -239,10 +224,10 @@ def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> FittedM
 
 
 def model_start(problem: Problem, state: State) -> State:
-    """Return a start for the problem's own model, from a state that was fitted with another model.
+    """Return a start for the problem's own model, from a state of another model.
 
-    A tilt acts in second order: its derivative vanishes at zero, so a solver cannot leave zero. It
-    starts at the tilt that stretches the image in the same way as the best aspect ratio and skew.
+    A tilt acts in second order, so a solver cannot leave zero. It starts at the tilt that stretches
+    the image in the same way as the best aspect ratio and skew.
     """
     start = held_at_nominal(problem, state)
     if not any("tilt_x" in free for free in problem.free):
@@ -263,8 +248,6 @@ def tilted(state: State, cameras: Sequence[int]) -> State:
 
     The tilt is that of a lens that is telecentric on both sides: by `telerig.rig.projection` it
     stretches the image by sqrt(1 + q^2) along q. The sign of q is arbitrary.
-
-    cameras : indices of these cameras.
     """
     intrinsics = state.intrinsics.copy()
     for camera in cameras:
@@ -286,9 +269,8 @@ def _revised(
 ) -> tuple[QuadraticCost, Lenses]:
     """Return the quadratic and the wanted model, or better ones.
 
-    A better model is an alternative with lower cost, or the best model of a new quadratic. A
-    quadratic is accurate near the fit at which it was computed. If its predicted cost of the wanted
-    model differs from the fitted cost, it is computed again at that fit.
+    A better model is an alternative with lower cost, or the best of a new quadratic, which is
+    computed where the predicted cost of the wanted model differs from the fitted one.
     """
     fitting = [o for o in others if all(x in options for x, options in zip(o.lenses, allowed))]
     best = min((fit, *fitting), key=lambda f: quadratic.cost_of_fit(f.lenses, f.cost))
@@ -315,9 +297,7 @@ def _taken(quadratic: QuadraticCost, path: list[Addition], fits: list[FittedMode
 
 
 def _without_worse_predictions(steps: list[Step]) -> list[Step]:
-    """Mark the steps at the end that predict left-out views worse as not taken, and return all
-    steps.
-    """
+    """Return the steps; those at the end that predict left-out views worse count as not taken."""
     last = len(steps) - 1
     while last > 0:
         before, after = (steps[k].fit for k in (last - 1, last))
@@ -335,10 +315,7 @@ def _without_worse_predictions(steps: list[Step]) -> list[Step]:
 def _not_taken(
     quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
 ) -> list[Step]:
-    """Return what one more group would have gained, except for groups that were tried and refused.
-
-    A tilt is left out here, because it gains nothing where aspect and skew gain nothing.
-    """
+    """Return what one more group would have gained, except for tilts and groups that were refused."""
     known = {(step.camera, step.added) for step in refused}
     out = []
     for camera, group, lenses in additions(chosen, allowed):
@@ -384,8 +361,7 @@ def _words(
 
 
 def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]) -> str:
-    """Say how all steps together, and the last one alone, changed the prediction of left-out
-    views."""
+    """Say how all steps together, and the last one, changed the prediction of left-out views."""
     taken = [step for step in steps if step.taken]
     fits = [step.fit for step in taken if step.fit is not None]
     simpler = [fit for fit in fits[:-1] if np.isfinite(fit.held_out)]
@@ -424,10 +400,7 @@ POSE_STEPS = 3
 
 
 def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
-    """Return the state after the pose of every view was refined, with cameras and dots held fixed.
-
-    These are Gauss-Newton steps on the 6 unknowns of each view.
-    """
+    """Return the state after Gauss-Newton steps of every view's pose, cameras and dots held fixed."""
     system = System(problem)
     for _ in range(steps):
         normal = np.zeros((len(problem.views), 6, 6))
@@ -448,15 +421,10 @@ def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
 
 
 def held_out_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
-    """Return the mean squared whitened residual (V,) of each of V views, predicted by a fit without
-    it.
+    """Return each view's mean squared whitened residual (V,), predicted by a fit without it.
 
-    A fit without some views is one Gauss-Newton step from ``state``. The pose of a left-out view is
-    then fitted to it, with the cameras and dots of the other views. Views whose fold cannot be left
-    out get NaN.
-
-    state : the minimum with all views.
-    folds : number of parts into which the views are divided; one part is left out at a time.
+    A fit without some views is one Gauss-Newton step from ``state``, the minimum with all views.
+    The pose of a left-out view is then fitted to it. Views whose fold cannot be left out get NaN.
     """
     views = np.arange(len(problem.views))
     out = np.full(len(views), np.nan)
@@ -487,16 +455,10 @@ UNDAMPED = 1e-12
 def considered_groups(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:
     """Return for each camera the considered groups of lens parameters (names as in `GROUPS`).
 
-    A considered group is held at its nominal value in the fit, but the covariance of the result
-    includes its uncertainty. A group that the lens model of a camera does not free is considered if
-    the model of another camera frees it (the lenses are of the same kind, so its value is probably
-    small but not zero here), or if the improvement of the fit when it is freed is unlikely to be
-    chance (p-value below `CONSIDERED_P_VALUE`). A group that the views do not determine is not
-    considered, because its weak prior would then dominate the covariance.
-
-    choice : the steps by which the lens models were chosen; None if they were not chosen
-        automatically. No group is then considered.
-    cameras : number of cameras.
+    They are held at nominal, but the covariance includes their uncertainty: groups that another
+    camera's model frees (the lenses are of the same kind), and those whose freeing improves the fit
+    by more than chance (`CONSIDERED_P_VALUE`). Groups that the views do not determine are not
+    considered, because their weak priors would dominate the covariance.
     """
     out: list[set[str]] = [set() for _ in range(cameras)]
     steps = choice.steps if choice is not None else ()
@@ -516,9 +478,7 @@ def _groups(parameters: tuple[str, ...]) -> Lens:
 
 
 def _acts_like(parameters: tuple[str, ...]) -> Lens:
-    """Return the groups of these parameters, and "affine" for a tilt, which also stretches the
-    image.
-    """
+    """Return the groups of these parameters, and "affine" for a tilt, which also stretches."""
     groups = _groups(parameters)
     return groups | {"affine"} if "tilt" in groups else groups
 
@@ -530,13 +490,9 @@ def considered_covariance(
     models: Sequence[str],
     groups: Sequence[Lens],
 ) -> tuple[tuple[tuple[str, ...], ...], JointCovariance]:
-    """Return for each camera the parameters in the covariance, and the covariance.
+    """Return for each camera the free and the considered parameters, and their covariance.
 
-    The parameters are the free ones and the considered ones.
-
-    joint : covariance of the solution.
-    models : name of each camera's model.
-    groups : for each camera the considered groups.
+    joint : covariance of the solution. groups : for each camera the considered groups.
     """
     if not any(groups):
         return problem.free, joint
@@ -551,9 +507,7 @@ def considered_covariance(
 
 
 def considered_words(groups: Sequence[Lens], cameras: Sequence[str]) -> str:
-    """Return a clause on the considered parameters, for the end of the choice's words; "" if none
-    are.
-    """
+    """Return a clause on the considered parameters, for the end of the choice's words, or ""."""
     parts = [
         f"{', '.join(p for g in ordered(more) for p in GROUPS[g])} of camera {camera!r}"
         for camera, more in zip(cameras, groups) if more

@@ -40,12 +40,7 @@ CLEAR_MISFIT = 0.1
 
 @dataclass(frozen=True)
 class Note:
-    """Hold a sentence for the user.
-
-    code : short name of the subject, for example "few views".
-    words : the sentence.
-    affects_verdict : whether the verdict then is "USABLE, with warnings" instead of "GOOD".
-    """
+    """A sentence for the user with a short name, and whether the verdict then is no longer GOOD."""
 
     code: str
     words: str
@@ -54,12 +49,7 @@ class Note:
 
 @dataclass(frozen=True)
 class PreCheck:
-    """Hold the result of the checks before a calibration.
-
-    tilts_deg : by (index of the view, index of the camera), the angle between the target's normal
-        and the optical axis, in degrees.
-    notes : sentences for the user.
-    """
+    """Notes before a calibration, and by (view, camera) the target's tilt to the optical axis."""
 
     tilts_deg: dict[tuple[int, int], float]
     notes: tuple[Note, ...]
@@ -68,14 +58,11 @@ class PreCheck:
 def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreCheck:
     """Check before a calibration whether the views can determine it.
 
-    problem : the measured dots and the nominal cameras.
-    dots_mm : (N, 3) positions of the target's N dots in its frame, in mm.
-    unknown_dots : whether these positions are only estimates; then more views are needed.
-
-    Returns the tilts of the target, and notes about what will be poorly determined.
-    Raises CalibrationError for too few views, too few dots or views that are all parallel; the
-    message names what is undetermined and what to do. Raises DetectionError for mirrored images of
-    a target that is visible from one side only.
+    dots_mm : (N, 3) positions of the target's N dots in its frame. unknown_dots : whether these are
+    only estimates; then more views are needed.
+    Returns tilts and notes about what will be poorly determined. Raises CalibrationError for too
+    few views, too few dots or parallel views, and DetectionError for mirrored images of a target
+    that is visible from one side only.
     """
     maps = image_maps(problem, dots_mm)
     stereo = len(problem.cameras) > 1
@@ -155,10 +142,7 @@ def _those(problem: Problem) -> str:
 
 
 def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
-    """Raise CalibrationError if a camera is connected to the first one by fewer than two views.
-
-    The connection may lead over other cameras; images : (view, camera) of all usable images.
-    """
+    """Raise CalibrationError if a camera is linked to the first one by fewer than two views."""
     for a, b in overlap_tree(problem, images):
         count = sum({(v, a), (v, b)} <= images for v in range(len(problem.views)))
         if count < 2:
@@ -173,11 +157,10 @@ def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
 def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
     """Return a note for each camera whose offset relative to the others no view determines.
 
-    A telecentric camera sees no depth. So a view that two cameras see determines their offset only
-    along the common perpendicular of their axes; a view that three cameras see determines the
-    rest. The views' positions are eliminated from the linear equations of all offsets; see
-    docs/theory.md.
-    With fewer than three cameras, or with clear perspective in all lenses, there is no note.
+    A view that two telecentric cameras see determines their offset only along the common
+    perpendicular of their axes; a view that three see determines the rest. The views' positions are
+    eliminated from the linear equations of all offsets; see docs/theory.md. With fewer than three
+    cameras, or with clear perspective in all lenses, there is no note.
     """
     count = len(problem.cameras)
     kappa_rho = state.intrinsics[:, INDEX["kappa_per_mm"]] * np.array(problem.rho_mm)
@@ -214,10 +197,10 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
 
 
 def exchanged_notes(problem: Problem, state: State) -> tuple[Note, ...]:
-    """Return a note for two cameras whose estimated scales fit each other's nominal scale better.
+    """Return a note for two cameras whose scales fit each other's nominal scale better.
 
-    This is a sign that the folders of the cameras were exchanged. Nominal scales that differ by
-    less than `OTHER_SCALE` tell nothing.
+    Their folders were probably exchanged. Nominal scales that differ by less than `OTHER_SCALE`
+    tell nothing.
     """
     estimated = np.log(state.intrinsics[:, INDEX["scale_px_per_mm"]])
     nominal = np.log([camera["scale_px_per_mm"] for camera in problem.cameras])
@@ -239,10 +222,9 @@ def exchanged_notes(problem: Problem, state: State) -> tuple[Note, ...]:
 
 
 def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[Note]:
-    """Check whether images are mirrored; raise DetectionError if only some of them are.
+    """Return a note if all images are mirrored; raise DetectionError if only some of them are.
 
-    Two kinds of images are left out of this check: those that show the target nearly edge on, and
-    those whose dots do not fit the target. Returns a note if all images are mirrored.
+    Images that show the target nearly edge on, or whose dots do not fit it, are left out.
     """
     hands = {}
     for (v, c), m in maps.items():
@@ -269,11 +251,9 @@ def _tilt_deg(jacobian: Array) -> float:
 def _refuse_parallel(
     problem: Problem, maps: dict[tuple[int, int], ImageMap], usable: list[int]
 ) -> None:
-    """Raise CalibrationError if the target has the same tilt in all views.
+    """Raise CalibrationError if the target has the same tilt in all views (docs/theory.md).
 
-    This is so if each camera sees it foreshortened by the same factor along the same direction of
-    the target. A rotation of the target in its own plane changes this direction, so it is enough
-    to distinguish two views: see docs/theory.md.
+    Each camera then sees it foreshortened by one factor along one direction of the target.
     """
     spread = 0.0
     for c in range(len(problem.cameras)):
@@ -329,8 +309,7 @@ def parallel_notes(state: State) -> list[Note]:
 def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:
     """Return sentences about parameters of the rig that the views determine poorly.
 
-    A parameter is named if its standard deviation exceeds half of its prior's, or if its
-    correlation with another one exceeds `TOLD_APART`.
+    Their standard deviation exceeds half of the prior's, or a correlation exceeds `TOLD_APART`.
     """
     names, covariance = joint.rig_block()
     sd = np.sqrt(np.diag(covariance))

@@ -35,13 +35,7 @@ _LEAST_CHANCE = 1e-12
 
 @dataclass(frozen=True)
 class Rig:
-    """Hold what is compared of one calibration.
-
-    cameras : the C cameras.
-    free : for each camera, the names of its free (estimated) intrinsics.
-    covariance : (P, P) covariance of the rig block's P parameters: all free intrinsics, camera by
-        camera, then the rotation (rad) and translation (mm) of each camera but the first.
-    """
+    """What is compared of one calibration: cameras and the covariance (P, P) of the rig block."""
 
     cameras: tuple[Camera, ...]
     free: tuple[tuple[str, ...], ...]
@@ -50,13 +44,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class Change:
-    """Hold the change of one quantity between two calibrations.
-
-    quantity : its name for the reader.
-    unit : unit of ``change`` and ``sd``: "urad", "um" or "ppm".
-    change : value of the second calibration minus that of the first.
-    sd : standard deviation of the change.
-    """
+    """The change of one quantity in "urad", "um" or "ppm", second calibration minus first."""
 
     quantity: str
     unit: str
@@ -71,14 +59,10 @@ class Change:
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """Hold how far two rigs place the same pixels apart in space.
+    """How far two rigs place the same pixels apart in space, after the best rigid motion.
 
-    points_mm : (N, 3) points in the rig frame, in mm.
-    shift_mm : (N, 3) point of the second rig minus point of the first, from the same pixels, after
-        the best rigid motion has been removed, in mm.
-    sd_mm : (N, 3) standard deviations of the shift that both covariances predict, in mm.
-    p_value : probability that the predicted errors alone cause a shift as large as this, from a
-        chi-square test.
+    points_mm, shift_mm, sd_mm : (N, 3) in the rig frame; sd_mm is what both covariances predict.
+    p_value : of a chi-square test that the predicted errors alone cause the shift.
     """
 
     points_mm: Array
@@ -99,15 +83,12 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class RigComparison:
-    """Hold the comparison of two calibrations of one rig with C cameras.
+    """The comparison of two calibrations of one rig with C cameras.
 
-    cameras : names of the C cameras.
     changes : for each camera but the first, its rotation about x, y and z and its offset along the
-        common perpendicular, both relative to the first camera; then the C changes of the scales.
-    field : how far the two rigs place the same pixels apart in space.
-    p_moved : probability that errors alone cause changes of the poses as large as these.
-    exchanged : whether each of two cameras now has the scale that the other one had.
-    media : "air" or "water", in which the target was, for the first and the second calibration.
+    common perpendicular, relative to the first; then the C changes of the scales.
+    p_moved : probability that errors alone cause changes of the poses as large as these. exchanged
+    : whether two cameras have exchanged their scales. media : "air" or "water" of each calibration.
     """
 
     cameras: tuple[str, ...]
@@ -119,10 +100,7 @@ class RigComparison:
 
     @property
     def identical(self) -> bool:
-        """Return whether both calibrations are equal except for rounding errors.
-
-        Then both come from the same views.
-        """
+        """Whether both calibrations are equal to rounding: then they come from the same views."""
         return self.field.rms_um < _ROUNDING * self.field.predicted_um
 
     @property
@@ -211,10 +189,8 @@ class RigComparison:
 def compare_calibrations(first: Calibration, second: Calibration) -> RigComparison:
     """Compare two calibrations of one rig: how did it change from ``first`` to ``second``?
 
-    The errors of the two are taken as independent. Errors that they share, for example of the
-    target's stated distance, make the standard deviations too large, never too small.
-    Refractive windows are left out of the comparison.
-
+    Their errors are taken as independent. Errors that they share, for example of the target's
+    stated distance, make the standard deviations too large, never too small. Windows are left out.
     Raises InputError if the two have different cameras or image sizes, or only one camera.
     """
     check_same_rig(first.cameras, second.cameras)
@@ -232,11 +208,7 @@ class Named(Protocol):
 
 
 def check_same_rig(first: Sequence[Named], second: Sequence[Named]) -> None:
-    """Check that two lists of cameras belong to the same rig.
-
-    Raises InputError if names, order or image sizes (width and height in px) differ, or if both
-    lists have a single camera.
-    """
+    """Raise InputError if names, order or image sizes differ, or for a single camera."""
     mine, theirs = ([(c.name, tuple(c.image_size_px)) for c in k] for k in (first, second))
     if len(mine) < 2 and len(theirs) < 2:
         raise InputError(
@@ -262,10 +234,7 @@ def _named(cameras: list[tuple[str, tuple[int, ...]]]) -> str:
 
 
 def compare_rigs(first: Rig, second: Rig) -> RigComparison:
-    """Compare two rigs with the same cameras.
-
-    Returns the changes, second minus first; their covariance is the sum of both covariances.
-    """
+    """Return the changes between two rigs, second minus first; the covariances add up."""
     cameras = tuple(camera.name for camera in first.cameras)
     pose, covariance = _pose_change(first, second)
     sd = np.sqrt(np.diag(covariance))
@@ -311,8 +280,8 @@ def _of(medium: str) -> str:
 def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:
     """Return how each camera but the first moved relative to the first, and the covariance.
 
-    Each of these cameras has four numbers, one camera after the other: the rotation about the x, y
-    and z axis of the rig frame (rad) and the offset along the common perpendicular (mm).
+    A camera has four numbers: the rotation about the x, y and z axis of the rig frame (rad) and the
+    offset along the common perpendicular (mm).
     """
     others = len(first.cameras) - 1
     changes, rows = [], np.zeros((4 * others, 6 * others))
@@ -343,23 +312,13 @@ def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
 
 
 def after_rigid_motion(found_mm: Array, points_mm: Array) -> Array:
-    """Return how two sets of points differ after the best rigid motion.
-
-    found_mm, points_mm : (N, 3) corresponding points, in mm.
-
-    Returns (N, 3) ``found_mm``, moved rigidly to fit best, minus ``points_mm``, in mm.
-    """
+    """Return ``found_mm`` (N, 3), moved rigidly to fit best, minus ``points_mm`` (N, 3)."""
     a, b = found_mm - found_mm.mean(0), points_mm - points_mm.mean(0)
     return np.asarray(a @ nearest_rotation(b.T @ a).T - b)
 
 
 def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference:
-    """Compute how far two rigs place the same pixels apart over the working volume.
-
-    first, second : the rigs. The first projects the points of a grid to pixels, and the second
-        triangulates these pixels.
-    steps : number of grid points along each edge of the volume.
-    """
+    """Return how far the second rig triangulates the pixels of the first's grid of points apart."""
     points = working_volume(first.cameras, steps)
     pixels = [camera.project(points) for camera in first.cameras]
     found = triangulate_any(second.cameras, pixels, 1.0).points_mm
@@ -382,11 +341,9 @@ def _root(covariance: Array) -> Array:
 
 
 def _chance(difference: Array, root: Array) -> float:
-    """Return the probability that chance gives a difference as large as this.
+    """Return the probability of a difference (K,) as large, with the covariance root root^T.
 
-    difference : (K,) values.
-    root : (K, L) matrix; root root^T is their covariance. Directions with (almost) no variance are
-        left out of the chi-square.
+    Directions with (almost) no variance are left out of the chi-square.
     """
     directions, sizes, _ = np.linalg.svd(root, full_matrices=False)
     seen = sizes > _RANK * sizes.max()

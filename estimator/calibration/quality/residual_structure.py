@@ -25,14 +25,10 @@ _LEAST_DOTS = 3
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Hold the result of one test of a camera's residuals.
+    """The result of one test of a camera's residuals.
 
-    name : kind of the test: "region", "direction", "neighbours" or "view".
-    camera : name of the camera.
-    size : size of the effect. For "region" it is in standard deviations of a residual, for
-        "view" it is a ratio to the other views; for the others it is a relative measure.
-    p_value : probability that chance alone gives an effect as large as this.
-    words : sentence for the user.
+    size : of the effect; for "region" in standard deviations of a residual, for "view" a ratio to
+    the other views, else relative. p_value : that chance alone gives an effect as large as this.
     """
 
     name: str
@@ -45,12 +41,8 @@ class ResidualTest:
 def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[str, Any]:
     """Test whether the residuals of a calibration have any structure left.
 
-    problem : the calibration's measurements; M is the number of its observations (a dot in an
-        image), in the order of ``problem.observations()``.
-    whitened : (M, 2) whitened residuals in u and v.
-    leverage : (M, 2, 2) covariance of each whitened prediction, which is the share of the noise
-        that the fit absorbs.
-
+    whitened : (M, 2) whitened residuals in the order of ``problem.observations()``. leverage : (M,
+    2, 2) covariance of each whitened prediction, the share of the noise that the fit absorbs.
     Returns the content of `Calibration.diagnostics`, entry "structure": "sound" (whether no test
     found anything), "words" (sentences) and "tests" (the fields of each `ResidualTest`).
     """
@@ -74,13 +66,9 @@ def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[s
 
 
 def standardised_residuals(whitened: Array, leverage: Array) -> Array:
-    """Scale whitened residuals to unit variance.
+    """Return whitened residuals (M, 2) times (identity - leverage)^(-1/2), of unit variance.
 
-    whitened : (M, 2) whitened residuals of M dots. The fit absorbs a share of their noise.
-    leverage : (M, 2, 2) this share for each dot.
-
-    Returns (M, 2) residuals, multiplied by (identity - leverage)^(-1/2). Components of which the
-    fit absorbs more than 98 % are set to 0.
+    Components of which the fit absorbs more than 98 % are set to 0.
     """
     left = np.eye(2) - leverage
     values, vectors = np.linalg.eigh(0.5 * (left + np.swapaxes(left, -1, -2)))
@@ -89,11 +77,7 @@ def standardised_residuals(whitened: Array, leverage: Array) -> Array:
 
 
 def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int]) -> ResidualTest:
-    """Test whether the residuals point the same way in a part of the image.
-
-    If they do, the lens model lacks a term. values : (M, 2) standardised residuals at the pixels
-    uv_px (M, 2); size_px : width and height of the image in px.
-    """
+    """Test whether residuals (M, 2) point the same way in a part of the image (lens model)."""
     cell = np.clip((uv_px + 0.5) / np.array(size_px) * CELLS, 0, CELLS - 1).astype(int)
     index = cell[:, 1] * CELLS + cell[:, 0]
     count = np.bincount(index, minlength=CELLS**2)
@@ -114,11 +98,7 @@ def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int])
 
 
 def _direction(camera: str, values: Array, share: float) -> ResidualTest:
-    """Test whether the residuals (M, 2) are longer in one direction.
-
-    Vibration, motion blur or an interlaced sensor can cause this. share : degrees of freedom
-    divided by the number of residuals.
-    """
+    """Test whether residuals (M, 2) are longer in one direction (vibration, interlaced sensor)."""
     u, v = values.T
     mean = 0.5 * float((u**2 + v**2).mean())
     half, cross = 0.5 * float((u**2 - v**2).mean()) / mean, float((u * v).mean()) / mean

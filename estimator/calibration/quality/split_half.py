@@ -36,15 +36,12 @@ _SCALE = 1e-7
 def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
     """Calibrate from each half of the views and compare the two rigs.
 
-    problem, state : the measurements and the solution of the calibration.
-
-    Returns the content of `Calibration.diagnostics`, entry "halves": always "words" (a sentence),
-    and if the check was possible also the number of views of each half, the RMS difference and its
-    prediction (um per axis), the p-value, "agree", and the differences at a grid of points.
-
-    Both halves use the same size of the target, which tells nothing about repeatability. So the
-    known distance of two dots is taken as exact in both; if none is known, the estimated distance
-    of two dots far apart is used.
+    Returns the content of `Calibration.diagnostics`, entry "halves": "words" and, if the check was
+    possible, the views of each half, the RMS difference and its prediction (um per axis), the
+    p-value, "agree", and the differences at a grid of points.
+    Both halves use the same size of the target, which tells nothing about repeatability: the known
+    distance of two dots, or else the estimated one of two dots far apart, is taken as exact in
+    both.
     """
     if len(problem.cameras) < 2:
         return {"words": "one camera: the split-half check compares points in space and needs two"}
@@ -108,10 +105,9 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
 
 
 def _in_turn(problem: Problem) -> NDArray[np.int64]:
-    """Return the indices of the used views, in the order in which the halves take turns.
+    """Return the used views in the order in which the halves take turns.
 
-    With three or more cameras, views that the same cameras see stand together, so that each half
-    gets equally many of each kind.
+    With three or more cameras, views that the same cameras see stand together.
     """
     used = np.unique(problem.view[problem.kept])
     if len(problem.cameras) == 2:

@@ -18,14 +18,9 @@ def telecentricity(
 ) -> dict[str, dict[str, float]]:
     """Return for each camera's name by how much its scale changes with depth.
 
-    problem, solution : the calibration.
-    models : the name of each camera's lens model. Where a model holds kappa, it is freed here for
-        one Gauss-Newton step.
-
-    The entries are: "change_per_mm", the relative change of the scale per mm at the mean depth of
-    the dots, and its standard deviation "sd_per_mm"; "depth_mm", the range of the dots' depths;
-    "perspective", |change_per_mm| times half the diagonal of the field of view, which is the slope
-    of a ray at the image's corner.
+    Where a model holds kappa, it is freed here for one Gauss-Newton step.
+    Entries: "change_per_mm" at the mean depth of the dots, and "sd_per_mm"; "depth_mm", the range
+    of the dots' depths; "perspective", the slope of a ray at the image's corner.
     """
     wide = problem.with_model([name_of({*groups_of(model), "kappa"}) for model in models])
     equations = linearisation(wide)[1](solution.state)

@@ -24,12 +24,9 @@ MANY_SD = 4.0
 
 @dataclass(frozen=True)
 class SpaceError:
-    """Hold the errors of N triangulated points after the best rigid motion.
+    """Errors of N triangulated points after the best rigid motion: RMS and predicted, um per axis.
 
-    rms_um : RMS of the errors per axis, in um.
-    predicted_um : the RMS that the calibration's covariance predicts, in um per axis.
-    errors_mm : (N, 3) estimated minus true points, in mm.
-    covariance_mm2 : (3N, 3N) predicted covariance of these errors, in mm^2.
+    errors_mm : (N, 3) estimated minus true. covariance_mm2 : (3N, 3N) predicted covariance.
     """
 
     rms_um: float
@@ -40,13 +37,7 @@ class SpaceError:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold the comparison of a calibration with the simulator's truth.
-
-    table : a text table, with one line for each quantity.
-    verdict : a sentence that begins with PASSED or FAILED.
-    passed : whether all quantities agree with the truth within their stated uncertainty.
-    space : errors of triangulated points.
-    """
+    """A text table, one line per quantity, and a verdict that begins with PASSED or FAILED."""
 
     table: str
     verdict: str
@@ -72,14 +63,7 @@ def true_cameras(truth: Mapping[str, Any]) -> tuple[Camera, ...]:
 def space_error(
     calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array
 ) -> SpaceError:
-    """Triangulate the true pixels of true points with the estimated rig, and return the errors.
-
-    calibration : the estimated rig; its refractive windows are left out.
-    truth : the true cameras, in the same order.
-    points_mm : (N, 3) true points in the rig frame, in mm.
-
-    The errors are what remains after the best rigid motion.
-    """
+    """Triangulate the true pixels of true points (N, 3) with the rig, and return the errors."""
     calibration = calibration.in_air()
     pixels = [camera.project(points_mm) for camera in truth]
     found = triangulate_any(calibration.cameras, pixels, 1.0).points_mm
@@ -94,13 +78,7 @@ def space_error(
 
 
 def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Comparison:
-    """Compare a calibration with the truth.
-
-    truth : the content of `truth/truth.json`.
-
-    Returns a table of estimated and true values, with their differences in standard deviations, and
-    a verdict. Nothing is written.
-    """
+    """Return a table of estimated and true values (`truth/truth.json`), and a verdict."""
     cameras = true_cameras(truth)
     space = space_error(calibration, cameras, working_volume(cameras))
     rows = _parameters(calibration, cameras)
@@ -125,10 +103,7 @@ def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Co
 def _parameters(
     calibration: Calibration, cameras: tuple[Camera, ...]
 ) -> list[tuple[str, float, float, float]]:
-    """Return the rows (name, estimate, truth, standard deviation) of the comparison.
-
-    Only quantities that do not depend on the gauge are compared.
-    """
+    """Return rows (name, estimate, truth, sd) of quantities that do not depend on the gauge."""
     rows = []
     for estimate, truth in zip(calibration.cameras, cameras):
         for name in ("scale_px_per_mm", "k1"):

@@ -14,14 +14,10 @@ STEPS = 7
 
 @dataclass(frozen=True)
 class UncertaintyMap:
-    """Hold covariances of triangulated points over the working volume, split by their cause.
+    """Covariances (N, 3, 3) of triangulated points on a grid (N, 3), split by their cause.
 
-    points_mm : (N, 3) grid of points in the rig frame, in mm.
-    calibration_mm2 : (N, 3, 3) covariances that the calibration's errors cause, in mm^2. These
-        errors are common to all points of a run.
-    measurement_mm2 : (N, 3, 3) covariances that the noise of the pixels causes, in mm^2. This noise
-        is independent for each point.
-    sigma_px : standard deviation of the pixels, in px.
+    Errors of the calibration are common to all points of a run; the noise of pixels with the
+    standard deviation sigma_px is independent for each point.
     """
 
     points_mm: Array
@@ -35,12 +31,8 @@ def uncertainty_map(
 ) -> UncertaintyMap:
     """Compute how uncertain points are that are triangulated from the pixels of all cameras.
 
-    calibration : a calibration of two or more cameras.
-    sigma_px : standard deviation of the pixels, in px; None takes the scatter of the calibration's
-        own dots.
-    steps : number of grid points along each edge of the working volume.
-
-    Raises CalibrationError for a single camera.
+    sigma_px : None takes the scatter of the calibration's own dots. Raises CalibrationError for a
+    single camera.
     """
     sigma = float(calibration.statistics.get("scatter_px", 0.02)) if sigma_px is None else sigma_px
     points = working_volume(calibration.cameras, steps)

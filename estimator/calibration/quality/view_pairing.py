@@ -26,11 +26,10 @@ FAR_BETTER = 0.02
 
 
 def refuse_copies(problem: Problem) -> None:
-    """Raise CalibrationError if two images have the same noise, so that one is a copy of the other.
+    """Raise CalibrationError if two images have the same noise, so that one is a copy.
 
-    Dots of two different images differ by their noise even if nothing moved. The sum of squared
-    differences of two images, in units of this noise, is chi-square distributed if they are
-    independent, and about zero for a copy.
+    The sum of squared differences, in units of this noise, is chi-square distributed for
+    independent images, and about zero for a copy.
     """
     count = len(problem.dot_ids)
     images, rows = np.unique(
@@ -59,15 +58,10 @@ def refuse_copies(problem: Problem) -> None:
 
 
 def wrong_pairs(problem: Problem, dots_mm: Array) -> str:
-    """Return a sentence if a camera's images fit the views before or after their own far better.
+    """Return a sentence if a camera's images fit the views before or after far better, else "".
 
-    This happens if a camera has missed a trigger, or if its first image was lost. Every few
-    consecutive views are solved with the images of one camera taken from 0 to `FARTHEST` views
-    later or earlier, at `MOST_WINDOWS` places at most.
-
-    dots_mm : (N, 3) positions of the dots to start from.
-
-    Returns "" if no offset explains the images far better than none.
+    A camera may have missed a trigger, or its first image was lost. Every few consecutive views are
+    solved with one camera's images from up to `FARTHEST` views later or earlier.
     """
     count = len(problem.views)
     if count < WINDOW:
@@ -95,10 +89,7 @@ def wrong_pairs(problem: Problem, dots_mm: Array) -> str:
 
 
 def _cost(problem: Problem, dots_mm: Array, camera: int, first: int, offset: int) -> float:
-    """Return the cost of `WINDOW` views with one camera's images from ``offset`` views later.
-
-    The cost is infinite where these views do not exist or cannot be solved.
-    """
+    """Return the cost of `WINDOW` views with one camera's images ``offset`` later, or infinity."""
     last = first + WINDOW
     if not 0 <= first + offset <= len(problem.views) - WINDOW:
         return float(np.inf)

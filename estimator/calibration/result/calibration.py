@@ -43,29 +43,20 @@ if TYPE_CHECKING:
 class Calibration(ShortText):
     """Hold a calibrated rig. The rig frame is the first camera's frame.
 
-    cameras : the cameras, in the order of `rig.toml`.
-    dot_ids : (N,) numbers of the target's N dots.
-    target_points_mm : (N, 3) estimated positions of these dots in the target's frame, in mm.
-    target_poses : by name of a view, the pose rig_from_target, which maps points of the target's
-        frame into the rig frame.
-    covariance : (P, P) covariance of the P parameters of the rig block: the free intrinsics of
-        each camera, then the small rotation (rad) and translation (mm) of the pose of each camera
-        but the first. Each parameter has the unit with which its name ends.
-    covariance_names : names of these P parameters, in the same order.
-    free : for each camera, the names of its free (estimated) intrinsics.
-    name : name of the rig.
-    verdict : "status" (a word) and "reasons" (sentences).
-    statistics, twin, model, diagnostics : the parts of `calibration.json` that have these names;
-        `docs/files.md` describes them. "twin" is about the mirror ambiguity.
-    notes : sentences for the user.
-    stage : travel axis and encoder scale with their covariance (`StageAxis.as_dict`); empty if
-        they are not known.
-    medium : "air" or "water", in which the target was. The cameras may have refractive windows in
-        both cases; then points that are projected or triangulated lie in the water behind them.
-    joint_names, joint_covariance : names and covariance matrix of all parameters of the estimate,
-        including the dots and the views' poses; empty if they were not loaded.
-    dots, residuals : tables (pandas) of the measured dots and of their residuals, as `dots.csv`
-        and `residuals.csv` hold them; None if the calibration was loaded from a file.
+    dot_ids : (N,) numbers of the target's N dots. target_points_mm : (N, 3) their estimated
+    positions in the target's frame. target_poses : by name of a view, the pose rig_from_target.
+    covariance : (P, P) of the rig block: the free intrinsics of each camera, then the small
+    rotation (rad) and translation (mm) of the pose of each camera but the first. covariance_names :
+    of these P parameters, with units. free : for each camera, the names of its free intrinsics.
+    verdict : "status" (a word) and "reasons" (sentences). statistics, twin, model, diagnostics :
+    the parts of `calibration.json` with these names (`docs/files.md`); "twin" is the mirror
+    ambiguity.
+    notes : sentences for the user. stage : `StageAxis.as_dict`; empty if it is not known.
+    medium : "air" or "water", in which the target was. With refractive windows, points that are
+    projected or triangulated lie in the water behind them.
+    joint_names, joint_covariance : of all parameters of the estimate, including the dots and the
+    views' poses; empty if they were not loaded.
+    dots, residuals : the tables of `dots.csv` and `residuals.csv`; None after loading.
     """
 
     cameras: tuple[Camera, ...]
@@ -141,12 +132,7 @@ class Calibration(ShortText):
         return pd.DataFrame.from_dict(rows, orient="index", columns=["value", "sd"])
 
     def camera(self, camera: str | int) -> Camera:
-        """Return one camera.
-
-        camera : its name, or its index in the order of `rig.toml`, from 0.
-
-        Raises CalibrationError if there is no such camera.
-        """
+        """Return one camera by name or index. Raises CalibrationError if there is no such camera."""
         if isinstance(camera, (int, np.integer)) and 0 <= camera < len(self.cameras):
             return self.cameras[camera]
         for candidate in self.cameras:
@@ -156,29 +142,21 @@ class Calibration(ShortText):
         raise CalibrationError(f"no camera {camera!r} in this calibration", todo=f"it has {names}")
 
     def in_air(self) -> Calibration:
-        """Return the same rig without its refractive windows.
-
-        The result is for points in air, for example those of a target in air.
-        """
+        """Return the same rig without its refractive windows, for points in air."""
         return replace(self, cameras=tuple(replace(c, wall=None) for c in self.cameras))
 
     def project(self, camera: str | int, points_mm: ArrayLike) -> Array:
-        """Return the (N, 2) pixels at which a camera sees points.
+        """Return the pixels (N, 2) at which a camera sees points (N, 3) of the rig frame, in mm.
 
-        camera : its name or index.
-        points_mm : (N, 3) points in the rig frame, in mm. If the camera has a refractive window,
-            the points lie in the water behind it.
+        With a refractive window, the points lie in the water behind it.
         """
         return self.camera(camera).project(points_mm)
 
     def unproject(self, camera: str | int, uv_px: ArrayLike) -> tuple[Array, Array]:
-        """Return the rays that belong to pixels of a camera.
+        """Return the rays of pixels (N, 2): origins (N, 3) in mm and unit directions (N, 3).
 
-        camera : its name or index.
-        uv_px : (N, 2) pixels.
-
-        Returns (N, 3) origins (mm) and (N, 3) unit directions of the rays in the rig frame. If the
-        camera has a refractive window, these are the rays in the water behind it.
+        They are in the rig frame. With a refractive window they are the rays in the water behind
+        it.
         """
         return self.camera(camera).unproject(uv_px)
 
@@ -217,13 +195,7 @@ class Calibration(ShortText):
         return np.asarray(cv2.remap(pixels, source[..., 0], source[..., 1], cv2.INTER_CUBIC))
 
     def project_covariance(self, camera: str | int, points_mm: ArrayLike) -> Array:
-        """Return the covariance of projected points that the calibration's errors cause.
-
-        camera : its name or index.
-        points_mm : (N, 3) points in the rig frame, in mm.
-
-        Returns (N, 2, 2) covariances, in px^2.
-        """
+        """Return covariances (N, 2, 2) in px^2 that the calibration's errors give projected points."""
         index = self.cameras.index(self.camera(camera))
         jacobian = rig_jacobian(self.cameras, self.free, np.asarray(points_mm, float))
         rows = jacobian[..., 2 * index : 2 * index + 2, :]
@@ -241,21 +213,18 @@ class Calibration(ShortText):
         """Compute N points in the rig frame from their pixels in two or more cameras.
 
         uv_first_px, uv_second_px : (N, 2) pixels in the first and in the second camera. For more
-            cameras, give ``uv_first_px`` alone: a mapping from the camera's name to (N, 2) pixels,
-            which are NaN where this camera does not see the point.
+        cameras, give ``uv_first_px`` alone: a mapping from the camera's name to (N, 2) pixels, NaN
+        where this camera does not see the point.
         sigma_px : noise of the pixels. A number or (N,) are standard deviations in px; (N, 2, 2)
-            are covariances in px^2. It may differ between the cameras: then give a pair, or a
-            mapping from the camera's name. None means the scatter of this calibration's own dots.
+        are covariances in px^2; a pair or a mapping gives each camera its own. None means the
+        scatter of this calibration's own dots.
         method : "ml" (maximum likelihood) or "midpoint" (the point midway between the rays).
         include_calibration : whether ``covariance_mm2`` of the result includes the errors of the
-            calibration. They are common to all points; ``measurement_covariance_mm2`` contains
-            only the noise of the pixels.
-
+        calibration, which are common to all points; ``measurement_covariance_mm2`` never does.
         Returns a `Triangulation`. If the pixels were given by name, its ``ray_miss_mm`` is (N, C),
         with one column for each of the C cameras of this calibration; points that fewer than two
-        cameras see are NaN, and ``unplaced`` is their number.
-        Raises CalibrationError for a single camera or an unknown name, InputError for shapes that
-        do not match.
+        cameras see are NaN, and ``unplaced`` is their number. Raises CalibrationError for a single
+        camera or an unknown name, InputError for shapes that do not match.
         """
         if len(self.cameras) < 2:
             raise CalibrationError(
@@ -332,16 +301,11 @@ class Calibration(ShortText):
         return replace(found, covariance_mm2=covariance.reshape(found.covariance_mm2.shape))
 
     def pair(self, first: str | int, second: str | int) -> Calibration:
-        """Return the calibration of two of the cameras, in the same rig frame.
+        """Return the calibration of two of the cameras (names or indices), in the same rig frame.
 
-        first, second : names or indices of the cameras. ``first`` must stand before ``second`` in
-            `rig.toml`.
-
-        In the result's covariance the pose of the first of the two is taken as exact. Its
-        uncertainty in the rig frame is common to both cameras, so it moves all triangulated points
-        in the same way (an S-transformation of the gauge).
-
-        Raises CalibrationError if a camera does not exist or if the order is wrong.
+        The pose of the first of the two is taken as exact: its uncertainty moves all triangulated
+        points in the same way (an S-transformation of the gauge). Raises CalibrationError if a
+        camera does not exist, or if the two are not in the order of `rig.toml`.
         """
         cameras = [self.camera(first), self.camera(second)]
         a, b = (self.cameras.index(camera) for camera in cameras)
@@ -371,10 +335,8 @@ class Calibration(ShortText):
         )
 
     def sd(self, name: str) -> float:
-        """Return the standard deviation of one parameter of the rig block.
-
-        name : the parameter, as in ``covariance_names``; the result has the unit with which this
-            name ends. The result is 0 for a parameter that was held fixed.
+        """Return the standard deviation of a parameter in ``covariance_names``, 0 if it was held
+        fixed.
 
         Raises InputError, with the most similar name, for one that is no parameter of this rig.
         """
@@ -437,11 +399,8 @@ class Calibration(ShortText):
     def save(self, path: str | Path) -> None:
         """Write `calibration.json`, `covariance.npz`, `dots.csv` and `residuals.csv` into a folder.
 
-        path : the folder, which is created if necessary. If the path ends in ``.json``, only this
-            file is written, and `covariance.npz` beside it.
-
-        What is not known (``joint_names`` empty, ``dots`` or ``residuals`` None) is not written;
-        an old `covariance.npz` is then deleted. All files of a folder appear together.
+        If the path ends in ``.json``, only this file and `covariance.npz` are written. What is not
+        known is not written; an old `covariance.npz` is then deleted. All files appear together.
         """
         from telerig.io.results.manifest import replaced_results
 
@@ -473,11 +432,8 @@ class Calibration(ShortText):
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read a calibration from `calibration.json` and, if it exists, `covariance.npz` beside it.
+    """Read a calibration from a folder or its `calibration.json`, with `covariance.npz` beside it.
 
-    path : the JSON file, or the folder that contains it.
-
-    Returns a `Calibration` without the tables ``dots`` and ``residuals``.
     Raises InputError if a file is missing, was not written by telerig, has a newer schema, or if
     the two files belong to different calibrations.
     """
@@ -527,13 +483,10 @@ def load_calibration(path: str | Path) -> Calibration:
 
 
 def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
-    """Return the calibration of the two cameras that recorded a run.
+    """Return the calibration of the two cameras that recorded a run, by their names.
 
-    calibration : the calibration of two or more cameras.
-    names : names of the run's cameras.
-
-    The calibration is returned unchanged if it has fewer than three cameras, or if ``names`` are
-    not two of its cameras; `check_calibration` then reports the error.
+    It is returned unchanged if it has fewer than three cameras, or if ``names`` are not two of
+    them; `check_calibration` then reports the error.
     """
     known = [camera.name for camera in calibration.cameras]
     if len(known) < 3 or len(names) != 2 or not set(names) <= set(known):
@@ -543,15 +496,11 @@ def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
 
 
 def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:
-    """Read the calibration for a run.
+    """Read the calibration for a run: of its dataset, or from ``files``.
 
-    run : folder of the run.
-    files : None to read results/calibration/calibration.json of the run's dataset; one
-        calibration.json or its folder; or the two camera files of OpenLPT (.txt), first camera
-        first.
-
-    Returns the calibration and the files that were read. Raises InputError when there is no
-    calibration, or when the files do not belong together.
+    files : one calibration.json or its folder, or the two camera files of OpenLPT (.txt). Returns
+    it with the files that were read. Raises InputError when there is none, or when files do not
+    belong together.
     """
     if not files:
         default = run.resolve().parent.parent / "results" / "calibration" / "calibration.json"
@@ -590,16 +539,12 @@ def calibration_from_cameras(
 ) -> Calibration:
     """Make a `Calibration` from cameras that are taken as exactly known.
 
-    cameras : one or more cameras. The frame of the first has to be the rig frame.
-    name : name of the rig.
-    sigma_px : standard deviation of the pixels (px) that `Calibration.triangulate` assumes if none
-        is given.
-    notes : further sentences to keep with the calibration, for example the names of its files.
-
+    The frame of the first has to be the rig frame. sigma_px : standard deviation of the pixels that
+    `Calibration.triangulate` assumes. notes : further sentences, for example the names of its
+    files.
     The result has no free intrinsics, and the covariance of its poses is zero; its first note says
-    that the uncertainty is unknown.
-    Raises CalibrationError if there is no camera, if two cameras have the same name, if the first
-    camera's frame is not the rig frame, or if sigma_px is not positive.
+    that the uncertainty is unknown. Raises CalibrationError if there is no camera, if two have the
+    same name, if the first frame is not the rig frame, or if sigma_px is not positive.
     """
     names = [c.name for c in cameras]
     if not names or len(set(names)) != len(names):

@@ -11,13 +11,7 @@ if TYPE_CHECKING:
 
 
 def summary(calibration: CalibrationFile) -> str:
-    """Return a calibration's summary as text of several lines.
-
-    calibration : the content of `calibration.json`.
-
-    The text begins with the verdict. Then it states the residuals, each camera's parameters with
-    their standard deviations, how the mirror ambiguity was decided, and the notes.
-    """
+    """Return the summary of a `calibration.json` as text: verdict, residuals, parameters, notes."""
     s = calibration.statistics
     if "views" not in s:
         return _imported(calibration)

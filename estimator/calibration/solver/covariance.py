@@ -25,20 +25,16 @@ FULL_COVARIANCE_UP_TO = 4000
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Holds the covariance of all parameters of a calibration with N dots and M used measurements,
-    in physical units.
+    """The covariance of all parameters of a calibration with N dots and M used measurements.
 
-    The first K parameters are those of cameras and views. Poses are expressed in GTSAM's tangent
-    space (rotation, translation) at ``rig_from_...``, with right perturbation.
-
-    names : names of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
-    matrix : (D, D) covariance of all parameters; of cameras and views only (D = K) if there are
-        more than `FULL_COVARIANCE_UP_TO` parameters.
-    dots : (N, 3, 3) covariance of each dot.
-    cross : (K, N, 3) covariance of each dot with cameras and views.
-    rig : P, the size of the rig block.
-    leverage : (M, 2, 2) J C J^T of each used measurement (J its derivative, C the covariance): the
-        share of its noise that the fit absorbs.
+    The first K parameters are those of cameras and views. Poses are in GTSAM's tangent space
+    (rotation, translation) at ``rig_from_...``, with right perturbation.
+    names : of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
+    matrix : (D, D); of cameras and views only (D = K) if there are more than
+    `FULL_COVARIANCE_UP_TO` parameters. dots : (N, 3, 3). cross : (K, N, 3). rig : P, the size of
+    the rig block.
+    leverage : (M, 2, 2) J C J^T of each used measurement: the share of its noise that the fit
+    absorbs.
     units : physical units per unit of the solver, for all K + 3 N parameters.
     """
 
@@ -53,11 +49,8 @@ class JointCovariance:
     def of_rig_and(self, dots: Ints) -> Array:
         """Return the covariance (P + 3 n, P + 3 n) of the rig block and n dots.
 
-        dots : (n,) indices of the dots.
-
-        If the full matrix was not kept, the result uses that dots are independent given cameras and
-        views. Only the two dots of a known distance depend on each other in addition, which is
-        neglected.
+        Without the full matrix, dots count as independent given cameras and views, which neglects a
+        known distance of two dots.
         """
         common = len(self.cross)
         if len(self.names) > common:
@@ -81,10 +74,7 @@ class JointCovariance:
         return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
     def widened(self, offset: Array) -> JointCovariance:
-        """Return the covariance plus offset offset^T.
-
-        offset : (K + 3 N,) an error that all parameters share, in the units of the solver.
-        """
+        """Return the covariance plus offset offset^T, an error (K + 3 N,) in the solver's units."""
         shift = offset * self.units
         whole = shift[: len(self.matrix)]
         common, of_dots = shift[: len(self.cross)], shift[len(self.cross) :].reshape(-1, 3)
@@ -103,14 +93,10 @@ class JointCovariance:
 def joint_covariance(
     problem: Problem, solution: Solution, *, leverage: Array | None = None
 ) -> JointCovariance:
-    """Return the inverse of the information matrix at the solution, from the solver's own
-    factorisation.
-
-    leverage : `JointCovariance.leverage` if it is already known.
+    """Return the inverse of the information matrix at the solution, as the solver factorised it.
 
     A parameter that no measurement determines (the pose of a view that was left out) gets an
-    infinite variance. Raises CalibrationError if the information matrix is singular to working
-    precision.
+    infinite variance. Raises CalibrationError if the information matrix is singular.
     """
     size = slots(problem)["dots"][0].stop
     posterior = solution.equations.posterior(whole=size <= FULL_COVARIANCE_UP_TO)

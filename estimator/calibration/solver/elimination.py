@@ -30,11 +30,9 @@ LEAST_PIVOT = 1e-10
 
 @dataclass(frozen=True)
 class _Images:
-    """Says where one camera's M measurements stand in P factors, each for one view and one group of
-    G dots.
+    """Where one camera's M measurements stand in P factors, one for a view and a group of dots.
 
-    view, group : (P,) indices of each factor's view and group.
-    place : (M,) index of the factor times G, plus the number of the dot in its group.
+    view, group : (P,). place : (M,) factor times G, plus the number of the dot in its group of G.
     """
 
     view: Ints
@@ -45,13 +43,9 @@ class _Images:
 class GraphLayout:
     """Orders the variables of a problem's graph: cameras, then views, then groups of dots.
 
-    The last group is filled up with variables that no measurement touches.
-
-    per_group : number of dots in a group.
-    size : W, the number of scalars in all variables.
-    places : for each variable the indices of its scalars among the W.
-    families : keys (M,) of the variables of one size, and where their scalars stand (M, size).
-    order : keys in the order of elimination.
+    The last group is filled up with variables that no measurement touches. size : W, the number of
+    scalars. places : for each variable the indices of its scalars. families : keys (M,) of the
+    variables of one size, and their scalars (M, size). order : of elimination.
     """
 
     def __init__(self, system: System) -> None:
@@ -96,12 +90,10 @@ class GraphLayout:
 
 
 class GraphEquations:
-    """Holds the Gaussian factor graph of a problem, linearised at one state.
+    """The Gaussian factor graph of a problem, linearised at one state.
 
-    cost : half the sum of squared residuals.
-    square, right : (W,) the diagonal of J^T J, and -J^T r, with J the whitened Jacobian and r the
-        residuals.
-    untouched : (W,) whether no measurement and no prior depends on the scalar.
+    square, right : (W,) the diagonal of J^T J, and -J^T r. untouched : (W,) whether no measurement
+    and no prior depends on the scalar.
     """
 
     def __init__(self, layout: GraphLayout, state: State) -> None:
@@ -116,11 +108,7 @@ class GraphEquations:
         self.scale = 1 / np.sqrt(np.where(self.untouched, 1.0, self.square))
 
     def _padded(self, state: State, camera: int) -> Array:
-        """Return the columns (S + 7, 2, P, G) of a camera with S parameters, with zeros for unseen
-        dots.
-
-        The products of the columns are also added to ``square`` and ``right``.
-        """
+        """Return a camera's columns (S + 7, 2, P, G), 0 for unseen dots; add up their products."""
         layout, where = self.layout, self.layout.images[camera]
         columns = layout.system.columns(state, camera)
         shape = (*columns.shape[:2], len(where.view), layout.per_group)
@@ -220,9 +208,7 @@ class GraphEquations:
             add_linear_factors(graph, [*keys], [*rows[:, None]], np.array([[-off]]))
 
     def _graph(self, damping: float) -> Any:
-        """Return the graph with Marquardt's damping. Scalars that nothing touches are held in
-        place.
-        """
+        """Return the graph with Marquardt's damping; scalars that nothing touches stay in place."""
         import gtsam
 
         graph = gtsam.GaussianFactorGraph()
@@ -236,11 +222,9 @@ class GraphEquations:
         return graph
 
     def _net(self, damping: float) -> Any:
-        """Return the Bayes net, by Cholesky factorisation or, if a pivot is too small for that, by
-        QR.
+        """Return the Bayes net by Cholesky factorisation, or by QR if a pivot is too small.
 
-        A pivot is too small if only one camera sees a view, because only a weak prior then
-        determines the depth of the view along this camera's axis.
+        It is if only one camera sees a view: only a weak prior determines the depth along its axis.
         """
         import gtsam
 
@@ -255,11 +239,9 @@ class GraphEquations:
             raise undetermined() from error
 
     def step(self, damping: float) -> tuple[Array, float]:
-        """Return the step (D,) of the D parameters with Marquardt's damping, and its predicted
-        gain.
+        """Return the step (D,) with Marquardt's damping, and the gain by the linear model.
 
-        The predicted gain is the decrease of the cost according to the linear model. Raises
-        CalibrationError when GTSAM can eliminate the graph neither by Cholesky nor by QR.
+        Raises CalibrationError when GTSAM can eliminate the graph neither by Cholesky nor by QR.
         """
         step = np.empty(self.layout.size)
         step[self.layout.every_place] = self._net(damping).optimize().vector()
@@ -267,12 +249,7 @@ class GraphEquations:
         return step[: self.layout.system.size], float(0.5 * step @ self.right)
 
     def posterior(self, whole: bool) -> Posterior:
-        """Return the inverse of J^T J from the Bayes net of the undamped graph.
-
-        whole : has no effect; the full inverse is always returned.
-
-        Raises CalibrationError if J^T J is singular to working precision.
-        """
+        """Return the inverse of J^T J, always in full; CalibrationError if it is singular."""
         del whole
         root, place = self._square_root()
         inverse, failed = dpotri(root, lower=0, overwrite_c=1)

@@ -26,11 +26,7 @@ from telerig.factors.custom_factors import (
 
 
 def keys_of(problem: Problem) -> Keys:
-    """Return the GTSAM keys of a problem's variables.
-
-    They are k0, k1, ... for intrinsics, c1, ... for camera poses, v0, ... for views and d0, ... for
-    dots.
-    """
+    """Return GTSAM's keys: k0, ... intrinsics, c1, ... cameras, v0, ... views, d0, ... dots."""
     import gtsam
 
     cameras = range(len(problem.cameras))

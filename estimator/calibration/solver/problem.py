@@ -56,10 +56,7 @@ DOTS_FREE = ("3d", "plane", "nominal")
 
 
 def checked_outlier_sd(outlier_sd: float) -> float:
-    """Return ``outlier_sd`` unchanged after a check.
-
-    Raises InputError if it is not finite, or so small that correct dots would be left out.
-    """
+    """Return ``outlier_sd``; InputError if it is not finite or would leave out correct dots."""
     if not LEAST_OUTLIER_SD <= outlier_sd < np.inf:
         raise InputError(
             f"dots beyond {outlier_sd:g} standard deviations cannot be distinguished from "
@@ -71,27 +68,19 @@ def checked_outlier_sd(outlier_sd: float) -> float:
 
 @dataclass(frozen=True)
 class Problem:
-    """Holds the measurements, priors and free parameters of one self-calibration.
+    """The measurements, priors and free parameters of one self-calibration.
 
-    There are C cameras, V views, N dots and M measured dots.
-
-    cameras : the nominal cameras; the first one defines the rig frame.
-    views : names of the views.
-    dot_ids : (N,) ids of the dots, sorted.
-    nominal_mm, dot_sigma_mm : (N, 3) nominal position of each dot, and the standard deviations of
-        the true position from it.
-    view, camera, dot : (M,) indices of each measurement.
-    uv_px : (M, 2).
-    covariance_px2 : (M, 2, 2) of each measurement, without weights.
-    weight : (M,) weights from 0 to 1.
+    There are C cameras, V views, N dots and M measured dots. The first camera is the rig frame.
+    nominal_mm, dot_sigma_mm : (N, 3) nominal position of each dot, and standard deviations from it.
+    view, camera, dot : (M,) indices of each measurement. uv_px : (M, 2). covariance_px2 : (M, 2,
+    2), without weights. weight : (M,) from 0 to 1.
     free : for each camera the names of its free intrinsics.
     scale : ((dot index, dot index), distance_mm, sigma_mm) of two dots whose distance is known;
-        None if the nominal positions set the scale.
-    plate_shift : (V, C) as in `Observations`.
-    solver : "gtsam", "schur", or "auto" for the one that suits the size of the problem.
-    outlier_sd : number of standard deviations beyond which a dot is left out.
+    None if the nominal positions set the scale.
+    plate_shift : (V, C) as in `Observations`. solver : "gtsam", "schur" or "auto". outlier_sd :
+    number of standard deviations beyond which a dot is left out.
     hold_scales : where all lenses have perspective, hold their scales at the nominal ones. The
-        depth of each camera's origin is then where its scale is that, not where the axes meet.
+    depth of each camera's origin is then where its scale is that, not where the axes meet.
     """
 
     cameras: tuple[Camera, ...]
@@ -162,13 +151,7 @@ class Problem:
         )  # fmt: skip
 
     def with_model(self, model: str | Sequence[str]) -> Problem:
-        """Return the same problem with other free intrinsics.
-
-        model : the name of a model for all cameras, or one name for each; see
-            `telerig.rig.lens_parameters`.
-
-        Raises CalibrationError for an unknown name.
-        """
+        """Return the problem with the free intrinsics of a model, for all cameras or for each."""
         names = [model] * len(self.cameras) if isinstance(model, str) else list(model)
         free = (
             ("scale_px_per_mm", *parameters_of(n), *wall_freedom(c))
@@ -190,10 +173,7 @@ class Problem:
 
 
 def whitening(covariance: Array) -> Array:
-    """Return the inverses of the lower Cholesky factors of covariances, both (M, 2, 2).
-
-    Raises numpy.linalg.LinAlgError if a covariance is not positive definite.
-    """
+    """Return the inverses of the lower Cholesky factors of covariances, both (M, 2, 2)."""
     first, second, mixed = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 1, 0]
     rest = second * first - mixed * mixed
     if not (np.all(first > 0) and np.all(rest > 0)):
@@ -266,12 +246,10 @@ IMPOSSIBLE_SD = 20.0
 def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Target) -> Problem:
     """Return a `Problem` with every measured dot, in which only the scales of the cameras are free.
 
-    dots : table with the columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
-
-    Raises InputError for values that are not finite, covariances that are not positive definite,
-    cameras or dots that the rig does not have, and rows given twice. Raises CalibrationError if
-    there are no dots, if the dots that set the scale are never seen, or if their distance
-    contradicts their nominal positions.
+    dots : table with the columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2. Raises
+    InputError for values or covariances that are impossible, unknown cameras or dots, and repeated
+    rows; CalibrationError for no dots, and for a scale that is never seen or contradicts the
+    nominal positions.
     """
     if len(dots) == 0:
         raise CalibrationError(
@@ -367,8 +345,7 @@ def _scale(target: Target, ids: NDArray[np.int64]) -> tuple[tuple[int, int], flo
 
 
 def _check_distance(target: Target) -> None:
-    """Raise CalibrationError if the stated distance is impossible, given the nominal positions and
-    their tolerance."""
+    """Raise CalibrationError if the stated distance contradicts the nominal positions."""
     assert target.scale_dots is not None and target.scale_distance_mm is not None
     ends = target.nominal_mm(np.array(target.scale_dots))
     nominal = float(np.linalg.norm(ends[1] - ends[0]))
@@ -384,12 +361,10 @@ def _check_distance(target: Target) -> None:
 
 
 def eccentricity_px(problem: Problem, state: State, rings: int = 2, spokes: int = 8) -> Array:
-    """Return the centre of area of each projected disc minus the projection of its centre (M, 2),
-    in px.
+    """Return each projected disc's centre of area minus its centre's projection (M, 2), in px.
 
-    The result has one row for each of the M measured dots. Each disc is sampled at ``rings`` radii
-    (Gauss-Legendre points in r^2) and ``spokes`` equal angles. Each sample is weighted by the area
-    that it covers in the image.
+    Each disc is sampled at ``rings`` radii (Gauss-Legendre points in r^2) and ``spokes`` equal
+    angles, weighted by the area that a sample covers in the image.
     """
     obs = problem.unweighted()
     radius = problem.target.diameter_mm(problem.dot_ids) / 2
@@ -417,16 +392,13 @@ def _shifted(state: State, shift_mm: Array) -> State:
 
 @dataclass(frozen=True)
 class Priors:
-    """Holds whitened residuals other than those of images, and their derivatives.
+    """Whitened residuals other than those of images, and their derivatives.
 
-    cameras : for each camera the residuals (r,) of the weak priors and the depth gauge, and their
-        derivatives (r, S) with respect to the camera's S parameters: its free intrinsics and,
-        except for the first camera, its pose.
-    views : residuals (V, 3) and derivatives (V, 3, 6) of the weak priors on the V views' positions.
-    dots : residuals (N, 3) of the N dots' nominal positions, and the diagonal (N, 3) of their
-        derivatives.
-    distance : indices of the two dots of a known distance, its residual, and the derivative (3,)
-        with respect to the first dot; None if no distance is known.
+    cameras : for each camera the residuals (r,) of weak priors and depth gauge, and derivatives (r,
+    S) by its S parameters: free intrinsics and, except for the first camera, the pose.
+    views : (V, 3) and (V, 3, 6) of the weak priors on positions. dots : (N, 3) of the nominal
+    positions, and the diagonal (N, 3) of their derivatives. distance : two dots of a known
+    distance, its residual, and the derivative (3,) by the first dot; None if none is known.
     """
 
     cameras: list[tuple[Array, Array]]
@@ -445,12 +417,9 @@ class Priors:
 class System:
     """Computes the residuals of a problem as functions of the state.
 
-    images : for each camera its measurements, sorted by view and dot.
-    rows : for each camera the rows of these measurements in `Problem.observations`.
-    camera_places : for each camera the indices of its S parameters among all D: free intrinsics,
-        then pose.
-    views_at, dots_at : index of the first parameter of the views and of the dots.
-    size : D, the number of all parameters.
+    images : for each camera its measurements, sorted by view and dot. rows : their rows in
+    `Problem.observations`. camera_places : for each camera the indices of its S parameters among
+    all D. views_at, dots_at : first parameter of the views and of the dots. size : D.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -477,13 +446,7 @@ class System:
         self.images = [_components_first(observations.subset(rows)) for rows in self.rows]
 
     def columns(self, state: State, camera: int, rows: slice = slice(None)) -> Array:
-        """Return `image_columns` (S + 7, 2, M) of M measurements of a camera.
-
-        The derivatives are with respect to the parameters in the units of a step
-        (`parameter_unit`).
-
-        rows : which of the camera's measurements are used.
-        """
+        """Return `image_columns` (S + 7, 2, M) of a camera, in units of `parameter_unit`."""
         obs = self.images[camera].subset(rows)
         out = image_columns(
             state, obs, camera, self.problem.rho_mm[camera], self.free[camera].tolist()

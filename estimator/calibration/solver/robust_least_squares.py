@@ -43,11 +43,7 @@ Equations = GraphEquations | NormalEquations
 
 @dataclass(frozen=True)
 class Solution:
-    """Holds the state at the minimum.
-
-    cost : half the sum of squared whitened residuals, including those of the priors.
-    equations : the linearised equations at the state.
-    """
+    """The state at the minimum, its cost with priors, and the linearised equations there."""
 
     state: State
     cost: float
@@ -69,11 +65,7 @@ def is_large(problem: Problem) -> bool:
 
 
 def linearisation(problem: Problem) -> tuple[System, Callable[[State], Equations]]:
-    """Return the problem's residuals, and a function that returns its linearised equations at a
-    state.
-
-    The equations are those of the solver that ``problem.solver`` asks for.
-    """
+    """Return the problem's residuals, and its solver's equations as a function of the state."""
     system = System(problem)
     if problem.solver == "schur" or (problem.solver == "auto" and is_large(problem)):
         return system, lambda state: NormalEquations(system, state)
@@ -89,10 +81,7 @@ def solve(
     relative: float = 1e-11,
     progress: Progress | None = None,
 ) -> Solution:
-    """Minimise the cost by Levenberg-Marquardt steps from a start.
-
-    The damping has Marquardt's scaling. The iteration ends when a step gains less than ``relative``
-    times the cost.
+    """Minimise the cost by Levenberg-Marquardt steps, until a step gains less than ``relative``.
 
     Raises CalibrationError if the cost at the start is not finite, or if the measurements leave a
     direction of the calibration undetermined.
@@ -129,10 +118,7 @@ def solve(
 
 
 def _at(linearised: Callable[[State], Equations], state: State) -> Equations | None:
-    """Return the equations at a state, or None if the cost is not finite there.
-
-    The cost is not finite if a camera cannot see a dot through its window at all.
-    """
+    """Return the equations, or None where the cost is not finite (a window hides a dot)."""
     try:
         equations = linearised(state)
     except GeometryError:
@@ -148,12 +134,7 @@ _MEDIAN = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 @dataclass(frozen=True)
 class RobustFit:
-    """Holds the result of a robust fit.
-
-    problem : the problem with the final weights and covariances.
-    solution : its solution.
-    floor_px : standard deviation of the scatter beyond the stated noise of the dots.
-    """
+    """The problem with final weights and covariances, its solution, and the noise floor."""
 
     problem: Problem
     solution: Solution
@@ -174,14 +155,11 @@ def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:
 
 
 def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float) -> float:
-    """Return the standard deviation of the residuals' scatter beyond their own covariance.
+    """Return the sd of the residuals' scatter (M, 2) beyond their own covariance (M, 2, 2).
 
-    The scatter is taken as equal in all directions; 0 is returned if it is not significant. It
-    follows from the median of the squared distances, so up to half of the dots may be wrong.
-
-    residual_px : (M, 2).
-    covariance_px2 : (M, 2, 2).
-    dof_per_row : degrees of freedom divided by the number of measured coordinates.
+    It is equal in all directions, 0 if not significant, and follows from the median of the squared
+    distances, so up to half of the dots may be wrong. dof_per_row : degrees of freedom per
+    coordinate.
     """
     expected = _MEDIAN * dof_per_row
 
@@ -211,10 +189,7 @@ def robust_solve(
     """Return the robust fit from a start.
 
     Each round solves the problem, estimates the noise floor and reduces the weight of dots beyond a
-    limit. The limit decreases from round to round to ``problem.outlier_sd``. The rounds end when
-    the set of kept dots no longer changes.
-
-    rounds : the largest number of rounds.
+    limit, which decreases to ``problem.outlier_sd``, until the set of kept dots no longer changes.
     """
     base, least = problem.covariance_px2, problem.outlier_sd
     problem = replace(problem, weight=np.ones(len(problem.view)))

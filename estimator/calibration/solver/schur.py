@@ -42,16 +42,11 @@ def undetermined() -> CalibrationError:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Holds the inverse of J^T J, or those parts of it that were asked for.
+    """The inverse of J^T J, or those parts of it that were asked for.
 
-    There are K parameters of cameras and views, and N dots.
-
-    common : (K, K) of cameras and views.
-    cross : (K, N, 3) of cameras and views with each dot.
-    dots : (N, 3, 3) of each dot.
-    whole : (K + 3 N, K + 3 N), or None if it was not asked for.
-    untouched : (K + 3 N,) whether no measurement and no prior depends on the parameter. Its
-        variance is 1 here.
+    common : (K, K) of cameras and views. cross : (K, N, 3) of these with each dot. dots : (N, 3,
+    3). whole : (K + 3 N, K + 3 N), or None. untouched : (K + 3 N,) whether nothing measured depends
+    on the parameter, whose variance is 1 here.
     """
 
     common: Array
@@ -71,13 +66,10 @@ class Posterior:
 
 
 class NormalEquations:
-    """Holds J^T J and -J^T r in blocks, for K parameters of cameras and views and N dots.
+    """J^T J and -J^T r in blocks, for K parameters of cameras and views and N dots.
 
-    common : (K, K) of cameras and views.
-    dots : (3, 3, N) of each dot.
-    cross : (K, 3, N) of cameras and views with each dot.
-    right : (K + 3 N,) -J^T r.
-    cost : half the sum of squared residuals.
+    common : (K, K). dots : (3, 3, N). cross : (K, 3, N). right : (K + 3 N,) -J^T r. cost : half the
+    sum of squared residuals.
     """
 
     def __init__(self, system: System, state: State) -> None:
@@ -111,8 +103,7 @@ class NormalEquations:
         return np.arange(self.system.views_at, self.system.dots_at).reshape(-1, 6)
 
     def _add(self, at: Ints, jacobian: Array, value: Array) -> None:
-        """Add the contribution of a residual ``value`` whose derivatives belong to the parameters
-        ``at``."""
+        """Add a residual whose derivatives belong to the parameters ``at``."""
         self.common[np.ix_(at, at)] += jacobian.T @ jacobian
         self.right[at] -= jacobian.T @ value
 
@@ -154,21 +145,15 @@ class NormalEquations:
         self.squared += float(gram[:, -1, -1].sum())
 
     def step(self, damping: float) -> tuple[Array, float]:
-        """Return the step (K + 3 N,) with Marquardt's damping, and its predicted gain.
+        """Return the step (K + 3 N,) with Marquardt's damping, and the gain by the linear model.
 
-        The predicted gain is the decrease of the cost according to the linear model. Raises
-        CalibrationError if the measurements leave a direction undetermined.
+        Raises CalibrationError if the measurements leave a direction undetermined.
         """
         step = self._schur_complement(damping).solve(self.right)
         return step, float(0.5 * step @ self.right)
 
     def posterior(self, whole: bool) -> Posterior:
-        """Return the inverse of J^T J, from the same factorisation as a step.
-
-        whole : whether the full inverse is wanted, with the covariances between dots.
-
-        Raises CalibrationError if J^T J is singular.
-        """
+        """Return the inverse of J^T J, with ``whole`` in full; CalibrationError if singular."""
         reduced, size = self._schur_complement(0.0), len(self.common)
         if whole:
             return Posterior.of(reduced.inverse(), size, self.untouched)
@@ -191,10 +176,9 @@ class NormalEquations:
         return SchurComplement.of(*self._kept_and_eliminated(damping))
 
     def _kept_and_eliminated(self, damping: float) -> tuple[Ints, Ints, Array, Array, Array]:
-        """Return which parameters are kept and eliminated, and the damped blocks K, E and D.
+        """Return kept (m,) and eliminated (B, n) parameters, and the damped blocks K, E and D.
 
-        With m kept parameters and B eliminated blocks of n parameters, the indices are (m,) and (B,
-        n), and the blocks are K (m, m), E (m, n, B) and D (B, n, n).
+        K is (m, m), E (m, n, B) and D (B, n, n).
         """
         size, count = len(self.common), self.dots.shape[-1]
         common = _damped(self.common, damping)
@@ -230,10 +214,7 @@ class NormalEquations:
         return kept, views, matrix, coupling, common[views[:, :, None], views[:, None]]
 
     def _of_dots(self, dots: Array, some: Ints, damping: float) -> Array:
-        """Return the damped information (3 n, 3 n) of n dots, including that of the known distance.
-
-        some : (n,) indices of the dots.
-        """
+        """Return the damped information (3 n, 3 n) of n dots, with that of the known distance."""
         out = np.zeros((len(some), 3, len(some), 3))
         each = np.arange(len(some))
         out[each, :, each] = dots[some]
@@ -248,13 +229,10 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class SchurComplement:
-    """Holds the factorised Schur complement, with m kept parameters and B eliminated blocks of n
-    parameters.
+    """The factorised Schur complement, with m kept parameters and B eliminated blocks of n.
 
-    kept, eliminated : (m,) and (B, n) indices among all parameters.
-    root : (B, n, n) inverse of W.
-    coupling : (m, n B) F. Its columns are ordered by component, then by block.
-    factor : lower Cholesky factor of S, in Fortran order.
+    kept, eliminated : (m,) and (B, n). root : (B, n, n) inverse of W. coupling : (m, n B) F, by
+    component, then by block. factor : lower Cholesky factor of S, in Fortran order.
     """
 
     kept: Ints
@@ -267,11 +245,7 @@ class SchurComplement:
     def of(
         kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Array
     ) -> SchurComplement:
-        """Return the factorisation of the blocks.
-
-        matrix : (m, m) K; it is overwritten.
-        coupling : (m, n, B) E.
-        blocks : (B, n, n) D.
+        """Return the factorisation of K (m, m), which is overwritten, E (m, n, B) and D (B, n, n).
 
         Raises CalibrationError if a block or the Schur complement is not positive definite.
         """
@@ -309,10 +283,7 @@ class SchurComplement:
         return np.asarray(lower + np.tril(lower, -1).T)
 
     def _whitened_coupling(self) -> Array:
-        """Return T (m, B, n) = chol(S)^-1 F W^-1.
-
-        D^-1 + T^T T is the block of the inverse that belongs to the eliminated parameters.
-        """
+        """Return T (m, B, n) = chol(S)^-1 F W^-1; the eliminated inverse is D^-1 + T^T T."""
         half = dtrsm(1.0, self.factor, self.coupling, lower=1).reshape(
             len(self.kept), -1, len(self.root)
         )
@@ -337,10 +308,7 @@ class SchurComplement:
     def inverse_blocks(self, size: int) -> tuple[Array, Array, Array]:
         """Return the blocks (K, K), (K, N, 3) and (N, 3, 3) of the inverse, as in `Posterior`.
 
-        If dots are eliminated, the blocks are computed directly; otherwise they are taken from the
-        full inverse.
-
-        size : K, the number of parameters of cameras and views.
+        They are computed directly if dots are eliminated, otherwise from the full inverse.
         """
         if self.root.shape[1] != 3:
             found = Posterior.of(self.inverse(), size, np.zeros(0, bool))
@@ -360,10 +328,7 @@ class SchurComplement:
 
 
 def _in_chunks(images: Sequence[tuple[int, int, int]]) -> list[Sequence[tuple[int, int, int]]]:
-    """Return the images in consecutive chunks of about `CHUNK` measurements.
-
-    images : (view, first row, last row + 1) of each image.
-    """
+    """Return the images (view, first row, last row + 1) in chunks of about `CHUNK` measurements."""
     ends = [end for _, _, end in images]
     parts = max(1, round(max(ends, default=0) / CHUNK))
     cuts = np.unique(np.searchsorted(ends, np.linspace(0, max(ends, default=0), parts + 1)[1:]) + 1)
@@ -371,11 +336,7 @@ def _in_chunks(images: Sequence[tuple[int, int, int]]) -> list[Sequence[tuple[in
 
 
 def _damped(matrix: Array, damping: float) -> Array:
-    """Return matrices (..., n, n) with Marquardt's damping.
-
-    A parameter that no measurement touches, for instance in a view that was left out, stays in
-    place.
-    """
+    """Return matrices (..., n, n) with Marquardt's damping; untouched parameters stay in place."""
     out = matrix.copy()
     i = np.arange(matrix.shape[-1])
     diagonal = matrix[..., i, i]

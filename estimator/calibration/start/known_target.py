@@ -33,9 +33,9 @@ _MIRROR = np.outer(_FLIP, _FLIP)
 class ImageMap:
     """The map of the target's plane in one image, at the point imaged to the image centre.
 
-    jacobian : (2, 2) px/mm; offset_px : (2,) pixels of the target origin minus the image centre;
-    perspective : (2,) relative change of scale per mm of the target's x and y (0 if affine);
-    misfit : RMS distance of the dots from the map, over their RMS distance from their mean.
+    jacobian : (2, 2) px/mm. offset_px : (2,) of the target origin from the image centre.
+    perspective : (2,) relative change of scale per mm. misfit : RMS distance of the dots from the
+    map, over their spread.
     """
 
     jacobian: Array
@@ -45,10 +45,7 @@ class ImageMap:
 
 
 def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageMap]:
-    """Return the map of each image that has at least four dots, by (view, camera).
-
-    dots_mm : (N, 3) or (N, 2) positions of the dots in the target's frame.
-    """
+    """Return the map of each image that has at least four dots, by (view, camera)."""
     out = {}
     for v in range(len(problem.views)):
         for c, camera in enumerate(problem.cameras):
@@ -84,12 +81,7 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
 
 
 def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
-    """Return the rotation camera_from_target (3, 3) and the scale in px/mm from an image's map.
-
-    jacobian : (2, 2) in px/mm, derivative of the pixel with respect to the target's x and y.
-
-    The rotation is one of two: its mirror image (see `mirrored`) gives the same map.
-    """
+    """Return camera_from_target (3, 3), up to its mirror image, and the scale (px/mm) of a map."""
     _, singular, vt = np.linalg.svd(jacobian)
     top = jacobian / singular[0]
     sine = np.sqrt(max(0.0, 1 - (singular[1] / singular[0]) ** 2))
@@ -101,12 +93,9 @@ def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
 
 
 def mirrored(rotation: Array) -> Array:
-    """Return the rotations (..., 3, 3) in the mirror image of the scene.
+    """Return rotations (..., 3, 3) in the mirror image of the scene, D R D with D = diag(1, 1, -1).
 
-    The mirror reverses the depth z of every camera's frame: R becomes D R D with
-    D = diag(1, 1, -1). A telecentric camera gives the same image of both.
-
-    rotation : (..., 3, 3) camera_from_target, or the rotation between two cameras.
+    A telecentric camera gives the same image of both.
     """
     return rotation * _MIRROR
 
@@ -118,11 +107,10 @@ def angle_between(a: Array, b: Array) -> Array:
 
 
 def rotation_hypotheses(first: Array, second: Array, count: int = 3) -> list[Array]:
-    """Inter-camera rotations second_from_first that one choice of signs per view can explain.
+    """Return rotations second_from_first that one choice of signs per view can explain, best first.
 
-    first, second : (V, 3, 3) camera_from_target, each up to its own mirror image. The best
-    ``count`` hypotheses, best first, none the mirror image of another (both explain the same). Each
-    pair of candidates of every view is tried and refined by averaging.
+    first, second : (V, 3, 3) camera_from_target, each up to its mirror image. Each pair of
+    candidates of every view is tried and refined by averaging; none is the mirror image of another.
     """
     plain = second @ np.swapaxes(first, -1, -2)
     crossed = mirrored(second) @ np.swapaxes(first, -1, -2)
@@ -152,11 +140,10 @@ def _refined(rotation: Array, plain: Array, crossed: Array) -> tuple[Array, floa
 
 
 def stereo_states(problem: Problem, dots_mm: Array, count: int = 2) -> list[State]:
-    """Starting states of two cameras or more, best first.
+    """Return starting states of two cameras or more, best first, up to the mirror ambiguity.
 
-    count : inter-camera rotations that are tried for each pair of cameras that share views. Which
-    of the two mirror solutions each state is, is open.
-    Raises CalibrationError where no chain of shared views connects all cameras.
+    count : rotations tried for each pair of cameras. Raises CalibrationError where no chain of
+    shared views connects all cameras.
     """
     maps = image_maps(problem, dots_mm)
     rotations = {k: rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
@@ -170,11 +157,10 @@ def stereo_states(problem: Problem, dots_mm: Array, count: int = 2) -> list[Stat
 def _camera_rotations(
     rotations: dict[tuple[int, int], Array], problem: Problem, count: int
 ) -> list[Array]:
-    """(C, 3, 3) camera_from_rig of every start worth trying, best first.
+    """Return camera_from_rig (C, 3, 3) of every start worth trying, best first.
 
-    Along a tree of cameras that share views, each pair has ``count`` rotations, and either may
-    be mirrored against the pair before it. Views of three cameras rank the combinations; the best
-    2^(C - 1) are kept, which are as many as a chain of pairs leaves open.
+    Along a tree of cameras that share views, each pair has ``count`` rotations, and either may be
+    mirrored. Views of three cameras rank the combinations; the best 2^(C - 1) are kept.
     """
     edges = overlap_tree(problem, set(rotations))
     hypotheses: list[list[Array]] = []
@@ -198,10 +184,9 @@ def _camera_rotations(
 
 
 def overlap_tree(problem: Problem, images: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Pairs of cameras (parent, child) that share the most views, from the first camera on.
+    """Return pairs of cameras (parent, child) that share most views, from the first camera on.
 
-    images : (view, camera) that can be used. Raises CalibrationError where the cameras fall into
-    groups without a common view.
+    Raises CalibrationError where the cameras fall into groups without a common view.
     """
     count = len(problem.cameras)
     seen = np.zeros((len(problem.views), count))
@@ -236,10 +221,7 @@ def overlap_tree(problem: Problem, images: set[tuple[int, int]]) -> list[tuple[i
 def _signs(
     rotations: dict[tuple[int, int], Array], cameras: Array, problem: Problem
 ) -> tuple[dict[int, Array], float]:
-    """rig_from_target rotation of each view, with the tilt signs that agree in all its cameras.
-
-    cameras : (C, 3, 3) camera_from_rig. Also the sum of the squared angles between the cameras.
-    """
+    """Return rig_from_target rotations with tilt signs that agree, and the squared angles' sum."""
     out, cost = {}, 0.0
     for v in range(len(problem.views)):
         seen = [c for c in range(len(cameras)) if (v, c) in rotations]
@@ -280,10 +262,7 @@ def _assemble(
     rotations: dict[int, Array],
     camera_from_rig: Array | None,
 ) -> State:
-    """Scales, view positions and baselines that go with the rotations.
-
-    camera_from_rig : (C, 3, 3) rotations, None for a single camera.
-    """
+    """Return a state: scales, view positions and baselines that go with the rotations."""
     state = nominal_state(problem)
     intrinsics, views, cameras = (
         state.intrinsics.copy(), state.rig_from_target.copy(), state.rig_from_camera.copy(),
@@ -320,10 +299,7 @@ def _assemble(
 def _place_by_scales(
     state: State, maps: dict[tuple[int, int], ImageMap], shifts: dict[tuple[int, int], Array]
 ) -> None:
-    """Place views and the second camera by how large the target looks, in place.
-
-    Nearly parallel axes tell no depth, but perspective does: x = X / (1 + kappa Z).
-    """
+    """Place views and the second camera by how large the target looks, in place (perspective)."""
     scale, kappa = (state.intrinsics[:, INDEX[n]] for n in ("scale_px_per_mm", "kappa_per_mm"))
     seen: dict[tuple[int, int], Array] = {}
     for (v, c), m in maps.items():
@@ -341,10 +317,7 @@ def _place_by_scales(
 def perspective_from_maps(
     maps: dict[tuple[int, int], ImageMap], state: State, camera: int
 ) -> float:
-    """kappa of one camera (1/mm) from how the scale changes over each tilted view.
-
-    The weighted median over the views, so that one with wrong dots does not decide.
-    """
+    """Return a camera's kappa (1/mm): the weighted median of scale changes over tilted views."""
     turn = state.rig_from_camera[camera, :3, :3].T
     kappas, weights = [], []
     for (v, c), m in maps.items():
@@ -363,8 +336,7 @@ def perspective_from_maps(
 def _place_views(views: Array, shifts: dict[tuple[int, int], Array], cameras: Array) -> Array:
     """Write each view's translation; return the cameras' (C, 2) offsets, gauge-fixed.
 
-    Along the image of the first axis in the second camera the offset trades with every depth and
-    is held at zero.
+    Along the image of the first axis in the second camera the offset is held at zero.
     """
     if len(cameras) == 2:
         return np.array([np.zeros(2), _place_views_of_two(views, shifts, cameras[1])])
@@ -387,9 +359,7 @@ def _place_views(views: Array, shifts: dict[tuple[int, int], Array], cameras: Ar
 def _place_views_of_two(
     views: Array, shifts: dict[tuple[int, int], Array], second_from_first: Array
 ) -> Array:
-    """`_place_views` for two cameras, with medians: across the first axis the offset is the mean
-    disagreement.
-    """
+    """`_place_views` for two cameras: the offset is the median disagreement."""
     along = second_from_first[:2, 2]
     length = np.linalg.norm(along)
     along = along / length

@@ -78,9 +78,8 @@ def consistent_start(
 ) -> State:
     """Return the best of several roughly fitted starts, up to its own mirror image.
 
-    costs : of the fits. Of those that fit alike, the one nearest to the nominal rotations, itself
-    or its mirror image.
-    Raises CalibrationError where the nominal rotations do not tell them apart.
+    Of those that fit alike it is the one nearest to the nominal rotations. Raises CalibrationError
+    where these do not tell them apart.
     """
     best = int(np.argmin(costs))
     if len(problem.cameras) == 2:
@@ -146,10 +145,9 @@ def perspective_sign(state: State, problem: Problem) -> int:
 
 
 def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
-    """Return the solution with which the final fit starts.
+    """Return the solution with which the final fit starts; with one camera it stays undecided.
 
-    One camera: undecided. The plate's refraction decides where no nominal rotation is given.
-    Raises CalibrationError as `choose_solution` does.
+    The plate's refraction decides where no nominal rotation is given. Raises as `choose_solution`.
     """
     if len(problem.cameras) == 1:
         words = "one camera: the mirrored solution has the same pixels and nothing decides"
@@ -165,8 +163,7 @@ def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) ->
 def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
     """Return the solution that the nominal rotations or strong perspective decide for.
 
-    Raises CalibrationError when both solutions are alike far from the nominal rotation, when
-    nothing decides, or when nominal rotation and perspective contradict each other.
+    Raises CalibrationError when nothing decides, or when these contradict each other.
     """
     other = mirrored_state(state)
     perspective = perspective_sign(state, problem)
@@ -230,8 +227,8 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
 def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
     """Return the cost of the mirror image of a solution with this state and cost.
 
-    Raises CalibrationError when it is far lower: the plate's refraction decides against the side
-    that the nominal rotation names.
+    Raises CalibrationError when it is far lower: the plate's refraction contradicts the nominal
+    rotation.
     """
     if len(problem.cameras) == 1:
         return cost
@@ -262,10 +259,8 @@ def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
 def with_tilt_signs(problem: Problem, state: State) -> State:
     """Return the state in which views seen alone have the tilts that agree with the relief.
 
-    With one camera every view is of this kind: the signs come out right up to the mirror
-    ambiguity of the whole. First all at once, from the reliefs that the views show
-    (`_from_relief`), then one by one, by the cost of each view's two poses. Dots that are wrong
-    under any sign are left out before.
+    With one camera every view is of this kind, up to the mirror ambiguity of the whole. All signs
+    are set by `_from_relief`, then each by the cost of the view's two poses.
     """
     alone, cameras = views_seen_alone(problem)
     relief = float(problem.dot_sigma_mm[:, 2].max())

@@ -23,7 +23,7 @@ TIE_DEG = 15.0
 
 
 def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[Problem, list[str]]:
-    """Images renumbered so that all cameras and all views agree, and notes on how it was decided.
+    """Return images renumbered so that cameras and views agree, and notes on how it was decided.
 
     Raises CalibrationError when two numberings explain two cameras alike.
     """
@@ -81,10 +81,7 @@ def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:
 def _numbered_alike_in_cameras(
     problem: Problem, labels: list[Ints], nominal_rotvec_deg: Nominal
 ) -> Problem:
-    """In each view, the numberings of all cameras turned to that of the first that sees it.
-
-    Pair by pair: first those of the tree of cameras that share most views, then the others.
-    """
+    """Return the numberings of all cameras, turned to that of the first that sees the view."""
     images = set(known_target.image_maps(problem, problem.nominal_mm))
     tree = known_target.overlap_tree(problem, images)
     order = [0, *(c for _, c in tree)]
@@ -125,10 +122,7 @@ def _numbered_alike_in_pair(
     pair: tuple[int, int],
     nominal: Array | None,
 ) -> Problem:
-    """The turn of one camera's numbering that one rotation against the other explains.
-
-    both : views that the two cameras see. nominal : (3, 3) of the second from the first.
-    """
+    """Return the turn of one camera's numbering that one rotation against the other explains."""
     first, second = pair
     maps = known_target.image_maps(problem, problem.nominal_mm)
     rotation = {k: known_target.rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
@@ -234,10 +228,7 @@ def _scatter(marks: Array) -> float:
 
 
 def _print_errors(problem: Problem, state: State) -> Array:
-    """(V, N, 2) where each view sees the dots, minus nominal, in the target's plane (mm).
-
-    NaN for dots that it does not see.
-    """
+    """Return (V, N, 2) where views see dots, minus nominal, in the target's plane (mm)."""
     obs = problem.observations()
     jac = whitened_residuals(state, obs, problem.rho_mm)
     normal = np.zeros((len(problem.views), len(problem.dot_ids), 2, 2))

@@ -26,10 +26,7 @@ _SWEEPS = 200
 
 
 def dots_from_images(problem: Problem) -> Array:
-    """(N, 3) dot positions in a frame of the target, from pixels and the known distance alone.
-
-    The frame is turned and shifted (never stretched) to lie best on the nominal positions, so
-    that priors and ids keep their meaning.
+    """Return dot positions (N, 3), from pixels and the known distance, nearest to the nominal ones.
 
     Raises CalibrationError when the views do not determine the target's shape.
     """

@@ -1,23 +1,18 @@
-"""Estimates how the cameras have moved relative to each other since the calibration, from the ray
-misses of the pairs of a tracked run.
+"""How the cameras have moved relative to each other since the calibration, from ray misses.
 
 The two rays of a pair miss each other along the common perpendicular n of both lines of sight. If
 the second camera has moved by v and rotated by w, the ray miss at a rig point p is n . (v + w x p),
-which is a constant plus a slope along both lines of sight. Ray misses therefore identify three of
-the six components of the pose between two telecentric cameras, at any angle between them: the shift
-along n, and the two rotations about axes perpendicular to n (roll about the second camera's own
-axis, and pitch about the axis perpendicular to that). Shifts in the plane of the lines of sight and
-the angle between the cameras (rotation about n) move the triangulated point but cause no ray miss;
-they keep their calibrated values. With perspective lenses more components are identifiable, and
-these are estimated too.
-
+a constant plus a slope along both lines of sight. Ray misses therefore identify three of the six
+components of the pose between two telecentric cameras: the shift along n, and the two rotations
+about axes perpendicular to n (roll about the second camera's own axis, and pitch). The others move
+the triangulated point but cause no ray miss; they keep their calibrated values. With perspective
+lenses more components are identifiable, and are estimated too.
 The noise of ray misses comes from pixels, differential shake and bubbles that change shape. It is a
-Gaussian process in time, whose hyper-parameters are learned from the ray misses themselves: white
-noise of each pair, damped oscillations that are common to all pairs of a frame (shake), and an
-Ornstein-Uhlenbeck process for each bubble, because the centre of its outline wanders about its
-centre of volume. Only the spectral density near 0 Hz limits the estimate of a constant, and an
-oscillation has little density there. The usual standard error of a mean would be too large or too
-small, because ray misses are correlated in time.
+Gaussian process in time, whose hyper-parameters are learned: white noise of each pair, damped
+oscillations that are common to all pairs of a frame (shake), and an Ornstein-Uhlenbeck process for
+each bubble, because the centre of its outline wanders about its centre of volume. Only the spectral
+density near 0 Hz limits the estimate of a constant; the usual standard error of a mean would be
+wrong, because ray misses are correlated in time.
 """
 
 from __future__ import annotations
@@ -71,12 +66,10 @@ _MOST_APART = 4
 
 @dataclass(frozen=True)
 class Series:
-    """Holds M ray misses in time, which are linear in K unknowns of unit prior variance.
+    """M ray misses in time, which are linear in K unknowns of unit prior variance.
 
-    frame, bubble : (M,) index of each frame and of each bubble.
-    t_s, miss_mm : (M,).
-    relative : (M,) variance of each ray miss divided by the median variance.
-    by_unknowns : (M, K) derivative of each ray miss with respect to the unknowns.
+    frame, bubble : (M,) indices. t_s, miss_mm : (M,). relative : (M,) variance over the median
+    variance. by_unknowns : (M, K).
     """
 
     frame: Ints
@@ -100,12 +93,11 @@ class Series:
 
 @dataclass(frozen=True)
 class Noise:
-    """Holds the hyper-parameters of the noise of ray misses.
+    """The hyper-parameters of the noise of ray misses.
 
-    white_mm : standard deviation of the white noise of a pair.
-    wander_mm, wander_s : standard deviation and correlation time of each bubble's
-        Ornstein-Uhlenbeck process.
-    shake : RMS (mm), decay time (s) and frequency (Hz) of each oscillation that all pairs share.
+    white_mm : standard deviation of a pair's white noise. wander_mm, wander_s : of each bubble's
+    Ornstein-Uhlenbeck process. shake : RMS (mm), decay time (s) and frequency (Hz) of each
+    oscillation that all pairs share.
     """
 
     white_mm: float
@@ -118,8 +110,7 @@ class Noise:
         return np.asarray(self.wander_mm**2 * np.exp(-np.abs(lag_s) / self.wander_s))
 
     def common(self, lag_s: Array) -> Array:
-        """Return the autocovariance of the shake at the lags, in mm^2: damped resonators driven by
-        white noise."""
+        """Return the autocovariance (mm^2) of the shake at the lags: damped resonators."""
         out = np.zeros_like(lag_s)
         for rms, decay, hz in self.shake:
             lag, turn = np.abs(lag_s), 2 * np.pi * hz
@@ -128,9 +119,7 @@ class Noise:
         return out
 
     def slopes(self, lag_s: Array) -> tuple[Array, Array]:
-        """Return the derivatives of `own` (2, L) by the logarithms of wander_mm and wander_s, and
-        those of `common` (3 n, L) by the logarithms of the n oscillations' numbers, in turn.
-        """
+        """Return derivatives of `own` (2, L) and `common` (3 n, L) by logarithms of their numbers."""
         lag, own = np.abs(lag_s), self.own(lag_s)
         common = []
         for rms, decay, hz in self.shake:
@@ -155,12 +144,10 @@ class Noise:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Holds a tapered periodogram, and what is needed for its expectation.
+    """A tapered periodogram from bin `_FIRST_BIN` on, and what is needed for its expectation.
 
-    power : periodogram from bin `_FIRST_BIN` on.
-    step_s : interval of the samples.
-    overlap : autocorrelation of the taper.
-    common, single : shares of the shake's variance and of a single bubble's variance in the series.
+    overlap : autocorrelation of the taper. common, single : shares of the shake's and of a single
+    bubble's variance in the series.
     """
 
     power: Array
@@ -186,8 +173,10 @@ class _Spectrum:
         return slice(_FIRST_BIN, _FIRST_BIN + len(self.power))
 
     def cost(self, noise: Noise) -> tuple[float, Array]:
-        """Return the negative debiased Whittle log-likelihood (Sykulski et al., Biometrika 106:251,
-        2019), and its derivative by the logarithms of the noise's numbers."""
+        """Return the negative debiased Whittle log-likelihood, and its derivative by logarithms.
+
+        Sykulski et al., Biometrika 106:251, 2019.
+        """
         density = self.expected(noise)
         cost = float(_INDEPENDENT * (np.log(density) + self.power / density).sum())
         by_density = np.zeros(len(self.overlap))
@@ -201,11 +190,10 @@ class _Spectrum:
 
 
 def learned_noise(parts: list[Series]) -> Noise:
-    """Return the noise model with the largest posterior, from the spectra of the residuals of
-    stretches.
+    """Return the noise model with the largest posterior, from the spectra of stretches' residuals.
 
-    Oscillations are added as long as each raises the log posterior by `_LEAST_LOG_RATIO`, at most
-    two (one for the arm of each camera).
+    At most two oscillations (one for the arm of each camera) are added, as long as each raises the
+    log posterior by `_LEAST_LOG_RATIO`.
     """
     spread = max(float(np.concatenate([p.residuals() for p in parts]).std()), 1e-7)
     start = np.log([spread / 2, spread / 4, _WANDER_S])
@@ -250,8 +238,7 @@ def _noise(log: Array) -> Noise:
 
 
 def _spectra(part: Series) -> list[_Spectrum]:
-    """Return the spectrum of each frame's mean ray miss, and those of single bubbles' deviations
-    from it."""
+    """Return spectra of each frame's mean ray miss, and of single bubbles' deviations from it."""
     left = part.residuals()
     t, index = np.unique(part.t_s, return_inverse=True)
     if len(t) < _LEAST_FRAMES:
@@ -283,9 +270,7 @@ def _spectrum(t_s: Array, values: Array, common: float, single: float) -> _Spect
 
 
 def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
-    """Return frequencies (Hz) that exceed the noise model's spectrum most and are not close
-    together.
-    """
+    """Return frequencies (Hz) apart that exceed the noise model's spectrum most."""
     ratio = spectrum.power / spectrum.expected(noise)
     length = len(spectrum.overlap) * spectrum.step_s
     hz = np.arange(_FIRST_BIN, _FIRST_BIN + len(ratio)) / length
@@ -299,11 +284,9 @@ def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
 
 
 def information(series: Series, noise: Noise) -> tuple[Array, Array, Array]:
-    """Return the information on the unknowns, and the leave-one-out residuals.
+    """Return the normal equations (K, K), (K,) without prior, and leave-one-out residuals (M,).
 
-    Returns the matrix (K, K) and the vector (K,) of the normal equations without prior, and the
-    residuals (M,) in standard deviations. The residuals are computed at the best unknowns of this
-    stretch; the uncertainty of these is neglected.
+    The residuals are in standard deviations, at the best unknowns of this stretch.
     """
     from scipy.linalg import cho_solve, cholesky
 
@@ -338,11 +321,7 @@ _LEAST_SINE = 0.05
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """Holds the prior standard deviations of each component of a movement.
-
-    They are wide, so that the data of the run decide. Components without effect on ray misses are
-    held at 0. Raises InputError for values that are not positive.
-    """
+    """Wide prior standard deviations of a movement; InputError for values that are not positive."""
 
     rotation_rad: float = 5e-3
     translation_mm: float = 0.2
@@ -357,18 +336,14 @@ class DriftPrior:
 
 @dataclass(frozen=True)
 class RigChange:
-    """Describes the movement of the second camera relative to the first since the calibration.
+    """The movement of the second camera relative to the first since the calibration.
 
-    camera : name of the second camera.
-    tangent, covariance : (6,) and (6, 6) of rig_from_<second camera> with the components
-        `POSE_COMPONENTS`. They are 0 in the directions that ray misses do not identify.
-    place_mm : (3,) mean position of the bubbles in the rig frame. The offset refers to this point.
-    values, sigmas : (3,) offset along n (mm), roll and pitch (rad), and their standard deviations.
-    prior_sigmas : (3,) their prior standard deviations.
-    chance : p-value, the probability of such ray misses if nothing has moved.
-    pairs : number of pairs from which the movement was estimated.
-    refined : pose rig_from_<second camera> that calibration and run give together; None if it was
-        not estimated.
+    tangent, covariance : (6,), (6, 6) of rig_from_<camera> with the components `POSE_COMPONENTS`, 0
+    in directions that ray misses do not identify. place_mm : (3,) mean position of the bubbles, to
+    which the offset refers.
+    values, sigmas, prior_sigmas : (3,) offset along n (mm), roll and pitch (rad). chance : p-value
+    of no movement. pairs : number of pairs used. refined : pose rig_from_<camera> that calibration
+    and run give together, or None.
     """
 
     camera: str
@@ -422,18 +397,15 @@ class RigChange:
 
 
 def _rounded(value: float, sd: float) -> str:
-    """Return value and standard deviation as text, rounded to two digits of the standard
-    deviation."""
+    """Return value ± standard deviation as text, to two digits of the latter."""
     digits = max(0, 1 - math.floor(math.log10(sd))) if sd > 0 else 2
     return f"{value:+.{digits}f} ± {sd:.{digits}f}"
 
 
 def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
-    """Return the common perpendicular of both lines of sight, and the rig point where these are
-    closest.
+    """Return the unit vector n (3,), first x second line of sight, and the rig point (3,) closest.
 
-    The first is the unit vector n (3,) along first line of sight x second line of sight, the other
-    a point (3,) in mm. Raises CalibrationError for cameras that look along one line.
+    Raises CalibrationError for cameras that look along one line.
     """
     rays = [c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2) for c in cameras]
     cross = np.cross(rays[0][1], rays[1][1])[0]
@@ -449,12 +421,7 @@ def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class RayMisses:
-    """Holds the ray misses of M pairs in mm along n.
-
-    miss_mm : (M,).
-    variance_mm2 : (M,) variance due to the noise of the pixels.
-    by_rig : (M, P) derivative with respect to the P parameters of the cameras.
-    """
+    """M ray misses along n (mm), their variances due to pixels, and derivatives (M, P)."""
 
     miss_mm: Array
     variance_mm2: Array
@@ -468,16 +435,12 @@ def ray_misses(
     uv_px: Array | None = None,
     covariance_px2: Array | None = None,
 ) -> RayMisses:
-    """Return the ray misses of M pairs, linearised at rig points near them.
+    """Return the ray misses of M pairs, linearised at rig points (M, 3) near them.
 
-    One combination of the four pixel coordinates of a pair does not change with the point; it is
-    given by the left null vector of the projection's Jacobian. This combination is the ray miss. It
-    is scaled to the shift of the second camera along n that would explain it.
-
-    free : for each camera the names of its free intrinsics.
-    points_mm : (M, 3) rig points.
-    uv_px : (M, 2, 2) pixels of each pair in the two cameras; without them the ray misses are 0.
-    covariance_px2 : (M, 2, 2, 2) their covariances; without them the variances are 0.
+    The left null vector of the projection's Jacobian combines a pair's four pixel coordinates such
+    that the point does not matter; it is scaled to the shift of the second camera along n.
+    free : for each camera its free intrinsics. uv_px : (M, 2, 2); covariance_px2 : (M, 2, 2, 2);
+    without them ray misses and variances are 0.
     """
     n, _ = common_perpendicular(cameras)
     predicted, by_point = stacked_jacobian(cameras, points_mm)
@@ -495,10 +458,9 @@ def ray_misses(
 
 
 def drift_covariance(cameras: Pair, prior: DriftPrior) -> Array:
-    """Return the prior covariance (6, 6) of a movement, restricted to directions that cause ray
-    misses.
+    """Return the prior covariance (6, 6) of a movement in directions that cause ray misses.
 
-    The ray misses of different directions are compared over the volume that both cameras see.
+    They are compared over the volume that both cameras see.
     """
     _, middle = common_perpendicular(cameras)
     reach = min(min(c.image_size_px) / c["scale_px_per_mm"] / 2 for c in cameras)
@@ -519,12 +481,7 @@ def rig_change_from(
     pairs: int,
     refined: Pose | None = None,
 ) -> RigChange:
-    """Return a movement with its offset, roll and pitch.
-
-    tangent : (6,) estimate, as in `RigChange`.
-    covariance, prior : (6, 6) posterior and prior covariance.
-    place_mm : (3,) rig point to which the offset refers.
-    """
+    """Return a movement with offset (at ``place_mm``), roll and pitch, from its tangent (6,)."""
     rows = offset_roll_pitch(cameras, place_mm)
     sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
     return RigChange(
@@ -534,10 +491,7 @@ def rig_change_from(
 
 
 def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
-    """Return the matrix (3, 6) that maps the tangent of rig_from_second to offset, roll and pitch.
-
-    The offset is the shift along n at the rig point ``place_mm`` (3,).
-    """
+    """Return the matrix (3, 6) from the tangent of rig_from_second to offset, roll and pitch."""
     n, _ = common_perpendicular(cameras)
     pose = cameras[1].camera_from_rig
     across = pose.rotation @ n
@@ -552,7 +506,7 @@ def p_value_of(tangent: Array, covariance: Array, prior: Array) -> float:
     """Return the p-value of an estimate under the hypothesis of no movement.
 
     It is a chi-square test over the directions that the prior leaves free. The prior shrinks the
-    estimate towards 0, so the true p-value is smaller than the returned one.
+    estimate towards 0, so the true p-value is smaller.
     """
     from scipy.special import chdtrc
 
@@ -567,7 +521,7 @@ def p_value_of(tangent: Array, covariance: Array, prior: Array) -> float:
 def covariance_root(covariance: Array, singular: float = _SINGULAR) -> Array:
     """Return a square root (P, k) of a covariance (P, P): its k directions of non-zero variance.
 
-    singular : eigenvalues of the correlation matrix below this share of the largest one count as 0.
+    singular : share of the largest eigenvalue of the correlation matrix that counts as 0.
     """
     unit = _scale(covariance)
     values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
@@ -582,20 +536,14 @@ def _scale(covariance: Array) -> Array:
 
 
 def rig_block(calibration: Calibration) -> tuple[Array, Free]:
-    """Return the covariance of the cameras' parameters, and each camera's free intrinsics.
-
-    The covariance is zero for a calibration that states none.
-    """
+    """Return the covariance of the cameras' parameters (zero if none), and the free intrinsics."""
     if calibration.covariance.size:
         return calibration.covariance, calibration.free
     return np.zeros((POSE, POSE)), ((), ())
 
 
 def with_drift(covariance: Array, drift: Array) -> Array:
-    """Return the covariance (P, P) of the cameras' parameters with that of a movement added.
-
-    drift : (6, 6) covariance of a movement of the second camera.
-    """
+    """Return the covariance (P, P) plus that of a movement (6, 6) of the second camera."""
     total = covariance.copy()
     total[-POSE:, -POSE:] += drift
     return total
@@ -604,16 +552,11 @@ def with_drift(covariance: Array, drift: Array) -> Array:
 def drift_posterior(
     rig: Array, rig_covariance: Array, prior_rig: Array, drift: Array
 ) -> tuple[Array, Array]:
-    """Return the movement's part of an estimated error of the cameras' parameters.
+    """Return the movement (6,) in an error of the cameras' parameters, and its covariance.
 
-    By Gaussian conditioning, the movement is a gain matrix times the sum of calibration error and
-    movement.
-
-    rig, rig_covariance : (P,) and (P, P) posterior of the sum of calibration error and movement.
-    prior_rig : (P, P) covariance of the calibration.
-    drift : (6, 6) prior covariance of the movement.
-
-    Returns the movement (6,) and its covariance (6, 6).
+    By Gaussian conditioning it is a gain times the sum of calibration error and movement, whose
+    posterior is rig (P,), rig_covariance (P, P). prior_rig : (P, P) of the calibration. drift : (6,
+    6).
     """
     total = with_drift(prior_rig, drift)
     unit = _scale(total)
@@ -626,8 +569,7 @@ def drift_posterior(
 
 
 def moved_pose(rig_from_camera: Pose, tangent: Array) -> Pose:
-    """Return the pose after a small step (6,) (rotation, translation), applied as a right
-    perturbation."""
+    """Return the pose after a small step (6,) (rotation, translation), a right perturbation."""
     return rig_from_camera @ Pose(rotation_from_rotvec(tangent[:3]), tangent[3:])
 
 
@@ -652,9 +594,7 @@ _SHAPE_PX = 0.02
 
 
 class PairCollector:
-    """Collects the reliable pairs of a run while it is tracked, and estimates a movement at its
-    end.
-    """
+    """Collects the reliable pairs of a run while it is tracked, and estimates a movement."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
@@ -666,8 +606,7 @@ class PairCollector:
         self.parts.append(tracks.loc[_reliable(tracks), [n for n in names if n in tracks]])
 
     def found(self) -> RigChange | None:
-        """Return the movement that all collected pairs give, or None if there are too few of
-        them."""
+        """Return the movement that all collected pairs give, or None if there are too few."""
         import pandas as pd
 
         filled = [p for p in self.parts if len(p)]
@@ -687,7 +626,7 @@ def rig_change(
 ) -> tuple[RigChange, Noise] | None:
     """Return the movement estimated from a table of tracks, and the noise model of its ray misses.
 
-    Returns None if there are fewer than `LEAST_PAIRS` reliable pairs, or not exactly two cameras.
+    Returns None for fewer than `LEAST_PAIRS` reliable pairs, or not exactly two cameras.
     """
     if len(calibration.cameras) != 2 or len(tracks) < LEAST_PAIRS:
         return None
@@ -727,8 +666,7 @@ def rig_change(
 
 
 def _reliable(tracks: pd.DataFrame) -> Bools:
-    """Return which rows have pixels measured in both views, high confidence and no flag of a
-    doubtful pair."""
+    """Return which rows have pixels in both views, high confidence and no doubtful flag."""
     keep = np.isfinite(tracks["ray_miss_mm"].to_numpy(float))
     if "confidence" in tracks:
         keep &= ~(tracks["confidence"].to_numpy(float) < _LEAST_CONFIDENCE)
@@ -738,8 +676,7 @@ def _reliable(tracks: pd.DataFrame) -> Bools:
 
 
 def _without_outliers(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows whose ray miss is not far from those of all others, with particles numbered
-    from 0."""
+    """Return the rows whose ray miss is near all others', with particles numbered from 0."""
     miss = table["ray_miss_mm"].to_numpy(float)
     if not len(miss):
         return table
@@ -756,10 +693,7 @@ def _points(table: pd.DataFrame) -> Array:
 
 
 def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
-    """Return the centres (M, 2, 2) of M pairs in two cameras, and their covariances (M, 2, 2, 2).
-
-    The centres contain the correction from outline centre to centre of volume if it is known.
-    """
+    """Return the centres (M, 2, 2) of pairs in two cameras, of volume if known, and covariances."""
     uv, spread = [], []
     for name in cameras:
         centre = table[[f"{name}_u_px", f"{name}_v_px"]].to_numpy(float)
@@ -775,10 +709,7 @@ def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
 def with_change(
     model: PairModel, change: RigChange | None, calibration: Calibration
 ) -> dict[str, Any]:
-    """Return the part ``pairs`` of tracking.json.
-
-    If the cameras have moved, a sentence on this replaces the one on an offset of the calibration.
-    """
+    """Return the part ``pairs`` of tracking.json; a movement replaces an offset's sentence."""
     words, moved = model.sentences(), change is not None and change.moved
     if change is not None and moved:
         words = model.sentences(without=[Finding.CALIBRATION_OFFSET])
@@ -802,8 +733,7 @@ def with_change(
 def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
     """Return stretches of a run with at most about 520 pairs each, spread evenly over the run.
 
-    Each stretch uses every frame if few bubbles are seen, and every second, third, ... frame if
-    many are.
+    Where many bubbles are seen they use only every second, third, ... frame.
     """
     frames, counts = np.unique(table["frame"].to_numpy(np.int64), return_counts=True)
     most = max(4, int(_MOST_ROWS / float(counts.mean())))
@@ -822,14 +752,10 @@ def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
 def _estimate(
     table: pd.DataFrame, series_of: Callable[[Any], Series], shape_mm: float
 ) -> tuple[Array, tuple[Array, Array], Noise, int] | None:
-    """Return the estimate of K unknowns, which have unit prior variance, from stretches of the run.
+    """Return unknowns (K,) of unit prior variance, two covariances, the noise and number of pairs.
 
-    series_of : function that returns the ray misses of a part of the table.
-    shape_mm : standard deviation of the constant ray miss of each bubble due to its shape.
-
-    Returns the unknowns (K,), two covariances (K, K), the noise model and the number of used pairs.
-    The second covariance includes the constant shape error of each bubble. Returns None if too few
-    pairs remain without outliers.
+    The second covariance includes a constant ray miss (sd shape_mm) of each bubble due to its
+    shape. Returns None if too few pairs remain without outliers.
     """
     parts = [series_of(part) for part in stretches(table)]
     some = np.unique(np.linspace(0, len(parts) - 1, _LEARNED_FROM).astype(int))
@@ -856,9 +782,7 @@ def _estimate(
 
 
 def _shape_share(parts: list[Series], covariance: Array, noise: Noise, shape_mm: float) -> Array:
-    """Return the covariance (K, K) due to a constant ray miss, as if the whole run showed one
-    bubble.
-    """
+    """Return the covariance (K, K) due to a constant ray miss of one bubble in the whole run."""
     response = np.zeros(len(covariance))
     for part in parts:
         constant = replace(part, miss_mm=np.full(len(part), shape_mm))

@@ -30,11 +30,7 @@ MEDIA = ("air", "water")
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """Hold a calibration and the detected dots that it was made from.
-
-    calibration : the calibration.
-    detected : the dots detected in the images; None if the dots were read from `dots.csv`.
-    """
+    """A calibration and the dots detected in images, None if they were read from `dots.csv`."""
 
     calibration: Calibration
     detected: DatasetDots | None
@@ -59,11 +55,8 @@ def check_options(
 ) -> None:
     """Check the options of `run_calibration` before any image is read.
 
-    model, solver, medium, dots_free, outlier_sd : as for `run_calibration`; other options are
-        ignored.
-    cameras : names of the rig's cameras; empty if they are not known yet.
-
-    Raises InputError or CalibrationError for a value that is not allowed.
+    cameras : names of the rig's cameras; empty if they are not known yet. Raises InputError or
+    CalibrationError for a value that is not allowed.
     """
     checked_medium(medium)
     checked_outlier_sd(outlier_sd)
@@ -98,11 +91,10 @@ def calibrate(
     seed: int = 0,
     progress: Progress | bool = False,
 ) -> Calibration:
-    """Calibrate a rig from the images or the dots of a dataset.
+    """Calibrate a rig from the images or the dots of a dataset; no file is written.
 
-    dataset : the dataset, which holds `rig.toml` and the images or the table of dots.
     model : "auto" (chosen for each camera), the name of a lens model (none, radial, brown,
-        kappa+radial, ...), or one for each camera: {"left": "brown"}, "left=brown,right=auto".
+    kappa+radial, ...), or one for each camera: {"left": "brown"}, "left=brown,right=auto".
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     medium : "air" or "water", in which the target is. If `rig.toml` has `[walls]` (refractive
         windows), the runs are in water in both cases.
@@ -187,11 +179,6 @@ def solve_dots(
 ) -> Calibration:
     """Calibrate the rig from a table of dots, without the stage's axis and the runs' windows.
 
-    dataset : gives the rig and the target; its images are not read.
-    table : the measured dots, a row for each dot in each image.
-    model, solver, medium, dots_free, outlier_sd, stage : as for `run_calibration`.
-    notes : sentences that the calibration keeps.
-
     The refractive windows are part of the model only if ``medium`` is "water".
     """
     from telerig.estimator.calibration.self_calibration import self_calibrate
@@ -217,12 +204,7 @@ def solve_dots(
 def detect(
     dataset: Dataset, *, stage: Progress | None = None, pictures: bool = False
 ) -> DatasetDots | None:
-    """Detect the dots in all images of a dataset.
-
-    stage, pictures : as for `run_calibration`.
-
-    Returns the dots, or None if the dataset holds a table of dots instead of images.
-    """
+    """Detect the dots in all images of a dataset; None if it holds a table of dots instead."""
     if dataset.source != "images":
         return None
     from telerig.estimator.dots.dataset_dots import detect_dataset

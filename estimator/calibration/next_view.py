@@ -48,9 +48,9 @@ class NextView:
     """Advice after ``views`` views.
 
     before_um : standard deviation per axis of points over the working volume, the calibration's
-    share, their common rigid motion set aside.  poses : best first; none when no pose of the table
-    is seen by two cameras.  size_um : what the stated uncertainty of the target's known
-    distance and print leaves, which no view can lower.  marks : ids of the target's marks.
+    share, less their common rigid motion. poses : best first; none when no pose of the table is
+    seen by two cameras. size_um : what the uncertainty of the target's known distance and print
+    leaves.
     """
 
     views: int
@@ -115,10 +115,10 @@ class NextView:
 
 
 def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextView | None:
-    """The best ways to hold the target next; None for a single camera, or a rig left undetermined.
+    """Return the best ways to hold the target next; None for a single camera, or no covariance.
 
     The candidates' noise is the median of the dots so far. Of many dots some stand for all, which
-    promises slightly too little, as the dots' own uncertainty is averaged over fewer of them.
+    promises slightly too little.
     """
     if len(problem.cameras) < 2 or not np.isfinite(joint.rig_block()[1]).all():
         return None
@@ -150,8 +150,8 @@ def _preferred(
 ) -> Ints:
     """Return up to three candidates of different tilts, the best first.
 
-    The lens model that the views so far have chosen may lack what acts where no dot has been:
-    among those nearly as good, the one that fills most of the empty image is preferred.
+    The lens model may lack what acts where no dot has been: among those nearly as good, the one
+    that fills most of the empty image is preferred.
     """
     order = np.argsort(-gained_um, kind="stable")
     alike = order[gained_um[order] >= ALIKE_SHARE * gained_um[order[0]]]
@@ -195,10 +195,9 @@ _EDGE_ON = 0.1
 class Candidates:
     """K poses that two cameras or more of C see.
 
-    rig_from_target : (K, 4, 4).  tilt : (K,) number of the plate's normal in the table.
-    facing : (K, C) +1 where a camera sees the side of negative z, else -1.
-    sees : (K, C) whether the plate's side and tilt let a camera see it.
-    pair : (K, 2) the cameras between which the plate is held.
+    rig_from_target : (K, 4, 4). tilt : (K,) number of the plate's normal in the table. facing : (K,
+    C) +1 where a camera sees the side of negative z, else -1. sees : (K, C) whether side and tilt
+    let a camera see it. pair : (K, 2) the cameras between which the plate is held.
     """
 
     rig_from_target: Array
@@ -255,10 +254,7 @@ def optical_axes(state: State) -> Array:
 
 
 def bases(axes: Array, facing: Array) -> tuple[Array, Array, Array]:
-    """Unit vectors: the plate's z when it faces both cameras alike, in the axes' plane, across.
-
-    axes : (2, 3), facing : (2,) of the two cameras.
-    """
+    """Return three unit vectors for two cameras: the plate's z facing both alike, along, across."""
     a, b = facing[:, None] * axes
     alike = (a + b) / np.linalg.norm(a + b)
     across = np.cross(a, b)
@@ -330,10 +326,7 @@ def _rotations(normal: Array, roll_rad: Array) -> Array:
 def predicted(
     problem: Problem, state: State, poses: Candidates, dots: Ints, whitener: Array
 ) -> tuple[State, Observations]:
-    """K views of ``dots`` in all C images, view by view and camera by camera; no pixels measured.
-
-    whitener : (C,) 1 / px, of each camera.
-    """
+    """Return K views of ``dots`` in all images, without measured pixels; whitener (C,) in 1/px."""
     cameras = np.arange(len(problem.cameras))
     view, camera, dot = (
         a.ravel() for a in np.meshgrid(np.arange(len(poses)), cameras, dots, indexing="ij")
@@ -376,10 +369,7 @@ def spread_dots(problem: Problem, count: int = FEW_DOTS) -> Ints:
 
 
 def _enough_seen(problem: Problem, state: State, poses: Candidates) -> Bools:
-    """Return (K,) whether two cameras see as many dots as images do so far, and all marks.
-
-    The two between which the plate is held; what others see of it is used as it is.
-    """
+    """Return (K,) whether the pair of cameras sees as many dots as images so far, and all marks."""
     image = (len(problem.cameras) * problem.view + problem.camera)[problem.kept]
     counts = np.bincount(image)
     share = SEEN_SHARE * np.median(counts[counts > 0]) / len(problem.dot_ids)
@@ -392,10 +382,7 @@ def _enough_seen(problem: Problem, state: State, poses: Candidates) -> Bools:
 
 
 def new_cells(problem: Problem, visible: Bools, uv_px: Array) -> Bools:
-    """(C, CELLS, CELLS) parts of the images, (columns, rows), that no dot has reached so far.
-
-    visible : (C, n); uv_px : (C, n, 2), of the view that would reach them.
-    """
+    """Return parts (C, CELLS, CELLS) of the images, (columns, rows), that a view reaches first."""
     out = []
     for c, camera in enumerate(problem.cameras):
         edges = [np.linspace(-0.5, size - 0.5, CELLS + 1) for size in camera.image_size_px]
@@ -412,9 +399,8 @@ def new_cells(problem: Problem, visible: Bools, uv_px: Array) -> Bools:
 class ViewGain:
     """What views do to the covariance of cameras and dots.
 
-    covariance : (P + 3 n, P + 3 n) of the rig block and of ``dots``, (n,) sorted, which alone can
-    be asked for.  root : (P, R), root root^T weighs the rig block by the variance of points in
-    space.  whitener : (C,) 1 / px.
+    covariance : (P + 3 n, P + 3 n) of the rig block and of ``dots``, (n,) sorted. root : (P, R),
+    root root^T weighs the rig block by the variance of points in space. whitener : (C,) 1/px.
     """
 
     problem: Problem
@@ -456,7 +442,7 @@ class ViewGain:
         return np.asarray(1e3 * np.sqrt(np.maximum(whole - less, 0) / self.points_mm.size))
 
     def after_um(self, poses: Candidates, dots: Ints) -> Array:
-        """(K,) standard deviation per axis with each of the views added, seen at ``dots``.
+        """Return the standard deviation (K,) per axis with each view added, seen at ``dots``.
 
         With A the view's rows, its pose projected out, and C the covariance, the summed variance of
         points falls by the trace of root^T C A^T (1 + A C A^T)^-1 A C root.
@@ -623,11 +609,7 @@ def _where(cells: Array) -> str:
 def first_views(
     first: str, second: str, angle_deg: float, *, alone: bool = True
 ) -> tuple[str, ...]:
-    """Words for the first views, before any calibration can say more.
-
-    first, second : the cameras' names.  angle_deg : between their axes.  alone : whether the rig
-    has no other cameras.
-    """
+    """Return words for the first views, before any calibration can say more."""
     between = "the cameras" if alone else f"cameras {first} and {second}"
     turn = max(0, min(20, int(TILT_LIMIT_DEG - angle_deg / 2 - 5) // 5 * 5))
     aside = {

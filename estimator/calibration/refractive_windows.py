@@ -36,8 +36,7 @@ def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[
 def behind_windows(calibration: Calibration, walls: Mapping[str, Wall]) -> Calibration:
     """Return a calibration that was made in air, for use in the water behind windows.
 
-    The prior covariance of each window's orientation joins the covariance, so it reaches every
-    projected and triangulated point.
+    The prior covariance of each window's orientation joins the covariance.
     """
     cameras = with_windows(calibration.cameras, walls)
     names, covariance = _with_priors(
@@ -97,8 +96,7 @@ def _with_priors(
 def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
     """Return the largest error (um) of points if ``used`` replaces the ``true`` cameras.
 
-    A common shift of all points is set aside: the rig's origin is a matter of definition. With one
-    camera, its error across its own axis.
+    A common shift of all points is set aside. With one camera, it is the error across its own axis.
     """
     points = working_volume(tuple(used))
     pixels = [camera.project(points) for camera in true]
@@ -194,10 +192,7 @@ def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
 
 
 def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[str]:
-    """Return the note on a window that may as well lean to the other side.
-
-    Without perspective a target in the water shows the square of the tilt only.
-    """
+    """Return the note on a window that may lean to the other side: only the tilt's square shows."""
     free, wall = wall_freedom(camera), camera.wall
     weak = abs(camera["kappa_per_mm"]) * camera.rho_mm < ENTOCENTRIC
     if calibration.medium == "air" or not free or wall is None or not weak:
@@ -241,8 +236,8 @@ def _without_distance(camera: Camera) -> list[str]:
 def window_warnings(rig: RigDescription | None, calibration: Calibration) -> list[str]:
     """Return warnings if the windows of rig.toml and of the calibration differ.
 
-    A calibration made in water without windows has their effect in its scales and axes, all but
-    that on perspective.
+    A calibration in water without windows has their effect in its scales and axes, but not in
+    perspective.
     """
     if rig is None:
         return []

@@ -47,18 +47,13 @@ BAD_FLOOR = 5.0
 
 @dataclass(frozen=True)
 class Fit:
-    """Hold a finished self-calibration of C cameras.
+    """A finished self-calibration of C cameras.
 
-    robust : the fit, with its problem, its solution and the weights of the dots.
-    models : name of the lens model of each camera.
-    model_words : a phrase about the models for the report.
-    choice : how the models were chosen; None if the user gave them.
-    centre_held : (C, 4, 4) poses of the cameras from a fit with the image centres held at the
-        middle of the image; None if the centres are held there in this fit, too.
-    mirror : which of the two solutions of the mirror ambiguity is kept; None until it is decided.
-    mirrored_cost : cost of the other solution (half the chi-square).
-    tilts_deg : by (index of the view, index of the camera), tilt of the target, in degrees.
-    notes : notes for the user.
+    models : name of each camera's lens model. model_words : a phrase about them. choice : None if
+    the user gave them. centre_held : (C, 4, 4) poses of the cameras from a fit with held image
+    centres; None if they are held in this fit, too.
+    mirror, mirrored_cost : the kept solution of the mirror ambiguity, and the other's cost.
+    tilts_deg : of the target by (view, camera).
     """
 
     robust: RobustFit
@@ -86,15 +81,11 @@ def calibration_from_fit(
     nominal_rotvec_deg: Nominal,
     name: str,
 ) -> Calibration:
-    """Make the public `Calibration` from a finished fit.
+    """Make the public `Calibration` from a finished fit, whose ``mirror`` is decided.
 
-    fit : the finished fit; its ``mirror`` has to be decided.
-    joint : covariance of all parameters.
-    free : for each camera, the names of the intrinsics that the covariance contains.
-    weak : sentences of `checks.weak_parameters` about this fit.
-    nominal_rotvec_deg : by index of a camera, its nominal rotation relative to the first (rotation
-        vector, degrees), as `rig.toml` states it.
-    name : name of the rig.
+    joint : covariance of all parameters. free : for each camera, the intrinsics that it contains.
+    weak : sentences of `checks.weak_parameters`. nominal_rotvec_deg : by index of a camera, as
+    `rig.toml` states it.
     """
     problem, state = fit.robust.problem, fit.robust.solution.state
     cameras = cameras_from_state(problem, state)
@@ -155,10 +146,9 @@ def dot_table(problem: Problem) -> pd.DataFrame:
 
 
 def residual_table(problem: Problem, state: State) -> pd.DataFrame:
-    """Return the table of the residuals (for `residuals.csv`), one row for each dot in each image.
+    """Return the rows of `residuals.csv`: `dot_table`, residual (measured minus predicted), weight.
 
-    Its columns are those of `dot_table`, the residual du_px and dv_px (measured minus predicted,
-    px), the weight in the fit, and the reason if this weight is less than 1.
+    A weight less than 1 has a reason.
     """
     residual = -pixel_residuals(problem, state)
     distance = np.sqrt(squared_distance(residual, problem.covariance_px2))
@@ -180,10 +170,7 @@ def _reason(distance: float, lost_view: bool, limit: float) -> str:
 
 
 def odd_views(problem: Problem) -> list[str]:
-    """Return a sentence for each view of which more than half of the dots were left out.
-
-    The cause may be wrong numbers of the dots, or a target that moved between the cameras' images.
-    """
+    """Return a sentence for each view of which more than half of the dots were left out."""
     measured = np.bincount(problem.view, minlength=len(problem.views))
     kept = np.bincount(problem.view[problem.kept], minlength=len(problem.views))
     return [
@@ -270,11 +257,9 @@ def _from_first(fit: Fit, joint: JointCovariance, camera: int) -> dict[str, Any]
 
 
 def _angle_systematic(fit: Fit, angle_rad: float, camera: int) -> float:
-    """Return how far the angle (rad) changes if the image centres are held at the image's middle.
+    """Return how far the angle (rad) changes with the image centres held, 0 if the model fits.
 
-    With strong perspective, a change of the angle and a change of the centres have similar effects,
-    and an error of the distortion model moves both. The result is 0 if the centres are held anyway,
-    and if the model explains the images down to their noise.
+    With strong perspective, an error of the distortion model moves both angle and centres.
     """
     noise = _scatter(fit.robust.problem.covariance_px2 - fit.robust.floor_px**2 * np.eye(2))
     if fit.centre_held is None or fit.robust.floor_px <= UNEXPLAINED * noise:
@@ -302,10 +287,7 @@ def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dic
 
 
 def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str, Any]:
-    """Return the residuals in space and the predicted uncertainty of points (um per axis).
-
-    The part that the calibration's errors cause does not include a rigid motion of all points.
-    """
+    """Return residuals in space and predicted uncertainty of points (um), less rigid motion."""
     if len(problem.cameras) < 2:
         return {}
     pixels, truth = _seen_in_space(problem, state)
@@ -328,11 +310,7 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
 
 
 def _seen_in_space(problem: Problem, state: State) -> tuple[Array, Array]:
-    """Return the pixels and the fitted positions of the dots that two or more cameras see.
-
-    Returns (C, K, 2) pixels in C cameras of K dots, NaN where a camera does not see the dot, and
-    (K, 3) positions in the rig frame, in mm. Only dots that were kept are used.
-    """
+    """Return pixels (C, K, 2), NaN if unseen, and points (K, 3) of dots that two cameras see."""
     key = problem.view * len(problem.dot_ids) + problem.dot
     kept = problem.kept
     found, row = np.unique(key[kept], return_inverse=True)
@@ -388,11 +366,7 @@ def _kappa_hint(fit: Fit) -> str:
 
 
 def _mirror(fit: Fit, nominal_rotvec_deg: Nominal) -> dict[str, Any]:
-    """Return the entry "twin" of `calibration.json`, about the mirror ambiguity.
-
-    Its ``nominal_rotvec_deg`` is one vector for two cameras, and a mapping by the camera's name for
-    more of them.
-    """
+    """Return the entry "twin" of `calibration.json`; with 3 cameras rotations are by name."""
     assert fit.mirror is not None
     cameras = fit.robust.problem.cameras
     stated: Any = {cameras[c].name: list(rotvec) for c, rotvec in nominal_rotvec_deg.items()}

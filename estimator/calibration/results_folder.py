@@ -54,21 +54,16 @@ def sources(dataset: Dataset) -> list[Path | Source]:
 
 
 def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
-    """Write the HTML report of a results folder and return its path.
-
-    folder : a results folder with `calibration.json` and the other files of a calibration.
-    dot : the pictures of `dot_example.npz`, if they are drawn already; None draws them now.
-    """
+    """Write the HTML report of a results folder; ``dot`` : its pictures, if drawn already."""
     from telerig.io.report.calibration.report import write_calibration_report
 
     return write_calibration_report(folder, dot=dot)
 
 
 class ReportBeside:
-    """Write the report in a second process, the assistant.
+    """Write the report of a results folder in a second process, the assistant.
 
-    The assistant draws the pictures that need no calibration while this process calibrates. Call
-    the object with a results folder, as `write_report`; it returns the path of the report.
+    It draws the pictures that need no calibration while this process calibrates.
     """
 
     def __init__(self, call: Assistant) -> None:
@@ -85,12 +80,7 @@ class ReportBeside:
 
 @contextmanager
 def report_beside(wanted: bool) -> Iterator[ReportBeside | None]:
-    """Start a second process, which loads the report's libraries while this one calibrates.
-
-    wanted : whether a report is wanted.
-
-    Yields a `ReportBeside`, or None if no report is wanted. The process ends with the context.
-    """
+    """Yield a `ReportBeside`, whose process ends with the context; None if no report is wanted."""
     if not wanted:
         yield None
         return
@@ -126,20 +116,13 @@ def write_results(
     used: Mapping[str, Input] | None = None,
     again: str = "",
 ) -> Path:
-    """Write the results folder of a calibration; `docs/files.md` lists its files.
+    """Write the results folder of a calibration; return the path of the report, if there is one.
 
-    dataset : the dataset that was calibrated.
-    run : the calibration and the detections that it was made from.
-    folder : the folder to write. All files appear together at the end, so that an interrupted
-        command leaves the old ones.
-    command, options, seconds : the command, its options by name, and the time (s) that each part
-        took, by name, for `run.json`.
-    change : comparison with an earlier calibration, for `comparison.json`; None writes none.
-    report : function that writes the report of a folder; None writes no report.
-    used : the fingerprints of `sources` from before the dataset was read; None takes them now.
-    again : the command line that makes the folder again; "" for `telerig calibrate` of the dataset.
-
-    Returns the path at which the report is, if there is one.
+    All files (`docs/files.md`) appear together at the end, so that an interrupted command leaves
+    the old ones. command, options, seconds : for `run.json`. change : for `comparison.json`; None
+    writes none. report : function that writes the report of a folder, or None. used : the
+    fingerprints of `sources` from before the dataset was read. again : the command line that makes
+    the folder again; "" for `telerig calibrate` of the dataset.
     """
     record = run_record(command, dataset.path, input_files(dataset), options, seconds)
     again = again or f"telerig calibrate {shlex.quote(str(dataset.path))}"
@@ -161,11 +144,9 @@ def write_results(
 
 
 def write_uncertainty(calibration: Calibration, path: Path) -> None:
-    """Write the covariances of points over the working volume to a NumPy file (.npz).
+    """Write covariances of points over the working volume to a NumPy file (.npz).
 
-    calibration : a calibration of two or more cameras.
-    path : the file to write. It holds points_mm (N, 3), calibration_mm2 and measurement_mm2
-        (N, 3, 3) in mm^2, and sigma_px, the noise of the pixels in px.
+    It holds points_mm (N, 3), calibration_mm2 and measurement_mm2 (N, 3, 3), and sigma_px.
     """
     from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
 
@@ -178,12 +159,7 @@ def write_uncertainty(calibration: Calibration, path: Path) -> None:
 
 
 def write_detections(detected: DatasetDots, folder: Path) -> None:
-    """Write what was detected in the images into a results folder.
-
-    The files are `rejected.csv` (candidates that are no dots) and, if they were made,
-    `overlays/<camera>/<view>.jpg` (the detections drawn over the images) and `dot_example.npz`
-    (one dot with its fit).
-    """
+    """Write `rejected.csv` and, if they were made, overlays and `dot_example.npz` into a folder."""
     from telerig.io.files.csv_table import write_table
 
     write_table(detected.rejected, folder / "rejected.csv")

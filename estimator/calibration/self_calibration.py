@@ -176,9 +176,7 @@ def _solved(
 
 
 def _with_origin(problem: Problem, start: State) -> Problem:
-    """Return the problem with scales held at the start's if axes of perspective lenses are nearly
-    parallel, else unchanged.
-    """
+    """Return the problem, with the start's scales held if perspective axes are nearly parallel."""
     if len(problem.cameras) < 2 or not mirror_ambiguity.perspective_sign(start, problem):
         return problem
     if checks.axes_angle_deg(start) > checks.NEAR_PARALLEL_DEG:

@@ -1,10 +1,9 @@
-"""Estimates travel axis and encoder scale from views of one static target at several stage
-positions.
+"""Travel axis and encoder scale from views of one static target at several stage positions.
 
-The folder `stage_axis/` of a dataset holds positions.csv, and either dots.csv or images. The target
-is at rest in the laboratory. When the encoder reads s, its dot X is at R X + t - w s - e in the
-rig. Here R and t are the pose of the target at reading 0, w = axis / (1 + scale) is the
-travel per unit of reading, and e is the error of the carriage's position in that view.
+The folder `stage_axis/` of a dataset holds positions.csv, and either dots.csv or images. When the
+encoder reads s, the dot X of the target at rest is at R X + t - w s - e in the rig. Here R and t
+are the pose of the target at reading 0, w = axis / (1 + scale) is the travel per unit of reading,
+and e is the error of the carriage's position in that view.
 """
 
 from __future__ import annotations
@@ -45,20 +44,16 @@ _CONTRADICTION_DEG = 10.0
 
 @dataclass(frozen=True)
 class StageAxis:
-    """Describes the calibrated stage.
+    """The calibrated stage.
 
     axis_rig : (3,) unit vector of travel in rig axes, in the direction of increasing readings.
-    basis : (3, 2) two orthonormal vectors perpendicular to the axis.
-    covariance : (2, 2) rad^2, covariance of the axis in this basis.
-    scale, scale_sd : scale error of the encoder and its standard deviation; reading = (1 + scale)
-        travel.
-    joint_covariance : (3, 3) covariance of the two components of the axis and the scale.
-    rig_from_target : pose of the target at reading 0.
-    chi2_dof : chi-square of the dots divided by the degrees of freedom; 1 is expected.
+    basis : (3, 2) two orthonormal vectors perpendicular to it; covariance : (2, 2) rad^2 of the
+    axis in them.
+    scale, scale_sd : scale error of the encoder; reading = (1 + scale) travel. joint_covariance :
+    (3, 3) of the two components of the axis and the scale. rig_from_target : pose at reading 0.
+    chi2_dof : of the dots; 1 is expected.
     position_sigma_mm, wander_sigma_mm : standard deviations of the carriage's position along and
-        across the axis. They are the given values, or the observed ones if these are significantly
-        larger.
-    words : sentences for the user.
+    across the axis, as given or as observed if that is significantly larger. words : for the user.
     """
 
     axis_rig: Array
@@ -94,13 +89,11 @@ class StageAxis:
 
 
 def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | None:
-    """Return the stage that the dataset's folder `stage_axis/` gives; None if there is no such
-    folder.
+    """Return the stage that the folder `stage_axis/` gives, None without it.
 
-    If rig.toml states another direction of travel, ``words`` of the result says so.
-
-    Raises InputError for a folder without positions.csv and for one with both images and dots.csv
-    or with neither, and the errors of `stage_axis_of`.
+    ``words`` say so if rig.toml states another direction. Raises InputError for a folder without
+    positions.csv, or with both or neither of images and dots.csv, and the errors of
+    `stage_axis_of`.
     """
     folder = dataset.path / FOLDER
     if not folder.is_dir():
@@ -173,17 +166,12 @@ def stage_axis_of(
     position_sigma_mm: float = 0.001,
     wander_sigma_mm: float = 0.0,
 ) -> StageAxis:
-    """Return the travel axis and the encoder scale with their covariance.
-
-    The covariance includes the uncertainty of the cameras' calibration.
+    """Return travel axis and encoder scale; their covariance includes the cameras' calibration.
 
     table : columns as in dots.csv: view, camera, dot, u_px, v_px and either suu_px2, suv_px2,
-        svv_px2 or sigma_px.
-    positions_mm : the encoder reading of each view, as a mapping or as a table with the columns
-        view and position_mm.
-    position_sigma_mm, wander_sigma_mm : standard deviations of the carriage's position along and
-        across the axis. Larger values are used if the views show significantly more scatter.
-
+    svv_px2 or sigma_px. positions_mm : the encoder reading of each view, a mapping or a table with
+    the columns view and position_mm.
+    position_sigma_mm, wander_sigma_mm : as in `StageAxis`.
     Raises InputError for views without a position and for unknown cameras, and CalibrationError for
     fewer than two positions, less than 1 mm between them, or a single camera.
     """
@@ -204,8 +192,7 @@ def stage_axis_of(
 def _dots(
     calibration: Calibration, table: pd.DataFrame, positions_mm: Mapping[str, float] | pd.DataFrame
 ) -> tuple[Dots, list[str]]:
-    """Return the dots that the calibration knows, and notes for the user on those that it does
-    not."""
+    """Return the dots that the calibration knows, and notes on those that it does not."""
     readings = _readings(positions_mm)
     names = [c.name for c in calibration.cameras]
     _check_names(table, "view", list(readings), "has no position")
@@ -235,10 +222,7 @@ def _dots(
 
 
 def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, float]:
-    """Return the encoder reading of each view, from a mapping or a table.
-
-    Raises InputError for a view with two positions and for positions that are not finite.
-    """
+    """Return the encoder reading of each view. Raises InputError for two, or not finite ones."""
     if isinstance(positions_mm, Mapping):
         out = {str(view): float(position) for view, position in positions_mm.items()}
     else:
@@ -285,10 +269,7 @@ def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
 
 
 def _covariance(rows: pd.DataFrame, calibration: Calibration) -> Array:
-    """Return the covariances (M, 2, 2) of the dots' pixels in px^2.
-
-    Without columns for them, the scatter of the dots in the calibration is used.
-    """
+    """Return the pixels' covariances (M, 2, 2), from the columns or the calibration's scatter."""
     if all(c in rows for c in _COVARIANCE):
         uu, uv, vv = rows[_COVARIANCE].to_numpy(float).T
     else:
@@ -302,11 +283,9 @@ def _covariance(rows: pd.DataFrame, calibration: Calibration) -> Array:
 def _observed_sigma(
     state: State, weights: Weights, system: StageEquations, sigma_mm: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the standard deviations of the carriage's position along and across the axis.
+    """Return the carriage's standard deviations, as observed if significantly larger than given.
 
-    Each is the given value, or the observed one if that is significantly larger. A straight line
-    uses up two of the views' positions in each direction, which the degrees of freedom take into
-    account.
+    A straight line uses up two of the views' positions in each direction.
     """
     from scipy.stats import chi2
 
@@ -338,9 +317,7 @@ def _scatter_words(given: tuple[float, float], observed: tuple[float, float]) ->
 
 
 def _suspect_notes(dots: Dots, weights: Weights, system: StageEquations) -> list[str]:
-    """Return notes on readings and dots that got almost no weight, and on having only two
-    positions.
-    """
+    """Return notes on readings and dots of almost no weight, and on only two positions."""
     words = []
     for v in np.flatnonzero(weights.views < _LEAST_WEIGHT):
         words.append(
@@ -415,14 +392,10 @@ _STATE, _RIG, _FIRST_ERROR = 0, 1, 2
 
 @dataclass(frozen=True)
 class Dots:
-    """Holds M measured dots of one target in V views.
+    """M measured dots of one target in V views.
 
-    views : names of the views.
-    reading_mm : (V,) encoder reading of each view.
-    view, camera : (M,) indices of each dot's view and camera.
-    place_mm : (M, 3) position of the dot in the target frame.
-    uv_px : (M, 2).
-    information : (M, 2, 2) inverse covariances of the pixels (1/px^2).
+    reading_mm : (V,). view, camera : (M,) indices. place_mm : (M, 3) in the target frame. uv_px :
+    (M, 2). information : (M, 2, 2) inverse covariances of the pixels (1/px^2).
     """
 
     views: tuple[str, ...]
@@ -436,11 +409,7 @@ class Dots:
 
 @dataclass(frozen=True)
 class State:
-    """Holds the estimated motion of the target in the rig.
-
-    rig_from_target : pose of the target at reading 0.
-    slope : (3,) w, the travel per unit of reading.
-    """
+    """The target's pose in the rig at reading 0, and the travel (3,) per unit of reading."""
 
     rig_from_target: Pose
     slope: Array
@@ -448,7 +417,7 @@ class State:
 
 @dataclass(frozen=True)
 class Weights:
-    """Holds robust weights from 0 to 1 of the dots (M,) and of the views' encoder readings (V,)."""
+    """Robust weights from 0 to 1 of the dots (M,) and of the views' encoder readings (V,)."""
 
     dots: Array
     views: Array
@@ -456,14 +425,11 @@ class Weights:
 
 @dataclass(frozen=True)
 class StageEquations:
-    """Holds the normal equations of the 9 unknowns (pose 6, slope 3), after the carriage's errors
-    were eliminated.
+    """The normal equations of the 9 unknowns (pose 6, slope 3), the carriage's errors eliminated.
 
-    normal, right : (9, 9) and (9,) the matrix and the right-hand side.
-    by_rig : (9, P) block that couples the unknowns with the P parameters of the cameras.
-    shift_mm, shift_covariance : (V, 3) and (V, 3, 3), displacement of each view from the straight
-        line.
-    dot_score : (M,) squared residuals in standard deviations, if each view is shifted freely.
+    normal, right : (9, 9), (9,). by_rig : (9, P) coupling with the cameras' parameters. shift_mm,
+    shift_covariance : (V, 3), (V, 3, 3) of each view from the straight line. dot_score : (M,)
+    squared residuals in standard deviations, if each view is shifted freely.
     """
 
     normal: Array
@@ -483,12 +449,9 @@ def fit(
 ) -> tuple[State, Weights, StageEquations]:
     """Fit the state to the dots by robust Gauss-Newton steps from a start.
 
-    free : for each camera the names of its free intrinsics.
-    sigma_mm : standard deviations of the carriage's position along and across the axis.
-
-    A dot or a reading beyond 3.5 standard deviations loses its weight by `travel_weights`.
-
-    Raises CalibrationError if the fit does not converge.
+    free : for each camera the names of its free intrinsics. sigma_mm : standard deviations along
+    and across the axis. A dot or a reading beyond 3.5 standard deviations loses its weight by
+    `travel_weights`. Raises CalibrationError if the fit does not converge.
     """
     weights = Weights(np.ones(len(dots.view)), np.ones(len(dots.views)))
     system = linearised(cameras, free, dots, state, sigma_mm, weights)
@@ -518,11 +481,9 @@ def fit(
 
 
 def _scores(system: StageEquations, state: State, sigma_mm: float) -> tuple[Array, Array]:
-    """Return the squared distances of the dots (M,) and of the readings (V,), in standard
-    deviations.
+    """Return squared distances of the dots (M,) and of the readings (V,), in standard deviations.
 
-    If the readings scatter by more than twice the stated standard deviation, the observed scatter
-    is used instead of it.
+    If readings scatter by more than twice the stated value, the observed scatter replaces it.
     """
     axis = state.slope / np.linalg.norm(state.slope)
     own = np.einsum("i,vij,j->v", axis, system.shift_covariance, axis)
@@ -541,8 +502,7 @@ def linearised(
     sigma_mm: tuple[float, float],
     weights: Weights,
 ) -> StageEquations:
-    """Return the normal equations at a state. GTSAM eliminates the carriage's error of each
-    view."""
+    """Return the normal equations; GTSAM eliminates the carriage's error of each view."""
     import gtsam
 
     residual, by_point, by_state, by_rig = derivatives(cameras, free, dots, state)
@@ -580,8 +540,7 @@ def linearised(
 
 
 def _across(slope: Array) -> Array:
-    """Return unit vectors as columns (3, 3): the direction of travel and two perpendicular to
-    it."""
+    """Return the direction of travel and two perpendicular unit vectors, as columns (3, 3)."""
     basis, _ = np.linalg.qr(np.column_stack([slope, np.eye(3)]))
     return np.asarray(basis)
 
@@ -589,10 +548,10 @@ def _across(slope: Array) -> Array:
 def derivatives(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], dots: Dots, state: State
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the residuals (M, 2), measured minus predicted, and the derivatives of the prediction.
+    """Return residuals (M, 2), measured minus predicted, and derivatives of the prediction.
 
-    The derivatives are (M, 2, 3) with respect to the rig point, (M, 2, 9) with respect to the
-    state, and (M, 2, P) with respect to the P parameters of the cameras.
+    These are (M, 2, 3) by the rig point, (M, 2, 9) by the state, and (M, 2, P) by the cameras'
+    parameters.
     """
     pose = state.rig_from_target
     points = pose.apply(dots.place_mm) - dots.reading_mm[dots.view, None] * state.slope
@@ -615,9 +574,9 @@ def derivatives(
 def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
     """Return a state in closed form from which `fit` can start.
 
-    The dots of each view are triangulated, the slope is a median over pairs of views, and the
-    target is fitted to the median position of each dot. Raises CalibrationError if no dot is seen
-    by two cameras at two positions.
+    Dots are triangulated, the slope is a median over pairs of views, and the target is fitted to
+    the median position of each dot. Raises CalibrationError if no dot is seen by two cameras at two
+    positions.
     """
     ids = np.unique(dots.place_mm, axis=0, return_inverse=True)[1].reshape(-1)
     keys = dots.view * (ids.max() + 1) + ids
@@ -634,8 +593,7 @@ def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
 
 
 def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
-    """Return the travel per unit of reading (3,) as the median over pairs of views of a dot
-    (Theil-Sen)."""
+    """Return the travel (3,) per unit of reading, the median over pairs of views (Theil-Sen)."""
     slopes = [np.zeros((0, 3))]
     for one in np.unique(dot):
         members = np.flatnonzero(dot == one)

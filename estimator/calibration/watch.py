@@ -53,8 +53,8 @@ class WatchedFolder:
     """The images of a dataset as they arrive; each is detected once.
 
     An image counts as written when its size and time were the same at two polls. One that changes
-    later is detected again, one that is removed is forgotten. A view that lacks a camera's image
-    for longer than ``patience_s`` is named, once.
+    later is detected again. A view that lacks an image for longer than ``patience_s`` is named
+    once.
     """
 
     path: Path
@@ -160,7 +160,7 @@ class WatchedFolder:
         return frozenset((p, s) for p, (s, i) in self._found.items() if i.view in complete)
 
     def detected(self) -> DatasetDots:
-        """Return the dots of all images that have arrived, of all cameras, in one table.
+        """Return the dots of all images that have arrived, in one table.
 
         Raises CalibrationError when no image has arrived, DetectionError when none shows the
         target.
@@ -207,10 +207,9 @@ def watch(
 ) -> tuple[Dataset, CalibrationRun]:
     """Solve whenever a view is complete, until one more would gain little or ``stop`` is set.
 
-    options : model, solver, medium, dots_free, outlier_sd and seed as for `run_calibration`.
-    Returns the dataset of the images that were used and its calibration, walls and stage included.
-
-    Raises CalibrationError or DetectionError when stopped with too little to calibrate.
+    options : as for `run_calibration`. Returns the dataset of the images that were used and its
+    calibration, walls and stage included. Raises CalibrationError or DetectionError when stopped
+    with too little to calibrate.
     """
     check_options(**options, cameras=list(dataset.rig.cameras))
     folder = WatchedFolder(dataset.path, tell)

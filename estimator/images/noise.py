@@ -28,14 +28,11 @@ _CLIPPED_SHARE = 0.01
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Describe the variance of a pixel's grey level as ``alpha + beta * level``.
+    """The variance of a pixel's grey level is ``alpha + beta * level``, in grey levels squared.
 
-    alpha : variance at grey level 0 (grey levels squared); beta : its increase per grey level.
-    step : distance between neighbouring grey levels, 0 for floats. The variance is never less than
-        that of rounding to this step, nor less than at any grey level at which it was measured.
-    relative_error : relative standard deviation of the variance.
-    lowest, highest : range of the grey levels at which the noise was measured.
-    black, white : grey levels at which the image is clipped; infinite where it is not.
+    It is never less than that of rounding to ``step`` (0 for floats), nor less than at any level,
+    from lowest to highest, at which it was measured. relative_error : of the variance. black, white
+    : grey levels at which the image is clipped; infinite where it is not.
     """
 
     alpha: float
@@ -48,11 +45,7 @@ class NoiseModel:
     white: float = np.inf
 
     def is_clipped(self, grey: Array, model: Array) -> Bools:
-        """Return where noise is cut off, in the shape of ``grey``.
-
-        That is where a pixel is clipped, or its expected level ``model`` is within two standard
-        deviations of clipping.
-        """
+        """Return where a pixel is clipped, or its expected level is within 2 sd of clipping."""
         reach = 2.0 * np.sqrt(self.variance(model))
         low = np.minimum(grey, model - reach) <= self.black
         return np.asarray(low | (np.maximum(grey, model + reach) >= self.white))
@@ -77,13 +70,8 @@ def with_inner_level(
 ) -> NoiseModel:
     """Correct the noise model at the grey level of the dots, where the image may have no flat area.
 
-    noise : the model measured in flat areas.
-    inner_level, outer_level : grey levels of the dots and of the background.
-    ratio : mean square of the whitened residuals of the dots' own pixels.
-    pixels : number of these pixels.
-
-    Returns the model unchanged if the noise was measured near ``inner_level``, or if ``ratio``
-    differs from 1 by less than about 4 standard deviations.
+    ratio : mean square of the whitened residuals of the dots' own ``pixels``. The model stays if
+    the noise was measured near ``inner_level``, or if ``ratio`` differs from 1 by less than 4 sd.
     """
     unseen = max(noise.lowest - inner_level, inner_level - noise.highest)
     if unseen < _UNSEEN_SHARE * abs(inner_level - outer_level):
@@ -100,13 +88,9 @@ def with_inner_level(
 def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
     """Return the factor by which the noise variance has to be multiplied.
 
-    noise : the estimate from flat areas of the image.
-    chi2_dof, dof : (N,) chi-square per degree of freedom of N fits, and degrees of freedom.
-
-    Images with many edges have few flat areas, but there the fits' residuals show the noise. The
-    median of chi2_dof is averaged with the estimate, weighted by the inverse variances, if both
-    agree to 3 standard deviations. If not, the model does not fit, and the factor is 1. If the
-    flat areas do not show the noise at all, the median is the factor.
+    chi2_dof, dof : (N,) of N fits. Images with many edges have few flat areas, but there the fits'
+    residuals show the noise: the median of chi2_dof is averaged with the estimate if both agree to
+    3 standard deviations. If not, the factor is 1; without flat areas it is the median.
     """
     if chi2_dof.size == 0:
         return 1.0
@@ -121,10 +105,7 @@ def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
 
 
 def grey_step(image: NDArray[np.generic]) -> float:
-    """Return the distance between neighbouring grey levels of an image (rows, columns).
-
-    It is 0 for floats, and for example 16 for values of 12 bits that are stored in 16 bits.
-    """
+    """Return the distance between grey levels, 0 for floats, 16 for 12 bits stored in 16."""
     if not np.issubdtype(image.dtype, np.integer):
         return 0.0
     levels = np.unique(image[:: max(1, image.shape[0] // 256)]).astype(np.int64)
@@ -132,11 +113,7 @@ def grey_step(image: NDArray[np.generic]) -> float:
 
 
 def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
-    """Return the standard deviation of values (N,), around 0 and without outliers.
-
-    Unlike the median absolute deviation it is not quantised to the grey levels. rounds : largest
-    number of iterations.
-    """
+    """Return the sd of values (N,) around 0 without outliers, not quantised to grey levels."""
     sigma = float(np.std(values))
     for _ in range(rounds):
         kept = values[np.abs(values) <= _CLIP * sigma]
@@ -150,20 +127,13 @@ def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
 
 
 def high_pass(image: Float32) -> Float32:
-    """Remove everything from an image (rows, columns) that is locally a plane.
-
-    The result has the same shape; it is scaled so that white noise keeps its variance.
-    """
+    """Return an image without what is locally a plane; white noise keeps its variance."""
     kernel = _SECOND_DIFFERENCES.astype(np.float32)
     return np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT))
 
 
 def rough_sigma(response: Float32) -> float:
-    """Return a first estimate of the noise's standard deviation (in grey levels).
-
-    response : (rows, columns) the image after `high_pass`. The fifth of its 8 x 8 tiles that
-    varies least is used.
-    """
+    """Return a first estimate of the noise: of the fifth of the 8 x 8 tiles that varies least."""
     rows, columns = (n // 8 * 8 for n in response.shape)
     tiles = response[:rows, :columns].reshape(rows // 8, 8, columns // 8, 8)
     tiles = tiles[:: max(1, response.size // _MAX_SAMPLES)]
@@ -182,16 +152,11 @@ def estimate_noise(
 ) -> NoiseModel:
     """Estimate the noise of an image from its flat areas.
 
-    image : (rows, columns) grey levels; response : the same image after :func:`high_pass`.
-    flat : (rows, columns) whether a pixel is far from all edges.
-    step : distance between neighbouring grey levels, see `grey_step`.
-    clip : grey levels (black, white) at which the image is clipped.
-    bins : largest number of groups of grey levels.
-
-    Pixels are grouped by the grey level of their surroundings, as their own level holds the noise.
-    A line is fitted through the clipped variances of the groups if they differ significantly.
-    Groups that the image's clipping touches are left out, as it hides their noise. If it touches
-    all, the noise is unknown, which an infinite ``relative_error`` of the result says.
+    response : the image after `high_pass`. flat : whether a pixel is far from all edges. step : see
+    `grey_step`. clip : grey levels (black, white) at which the image is clipped.
+    Pixels are grouped by the grey level of their surroundings. A line is fitted through the clipped
+    variances of the groups if they differ significantly. Groups that the image's clipping touches
+    are left out; if it touches all, the ``relative_error`` of the result is infinite.
     """
     level = cv2.blur(image, (5, 5))
     if np.count_nonzero(flat) >= 64:
@@ -235,10 +200,7 @@ def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float
 
 
 def check_grey_image(image: NDArray[Any], least_size_px: int, wanted: str) -> None:
-    """Raise InputError for anything but a finite 2-D image of at least ``least_size_px`` per side.
-
-    wanted : what is looked for in the image, in the plural, for the message.
-    """
+    """Raise InputError for anything but a finite 2-D image of ``least_size_px`` per side."""
     if image.ndim != 2:
         raise InputError(
             f"a grey image has 2 dimensions, this array has {image.ndim}: {image.shape}",

@@ -25,10 +25,10 @@ from telerig.rig.camera import Camera
 
 @dataclass(frozen=True)
 class TankView:
-    """Lab places (2,) in mm: the coordinates along the travel and across it that one camera sees.
+    """Coordinates (2,) in mm along and across the travel that one camera sees.
 
-    basis : (2, 3) unit vectors in rig axes, perpendicular to the camera's middle ray. origin : (3,)
-    rig mm.
+    basis : (2, 3) unit vectors in rig axes, perpendicular to the camera's middle ray. origin :
+    (3,).
     """
 
     camera: Camera
@@ -115,9 +115,8 @@ _TOO_MANY_LOST = 2
 class Mark:
     """A dot of the strip: its place (2,) in the lab in mm, and how often and where it was seen.
 
-    epoch : which start of following it belongs to. low_px, high_px : (2,) range of its pixels.
-    left_out : number of frames in which it should have been seen, by the reason why it was not
-    measured.
+    epoch : of its following. low_px, high_px : (2,) range of its pixels. left_out : number of
+    frames without a measurement, by the reason.
     """
 
     number: int
@@ -149,10 +148,7 @@ class _Shift:
 
 
 class Follower:
-    """One camera's dots, frame by frame.
-
-    diameter_mm : of a dot. margin_px : least distance of a whole dot's centre from the border.
-    """
+    """One camera's dots, frame by frame; margin_px from the border is the least for a whole dot."""
 
     def __init__(
         self, view: TankView, *, diameter_mm: float, margin_px: float, frame_count: int
@@ -173,11 +169,7 @@ class Follower:
     def add(
         self, frame: int, dots: DotSightings, position_mm: float | None
     ) -> list[tuple[int, int]]:
-        """(dot, mark's number) of the frame's dots that are marks.
-
-        position_mm : of the stage, None where it is not known. Frames come in order; those without
-        an image may be left out.
-        """
+        """Return (dot, mark's number) of a frame's dots that are marks. Frames come in order."""
         known = position_mm is not None and bool(np.isfinite(position_mm))
         if known and position_mm is not None:
             self._held_mm = position_mm
@@ -202,10 +194,7 @@ class Follower:
         return self._new_marks(frame, place - predicted, dots, range(len(place)))
 
     def kept(self, *, moved: bool) -> list[Mark]:
-        """Return the marks that stayed at one place of the tank while it passed the image.
-
-        moved : whether the tank did pass; if not, being seen often has to suffice.
-        """
+        """Return the marks that stayed at one place of the tank while it passed the image."""
         far = self.diameter_mm * self._scale if moved else 0.0
         return [
             m
@@ -379,9 +368,8 @@ _PAD_PX = 2.0
 class StripInImages:
     """Where one camera sees the strip's dots, whether whole or not, measured or not.
 
-    places_mm : (K, 2) lab; epochs : (K,). shift_mm : (F, 2) of each frame. position_mm : (F,).
-    epoch_starts : first frame of each epoch; a dot's place is valid in its own epoch.
-    line_mm : least and greatest place across the travel. diameter_mm : of a dot.
+    places_mm : (K, 2) lab; epochs : (K,), in which a place is valid; epoch_starts : first frames.
+    shift_mm : (F, 2). position_mm : (F,). line_mm : least and greatest place across the travel.
     """
 
     view: TankView
@@ -439,10 +427,7 @@ class StripInImages:
         return out
 
     def are_dots(self, frame: int, bubbles: pd.DataFrame) -> Bools:
-        """(n,) which rows of a table of detections are dots of the strip.
-
-        They are told by their place and size; those that the border cuts, by the strip's line.
-        """
+        """Return (n,) which detections are dots of the strip, by place and size, or by its line."""
         uv = bubbles[["u_px", "v_px"]].to_numpy(float)
         size, centres = bubbles["d_eq_px"].to_numpy(float), self.centres_px(frame)
         if not len(uv):

@@ -37,9 +37,9 @@ _RING_TAIL, _RING_STEP = 0.1, 0.25
 class DotLook:
     """The appearance of a strip's dots in one camera, and where in the image they may be.
 
-    windows : image parts that the strip passes through. All others are medians over the dots:
-    a_px >= b_px : semi-axes. contrast : grey step over the brighter level. chi2_dof : misfit of the
-    luminance fit. blur_px : of the edge.
+    windows : image parts that the strip passes through. Others are medians over the dots: a_px >=
+    b_px semi-axes; contrast : grey step over the brighter level; chi2_dof : of the luminance fit;
+    blur_px.
     """
 
     polarity: Polarity
@@ -72,11 +72,9 @@ def learn_look(
     polarity: Polarity,
     diameter_px: float,
 ) -> DotLook | None:
-    """The appearance of the strip's dots in a sample of whole images; None where no strip is seen.
+    """Return the appearance of the strip's dots in a sample of images; None where none is seen.
 
-    travel_px : (2,) direction in which the strip passes through the image, of any length.
-    A strip's dots lie at the same distance from the line of travel in several images; bubbles do
-    not.
+    Its dots lie at the same distance from the line of travel ``travel_px`` (2,) in several images.
     """
     across = np.array([-travel_px[1], travel_px[0]]) / np.linalg.norm(travel_px)
     rows, shape, count = [], (0, 0), 0
@@ -176,10 +174,7 @@ def _bands(seen: Array, across: Array, diameter_px: float) -> list[Ints]:
 
 
 def _window(place: Array, across: Array, diameter_px: float, shape: Sequence[int]) -> Window:
-    """The part of the image that the band from the least to the greatest ``place`` crosses.
-
-    place : coordinates along ``across`` of the dots of one strip.
-    """
+    """Return the part of the image that the band from least to greatest ``place`` crosses."""
     reach = 1.5 * diameter_px + 6
     low, high = float(place.min()) - reach, float(place.max()) + reach
     height, width = shape

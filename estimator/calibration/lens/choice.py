@@ -118,13 +118,13 @@ class Step:
 
     @property
     def p_value(self) -> float:
-        """The probability of such a gain if the added parameters are zero; NaN for the first step."""
+        """The probability of such a gain if the added parameters are zero; NaN without any."""
         return float(chdtrc(len(self.added), self.gain)) if self.added else float("nan")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen lens model, the steps that led to it and those not taken, and sentences on them."""
+    """The chosen lens model, the steps that led to it and those not taken, and their words."""
 
     steps: tuple[Step, ...]
     chosen: FittedModel
@@ -315,7 +315,7 @@ def _without_worse_predictions(steps: list[Step]) -> list[Step]:
 def _not_taken(
     quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
 ) -> list[Step]:
-    """Return what one more group would have gained, except for tilts and groups that were refused."""
+    """Return what one more group would have gained, except for tilts and refused groups."""
     known = {(step.camera, step.added) for step in refused}
     out = []
     for camera, group, lenses in additions(chosen, allowed):
@@ -400,7 +400,7 @@ POSE_STEPS = 3
 
 
 def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
-    """Return the state after Gauss-Newton steps of every view's pose, cameras and dots held fixed."""
+    """Return the state after Gauss-Newton steps of every view's pose alone."""
     system = System(problem)
     for _ in range(steps):
         normal = np.zeros((len(problem.views), 6, 6))

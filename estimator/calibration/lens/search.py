@@ -51,18 +51,14 @@ estimated."""
 
 @dataclass(frozen=True)
 class QuadraticCost:
-    """Describes the cost as a quadratic form in K coordinates, at the minimum of a rich model.
+    """The cost as a quadratic form in K coordinates, at the minimum of a rich model.
 
-    names : (camera, parameter) of each coordinate. The two sums of each camera that describe a
-        homography come last.
-    offset : (K,) the coordinates at the minimum, relative to nominal.
-    covariance : (K, K) of the coordinates.
-    prior : (K,) prior standard deviations.
-    least : chi-square at the minimum.
-    variance : of the residuals, relative to the stated noise; 1 if the stated noise is right. All
-        values of chi-square are divided by it.
-    penalty : of one free parameter, in chi-square.
-    group_penalty : of a group, in addition to the penalty of its parameters.
+    names : (camera, parameter) of each coordinate; the two sums of each camera that describe a
+    homography come last. offset : (K,) at the minimum, relative to nominal. covariance : (K, K).
+    prior : (K,) standard deviations.
+    least : chi-square at the minimum. variance : of the residuals, relative to the stated noise, by
+    which chi-square is divided. penalty : of one free parameter; group_penalty : of a group
+    besides.
     """
 
     names: tuple[tuple[int, str], ...]
@@ -127,18 +123,12 @@ class QuadraticCost:
         return self.rise(lenses) + sum(self.penalty_of(lens) for lens in lenses)
 
     def cost_of_fit(self, lenses: Lenses, fitted_cost: float) -> float:
-        """Return the value of the criterion for a model that was fitted.
-
-        fitted_cost : half the model's chi-square.
-        """
+        """Return the criterion of a fitted model; fitted_cost is half its chi-square."""
         penalties = sum(self.penalty_of(lens) for lens in lenses)
         return 2 * fitted_cost / self.variance - self.least + penalties
 
     def penalty_of(self, lens: Lens) -> float:
-        """Return the penalty of one camera's model.
-
-        A tilt counts as two groups, because it describes a stretch and a homography.
-        """
+        """Return the penalty of a model; a tilt counts as two groups, stretch and homography."""
         free = sum(len(GROUPS[g]) for g in lens - {"centre"})
         return self.penalty * free + self.group_penalty * len((lens - {"centre"}) | _also(lens))
 
@@ -179,9 +169,8 @@ def _held_by(lens: Lens) -> frozenset[str]:
 def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) -> float:
     """Return the variance of the residuals relative to the stated noise.
 
-    It is chi-square of the images divided by its expectation, with the stated noise counted as
-    `NOISE_DOF` additional degrees of freedom. E[r^T r] = number of residuals - number of parameters
-    + trace(C P), where C is the covariance and P the information of the priors (docs/theory.md).
+    It is chi-square of the images over its expectation, number of residuals - number of parameters
+    + trace(C P) (docs/theory.md); the stated noise adds `NOISE_DOF` degrees of freedom.
     """
     error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
     shared = sum(len(f) for f in problem.free)
@@ -200,9 +189,8 @@ def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) 
 def possible(rich: Lens) -> list[Lens]:
     """Return every lens model that a rich one contains.
 
-    k2 is free only with k1, and a tilt replaces aspect and skew. A model with a tilt does not
-    contain s, because both could describe the same homography. If the centre is free, the centre
-    and kappa always are.
+    k2 is free only with k1, a tilt replaces aspect and skew, and excludes s, because both could
+    describe the same homography. If the centre is free, the centre and kappa always are.
     """
     always = rich & {"centre", "kappa"} if "centre" in rich else Lens()
     richest = rich | {"tilt"} if {"affine", "p", "s"} <= rich else rich
@@ -210,12 +198,10 @@ def possible(rich: Lens) -> list[Lens]:
 
 
 def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lenses:
-    """Return the model with the lowest cost.
+    """Return the model with the lowest cost, among lens models ``allowed`` for each camera.
 
-    The model of one camera after the other is optimised until none changes, once from the richest
-    and once from the simplest model; the better result is returned.
-
-    allowed : for each camera the lens models to choose from.
+    One camera after the other is optimised until none changes, from the richest and from the
+    simplest model; the better result is returned.
     """
     ends = []
     for start in (max, min):

@@ -132,7 +132,7 @@ class Calibration(ShortText):
         return pd.DataFrame.from_dict(rows, orient="index", columns=["value", "sd"])
 
     def camera(self, camera: str | int) -> Camera:
-        """Return one camera by name or index. Raises CalibrationError if there is no such camera."""
+        """Return one camera by name or index; CalibrationError if there is no such camera."""
         if isinstance(camera, (int, np.integer)) and 0 <= camera < len(self.cameras):
             return self.cameras[camera]
         for candidate in self.cameras:
@@ -195,7 +195,7 @@ class Calibration(ShortText):
         return np.asarray(cv2.remap(pixels, source[..., 0], source[..., 1], cv2.INTER_CUBIC))
 
     def project_covariance(self, camera: str | int, points_mm: ArrayLike) -> Array:
-        """Return covariances (N, 2, 2) in px^2 that the calibration's errors give projected points."""
+        """Return covariances (N, 2, 2) in px^2 of projections, due to the calibration's errors."""
         index = self.cameras.index(self.camera(camera))
         jacobian = rig_jacobian(self.cameras, self.free, np.asarray(points_mm, float))
         rows = jacobian[..., 2 * index : 2 * index + 2, :]
@@ -335,8 +335,7 @@ class Calibration(ShortText):
         )
 
     def sd(self, name: str) -> float:
-        """Return the standard deviation of a parameter in ``covariance_names``, 0 if it was held
-        fixed.
+        """Return the standard deviation of a parameter in ``covariance_names``; 0 if held fixed.
 
         Raises InputError, with the most similar name, for one that is no parameter of this rig.
         """

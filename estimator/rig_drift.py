@@ -119,7 +119,7 @@ class Noise:
         return out
 
     def slopes(self, lag_s: Array) -> tuple[Array, Array]:
-        """Return derivatives of `own` (2, L) and `common` (3 n, L) by logarithms of their numbers."""
+        """Return derivatives of `own` (2, L) and `common` (3 n, L) by logarithms of numbers."""
         lag, own = np.abs(lag_s), self.own(lag_s)
         common = []
         for rms, decay, hz in self.shake:

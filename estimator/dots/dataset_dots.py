@@ -33,13 +33,11 @@ MEASURED = [
 
 @dataclass(frozen=True)
 class TargetDetection:
-    """Hold the target as it was found in one image.
+    """The target as it was found in one image.
 
-    table : a row for each numbered dot, sorted by number: dot (number), row, column (on the target)
-        and the measured columns of `locate_dots` up to chi2_dof.
-    rejected : a row for each candidate that was left out: u_px, v_px, a_px, b_px, angle_rad and the
-        reason in words.
-    numbering : how the dots were numbered.
+    table : a row for each numbered dot, sorted by number: dot, row, column and the measured columns
+    of `locate_dots` up to chi2_dof. rejected : candidates that were left out (u_px, v_px, a_px,
+    b_px, angle_rad, reason). numbering : how the dots were numbered.
     """
 
     table: pd.DataFrame
@@ -48,17 +46,13 @@ class TargetDetection:
 
 
 def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
-    """Find the target's dots in an image and number them.
-
-    image : (rows, columns) grey levels.
-    target : the target, as `rig.toml` describes it.
+    """Find the target's dots in an image (rows, columns) of grey levels and number them.
 
     Returns a table with a row for each dot and the columns dot (number), row, column, u_px, v_px,
-    suu_px2, suv_px2, svv_px2, a_px, b_px, angle_rad, chi2_dof; see `locate_dots`. A symmetric
-    target without marks can be numbered in several ways that fit equally well; the table then
-    holds one of them.
-    Raises DetectionError if the target is not found or its numbers are ambiguous, and InputError
-    if ``image`` is no grey image.
+    suu_px2, suv_px2, svv_px2, a_px, b_px, angle_rad, chi2_dof; see `locate_dots`. For a symmetric
+    target without marks it holds one of several equal numberings.
+    Raises DetectionError if the target is not found or its numbers are ambiguous, and InputError if
+    ``image`` is no grey image.
     """
     measured = measure_dots(image, polarity=target.polarity)
     return _clearly_numbered(measured, target, image.shape).table
@@ -67,9 +61,7 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
 def _clearly_numbered(
     measured: DotMeasurement, target: Target, image_shape: tuple[int, ...]
 ) -> TargetDetection:
-    """Number the target's dots. Raises DetectionError, also for ambiguous numbers, and says where
-    the marks are seen if `rig.toml` has them elsewhere.
-    """
+    """Number the target's dots; DetectionError, which says where marks are, if ambiguous."""
     try:
         found = numbered(measured, target)
         if found.numbering.ambiguous:
@@ -94,9 +86,8 @@ def _described_otherwise(
 
 
 def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
-    """Number the target's dots among the measured dots of an image.
+    """Number the target's dots among the measured ones; ``numbering.ambiguous`` may be True.
 
-    An ambiguous numbering is returned, too; ``numbering.ambiguous`` of the result says so.
     Raises DetectionError if the dots cannot be numbered at all.
     """
     numbering = number_dots(measured.dots, target)
@@ -123,12 +114,7 @@ def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
 
 
 def rejected_table(measured: DotMeasurement, index: Any, reason: Any) -> pd.DataFrame:
-    """Return the table of all rejected candidates of an image.
-
-    measured : the dots and the blobs that are no dots.
-    index : (n,) positions of dots that are rejected as well, or a slice.
-    reason : (n,) reasons in words, or one for all.
-    """
+    """Return an image's rejected candidates: blobs, and dots at ``index`` for their reasons."""
     dots = measured.dots.iloc[index].assign(reason=reason)[REJECTED]
     parts = [part for part in (measured.rejected, dots) if len(part)]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=REJECTED)
@@ -141,16 +127,11 @@ REACH = 1.7
 def dot_example(
     image: NDArray[Any], u_px: float, v_px: float, a_px: float, *, polarity: Any
 ) -> dict[str, Array] | None:
-    """Fit the dot nearest to a pixel, as an example for the report.
+    """Fit the dot nearest to a pixel, as an example for the report; None if it is not found.
 
-    image : (rows, columns) grey levels.
-    u_px, v_px : position of the dot; a_px : its semi-major axis (px).
-    polarity : as for `locate_dots`.
-
-    Returns None if the dot is not found. Otherwise it returns a mapping: "patch" and "model", (h,
-    w) measured and fitted grey levels of a crop of h x w pixels; "u0" and "v0", the crop's first
-    pixel; "u_px", "v_px", "a_px", "b_px" and "angle_rad", the fitted ellipse; "noise", the standard
-    deviation of a grey level.
+    Returns "patch" and "model", (h, w) measured and fitted grey levels; "u0" and "v0", the crop's
+    first pixel; the fitted ellipse "u_px", "v_px", "a_px", "b_px" and "angle_rad"; "noise", the
+    standard deviation of a grey level.
     """
     half = int(np.ceil(REACH * a_px + 5))
     v0, u0 = max(0, round(v_px) - half), max(0, round(u_px) - half)
@@ -196,15 +177,11 @@ NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
 
 @dataclass(frozen=True)
 class ImageDots:
-    """Hold what was found in one image.
+    """What was found in one image.
 
-    view, camera : names of the view and of the camera.
-    dots, rejected : tables of the numbered dots and of the rejected candidates, see
-        `TargetDetection`.
-    handedness : +1; -1 if the image shows the target mirrored; 0 if the target was not found.
-    failure : why the image was left out; empty if it is used.
-    notes : sentences for the user.
-    overlay : JPEG data of the image with all dots and candidates drawn; empty if not asked for.
+    dots, rejected : see `TargetDetection`. handedness : +1; -1 if the image shows the target
+    mirrored; 0 if the target was not found. failure : why the image was left out, or "". overlay :
+    JPEG data of the image with dots and candidates, or empty.
     """
 
     view: str
@@ -219,12 +196,9 @@ class ImageDots:
 
 @dataclass(frozen=True)
 class DatasetDots:
-    """Hold what was found in all images of a dataset.
+    """What was found in all images of a dataset, in the order of views and cameras.
 
-    dots, rejected : tables of all images together; their first columns are view and camera.
-    images : the results of the images, in the order of views and cameras.
-    notes : sentences for the user.
-    example : one dot with its fit, as `dot_example` returns it; empty if no overlays were made.
+    dots, rejected : tables of all images, with view and camera. example : as `dot_example`.
     """
 
     dots: pd.DataFrame
@@ -242,15 +216,12 @@ def detect_dataset(
     overlays: bool = False,
     meanwhile: Callable[[], object] | None = None,
 ) -> DatasetDots:
-    """Detect the target in every calibration image of a dataset.
+    """Detect the target in every calibration image of a dataset, by ``workers`` processes.
 
-    progress : function that is called with (images done, images in all); None for none.
-    workers : number of processes; None takes one per core where that saves time.
-    overlays : draw the overlay of each image, and fit one dot as an example.
-    meanwhile : called in this process while the worker processes run.
-
-    Raises InputError for images that cannot be read, DetectionError when no image shows the
-    target or when images contradict each other's handedness.
+    progress : is called with (images done, images in all). overlays : draw the overlay of each
+    image, and fit one dot as an example. meanwhile : is called in this process while others work.
+    Raises InputError for images that cannot be read, DetectionError when no image shows the target
+    or when images contradict each other's handedness.
     """
     tasks = [(view, camera) for view in dataset.views for camera in view.image_paths]
     count = _workers(dataset, len(tasks)) if workers is None else workers
@@ -277,11 +248,8 @@ def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str
 
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:
-    """Read one image of a dataset and detect the target in it.
+    """Read one image of a dataset and detect the target in it; the result may have a ``failure``.
 
-    overlay : whether to draw the result over the image.
-
-    A target that is not found is no error; the result's ``failure`` says so.
     Raises InputError if the image cannot be read.
     """
     image = dataset.image(view, camera)
@@ -301,7 +269,7 @@ def _detect_task(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> Ima
 def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
     """Put the results of all images together.
 
-    Raises DetectionError if no image shows the target, or if only some of the images are mirrored.
+    Raises DetectionError if no image shows the target, or if only some of them are mirrored.
     """
     failures = [i for i in found if i.failure]
     if len(failures) == len(found):

@@ -67,14 +67,7 @@ _MOVED_SD = 0.1
 
 @dataclass(frozen=True)
 class DotMeasurement:
-    """Hold the dots of one image.
-
-    dots : table with a row for each accepted dot; `locate_dots` describes its columns.
-    rejected : table of the candidates that are no dots: ellipse (u_px, v_px, a_px, b_px,
-        angle_rad) and the reason in words.
-    noise : model of the image's noise.
-    polarity : "white_on_black" or "black_on_white", as it was used.
-    """
+    """The dots of one image, candidates that are no dots, the noise, and the polarity used."""
 
     dots: pd.DataFrame
     rejected: pd.DataFrame
@@ -88,19 +81,16 @@ def locate_dots(
     polarity: Literal["auto", "white_on_black", "black_on_white"] = "auto",
     min_diameter_px: float = 5.0,
 ) -> pd.DataFrame:
-    """Find all dots in a grey image.
+    """Find all dots in a grey image (rows, columns).
 
-    image : (rows, columns) grey levels.
-    polarity : whether the dots are white on black or black on white; "auto" decides this.
-    min_diameter_px : smaller dots are left out (px).
-
+    polarity : "white_on_black", "black_on_white", or "auto", which decides this. min_diameter_px :
+    smaller dots are left out.
     Returns a table with a row for each dot, in no particular order. Its columns are: ``u_px``,
-    ``v_px`` centre; ``suu_px2``, ``suv_px2``, ``svv_px2`` covariance of the centre; ``a_px`` >=
-    ``b_px`` semi-axes; ``angle_rad`` angle of the major axis from +u towards +v; ``chi2_dof``
-    chi-square per degree of freedom of the fit; ``inner_level``, ``outer_level`` grey levels of the
-    dot and of the background at the centre; ``blur_px`` standard deviation of the optical blur;
-    ``ring`` whether it is a mark with a hole; ``noise`` standard deviation of a grey level.
-
+    ``v_px`` centre; ``suu_px2``, ``suv_px2``, ``svv_px2`` its covariance; ``a_px`` >= ``b_px``
+    semi-axes; ``angle_rad`` angle of the major axis from +u towards +v; ``chi2_dof`` chi-square per
+    degree of freedom of the fit; ``inner_level``, ``outer_level`` grey levels of the dot and of the
+    background; ``blur_px`` standard deviation of the optical blur; ``ring`` whether it is a mark
+    with a hole; ``noise`` standard deviation of a grey level.
     Raises InputError for anything but a 2-D array of finite numbers.
     """
     return measure_dots(image, polarity=polarity, min_diameter_px=min_diameter_px).dots
@@ -113,10 +103,7 @@ def measure_dots(
     min_diameter_px: float = 5.0,
     max_diameter_px: float = np.inf,
 ) -> DotMeasurement:
-    """Find all dots like :func:`locate_dots`; return the rejected candidates and the noise as well.
-
-    max_diameter_px : larger blobs are left out, and are not used for the typical size of the dots.
-    """
+    """Find dots like :func:`locate_dots`; return rejected candidates and the noise, too."""
     grey = _checked(image, polarity, min_diameter_px)
     keep_freed_memory()
     response = high_pass(grey)
@@ -209,12 +196,7 @@ def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel
 
 @dataclass(frozen=True)
 class _Scene:
-    """Hold an image and the blobs in it whose dots are to be fitted.
-
-    grey : (rows, columns) grey levels.
-    labels : (rows, columns) number of the blob to which a pixel belongs, 0 for none.
-    blobs : the blobs to fit.
-    """
+    """Grey levels (rows, columns), the blob's number of each pixel (0: none), and blobs to fit."""
 
     grey: Float32
     labels: NDArray[np.int32]
@@ -242,9 +224,8 @@ class _Scene:
     def second_fits(self, fits: list[DotFit], noise: NoiseModel) -> list[DotFit]:
         """Fit each dot again, with the illumination and its neighbours known from the first fits.
 
-        Dots that share pixels are fitted in turn. Each time, the light of the neighbours is
-        subtracted as their last fits predict it, until no dot moves any more (Gauss-Seidel
-        iteration; its limit is the fit of all dots together).
+        Of dots that share pixels, each is fitted after the light of the others was subtracted,
+        until none moves (Gauss-Seidel iteration; its limit is the fit of all dots together).
         """
         priors = with_common_blur(contrast_gradients(fits, self.grey.shape), fits)
         neighbours = close_neighbours(fits)

@@ -21,12 +21,10 @@ MOST_IMAGES = 6
 
 @dataclass(frozen=True)
 class TargetProposal:
-    """Hold what the images of one camera or several show.
+    """What the images of one camera or several show.
 
-    cameras : name, (width, height) in px and scale in px/mm of each.
-    pitch_px : the larger pitch of the grid, without foreshortening, in the first camera.
-    lines : the lines of [target].
-    words : what was found, for the user.
+    cameras : name, (width, height) in px and scale in px/mm. pitch_px : the larger pitch, without
+    foreshortening, in the first camera. lines : of [target]. words : for the user.
     """
 
     cameras: tuple[tuple[str, tuple[int, int], float], ...]
@@ -38,13 +36,11 @@ class TargetProposal:
 def target_from_images(
     folder: Path, *, pitch_mm: float | None, scale_px_per_mm: float
 ) -> TargetProposal:
-    """Describe the target that the images of a folder show.
+    """Describe the target that images in a folder, or in one folder for each camera, show.
 
-    folder : a folder of images, or one folder of images for each camera.
-    pitch_mm : the known distance of neighbouring dots (along x); None if only the scale is known.
-    scale_px_per_mm : nominal scale of the first camera, used where no pitch is given.
-
-    Raises InputError if there are no images, DetectionError if none shows a grid of dots.
+    pitch_mm : the known distance of neighbouring dots (along x). scale_px_per_mm : nominal scale of
+    the first camera, used where no pitch is given. Raises InputError if there are no images,
+    DetectionError if none shows a grid of dots.
     """
     found, failures = [], []
     for name, images in _images_by_camera(folder).items():

@@ -22,10 +22,7 @@ _GAP = 2.5
 
 @dataclass(frozen=True)
 class Grid:
-    """Hold n times start_s + k step_s, and the knot spacing of the kernel in steps.
-
-    knots : at least 2.
-    """
+    """Times start_s + k step_s (n,), and the knot spacing of the kernel in steps, at least 2."""
 
     start_s: float
     step_s: float
@@ -67,10 +64,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Accelerations:
-    """Hold smoothed accelerations on a grid.
-
-    values : (n, D) in mm/s^2, 0 where unknown.  known : (n,).
-    """
+    """Smoothed accelerations (n, D) in mm/s^2 on a grid, 0 where not known (n,)."""
 
     grid: Grid
     values: Array
@@ -102,10 +96,7 @@ def of_positions(grid: Grid, t_s: ArrayLike, positions_mm: ArrayLike) -> Acceler
 
 
 def of_readings(grid: Grid, t_s: ArrayLike, readings_mm_s2: ArrayLike) -> Accelerations:
-    """Return the smoothed readings (N, 3) of an accelerometer, without their median.
-
-    Its grid covers the whole record, with the steps of ``grid``.
-    """
+    """Return the smoothed readings (N, 3) less their median, over the whole record."""
     from scipy.signal import fftconvolve
 
     t, reading = np.asarray(t_s, float), np.asarray(readings_mm_s2, float)

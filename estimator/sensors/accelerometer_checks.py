@@ -23,18 +23,12 @@ _SMOOTHED_S = 0.03
 
 
 def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> list[Finding]:
-    """Return what is wrong with unit, gravity and axes of one sensor.
-
-    up : (3,) upward direction in rig axes.  gravity_m_s2 : of the laboratory.
-    """
+    """Return what is wrong with unit, gravity and axes of one sensor; up (3,) in rig axes."""
     return _check_gravity(sensor, np.asarray(up, float), gravity_m_s2) or check_axes(sensor, up)
 
 
 def gravity_of(reading: ArrayLike) -> Array:
-    """Return the median reading (3,) of N readings (N, 3), which is gravity plus bias.
-
-    Shake and clipping hardly change the median.
-    """
+    """Return the median (3,) of readings (N, 3): gravity plus bias, hardly changed by shake."""
     return np.asarray(np.median(np.asarray(reading, float), axis=0))
 
 
@@ -89,11 +83,7 @@ def _check_gravity(sensor: Sensor, up: Array, gravity_m_s2: float) -> list[Findi
 
 
 def check_axes(sensor: Sensor, up: ArrayLike) -> list[Finding]:
-    """Return a finding if gravity does not point up with the stated mounting, and axes that would
-    fit.
-
-    up : (3,) upward direction in rig axes.
-    """
+    """Return a finding if gravity does not point ``up`` (3,), with axes that would fit."""
     gravity, axes = gravity_of(sensor.reading_m_s2), sensor.axes
     angle = _tilt_deg(gravity, axes, up)
     if angle < _TILTED_DEG:
@@ -116,11 +106,10 @@ def check_axes(sensor: Sensor, up: ArrayLike) -> list[Finding]:
 
 
 def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | None:
-    """Return the given axes with rows exchanged or reversed such that gravity points up.
+    """Return the given axes (3, 3) with rows exchanged or reversed such that gravity points up.
 
-    Of the 24 right-handed exchanges, the one that changes the entries least is returned, as (3, 3).
-    None is returned if no exchange brings gravity within 15 degrees of up. A rotation about the
-    vertical remains undetermined.
+    Of the 24 right-handed exchanges it is the one that changes the entries least; None if none
+    brings gravity within 15 degrees of up. A rotation about the vertical remains undetermined.
     """
     from scipy.spatial.transform import Rotation
 
@@ -142,11 +131,9 @@ def _tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
 
 
 def check_motion(sensor: Sensor, stage: Array, along: Array) -> list[Finding]:
-    """Return a warning if the carriage's acceleration appears on another axis of the sensor than
-    stated.
+    """Return a warning if another axis of the sensor than stated feels the carriage accelerate.
 
-    stage : (E, 2) times (s) and positions (mm) of the encoder.
-    along : (3,) travel axis in the sensor's axes.
+    stage : (E, 2) times (s) and positions (mm). along : (3,) travel axis in the sensor's axes.
     """
     found = motion_correlation(sensor.t_s, sensor.reading_m_s2, stage[:, 0], stage[:, 1])
     if found is None:
@@ -172,13 +159,10 @@ def check_motion(sensor: Sensor, stage: Array, along: Array) -> list[Finding]:
 def motion_correlation(
     t_s: ArrayLike, reading: ArrayLike, stage_t_s: ArrayLike, position_mm: ArrayLike
 ) -> Array | None:
-    """Return the correlation (3,) of each sensor axis with the carriage's acceleration.
+    """Return the correlation (3,) of each sensor axis with the carriage's acceleration, or None.
 
-    Both are smoothed over 30 ms. None is returned if the records overlap by less than 0.3 s, or if
-    the carriage does not accelerate.
-
-    t_s, reading : (N,) times and (N, 3) readings of the accelerometer.
-    stage_t_s, position_mm : (E,) times and positions of the encoder.
+    Both are smoothed over 30 ms. There is none if the records (N,), (N, 3) and (E,) overlap by less
+    than 0.3 s, or if the carriage does not accelerate.
     """
     from scipy.signal import savgol_coeffs
 

@@ -36,11 +36,7 @@ _RIDGE = 1e-5
 
 @dataclass(frozen=True)
 class Channel:
-    """Hold an acceleration that sensors explain.
-
-    name : in words.  values, known : (n,) in mm/s^2 on the grid of the images.
-    sensors : indices of the sensors whose axes explain it.
-    """
+    """An acceleration (n,) in mm/s^2, on the grid of the images, that some sensors explain."""
 
     name: str
     values: Array
@@ -53,10 +49,7 @@ class Channel:
         at: int,
         whitening: Array | None = None,
     ) -> tuple[Array, Array]:
-        """Return the known values (m,) and their fit by the readings at a lag, means removed.
-
-        at : index of the lag.  whitening : filter for both; None for none.
-        """
+        """Return known values (m,) and their fit at a lag, means removed, whitened if wanted."""
         x = np.concatenate([readings[s].values for s in self.sensors], axis=1)
         index = np.arange(len(self.values)) + at - (len(self.values) - 1)
         inside = (index >= 0) & (index < len(x)) & self.known
@@ -70,16 +63,13 @@ class Channel:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Hold the offset of a clock.
+    """The offset of a clock: a sample stamped t was measured at t - offset_s.
 
-    offset_s, sd_s : a sample stamped t was measured at t - offset_s. The sd includes how far the
-        channels disagree.
-    nats : log-likelihood ratio at the peak, against no connection at all.
-    runner_up_nats, runner_up_s : the same at the best other lag, and that lag.
-    reversed_nats : the best with the record reversed in time, which no true connection survives.
-    at_zero_nats : the best at offsets that a clock shared with the frames can have.
-    at_end : whether the peak lies at the end of the lags that were tried.
-    explained : by channel, the share of its variance that the sensors explain at the peak.
+    sd_s : includes how far the channels disagree. nats : log-likelihood ratio at the peak, against
+    no connection at all; runner_up_nats, runner_up_s : at the best other lag; reversed_nats : the
+    best with the record reversed in time; at_zero_nats : the best at offsets of a shared clock.
+    at_end : whether the peak lies at the end of the lags that were tried. explained : by channel,
+    the share of its variance that the sensors explain at the peak.
     """
 
     offset_s: float
@@ -123,9 +113,8 @@ def align(
 ) -> Alignment | None:
     """Return the offset of the clock that the sensors share, or None if no lag can be tried.
 
-    frames : the grid of the channels.
-    readings : of the sensors, on one grid with the steps of ``frames``.
-    near_s : the largest offset of a clock that is that of the frames.
+    frames : the grid of the channels. readings : on one grid with the same steps. near_s : the
+    largest offset of a clock that is that of the frames.
     """
     own = readings[0].grid
     shift = round((frames.start_s - own.start_s) / frames.step_s)
@@ -170,10 +159,7 @@ def align(
 
 @dataclass(frozen=True)
 class _Profile:
-    """Hold for each lag the share of a channel's variance that is explained, and the overlap.
-
-    explained, overlap : (lags,).  reverse : whether the record runs backwards.
-    """
+    """A channel's explained share of variance, and the overlap, for each lag (lags,)."""
 
     channel: Channel
     explained: Array
@@ -240,8 +226,8 @@ def filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bool
 def effective_size(residual: Array, fit: Array) -> float:
     """Return the number of independent samples that a regression of n samples has.
 
-    It is n over the sum of the products of the autocorrelations of residual and fit (Bartlett,
-    J. R. Stat. Soc. Suppl. 8:27, 1946).
+    It is n over the sum of the products of the autocorrelations of residual and fit (Bartlett, J.
+    R. Stat. Soc. Suppl. 8:27, 1946).
     """
     count = len(fit)
     products = _autocorrelation(residual) * _autocorrelation(fit)
@@ -266,10 +252,7 @@ def whitening_filter(residual: Array) -> Array:
 
 
 def _sliding(series: Array, weight: Array) -> Array:
-    """Return sum_i weight_i x_(i + l) at every lag l at which the two overlap.
-
-    series : (K, N) rows x.  weight : (n,).  The result is (K, N + n - 1), from l = 1 - n on.
-    """
+    """Return sum_i weight_i x_(i + l), (K, N + n - 1), of rows x (K, N) at lags l from 1 - n."""
     from scipy.fft import irfft, next_fast_len, rfft
 
     count = series.shape[1] + len(weight) - 1
@@ -310,10 +293,9 @@ def _lobe(total: Array, peak: int) -> slice:
 def _disagreement(
     profiles: Sequence[_Profile], sizes: Sequence[float], tried: Bools, place: float, reach: int
 ) -> float:
-    """Return the factor by which the channels' own peaks scatter more than their sds say, 1 at
-    least (Birge, Phys. Rev. 40:207, 1932). Different low-pass filters of a sensor's axes do that.
+    """Return by how much the channels' own peaks scatter more than their sds say, at least 1.
 
-    place : of the common peak, in lags.  reach : so far from it a channel's own may lie.
+    Birge, Phys. Rev. 40:207, 1932. Different low-pass filters of a sensor's axes do that.
     """
     squares = []
     for profile, size in zip(profiles, sizes):

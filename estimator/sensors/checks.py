@@ -87,12 +87,8 @@ def read_sensors(
 ) -> Sensors:
     """Return encoder and accelerometers with their unusable samples masked, and the findings.
 
-    stage, accelerometers, rig : as for `telerig.smooth`; the stage as a table.
-    cameras : their names.
-    frames_t_s : (F,) times of the frames.
-    files : names of both tables for messages; "" for an argument.
-
-    Raises InputError for records that cannot be read.
+    stage, accelerometers, rig : as for `telerig.smooth`. frames_t_s : (F,). files : names of both
+    tables for messages, or "". Raises InputError for records that cannot be read.
     """
     frames = np.asarray(frames_t_s, float)
     encoder, findings = _encoder(stage, frames, files[0])
@@ -138,10 +134,7 @@ def _slower_than(frames_t_s: Array, sensor: Sensor) -> list[Finding]:
 
 
 def _encoder(stage: Any, frames: Array, where: str) -> tuple[Encoder | None, list[Finding]]:
-    """Return the encoder's usable readings, and what is wrong with the record.
-
-    There is no encoder if its record covers no frame.
-    """
+    """Return the encoder's usable readings, None if they cover no frame, and findings."""
     if stage is None:
         return None, []
     t, position = table_columns(stage, ("t_s", "position_mm"), where, what="a table")
@@ -162,13 +155,11 @@ def _encoder(stage: Any, frames: Array, where: str) -> tuple[Encoder | None, lis
 def check_sensors(
     run: RunData, *, tracks: Any = None, calibration: Calibration | None = None
 ) -> list[Finding]:
-    """Return the findings about a run's encoder and accelerometers, and about its tracks if they
-    are given.
+    """Return the findings about a run's encoder, accelerometers and, if given, tracks.
 
-    tracks : `Tracks`, or a table like tracks.csv, which is compared with ``calibration``.
-
-    Raises InputError for data that cannot be read: sensors that rig.toml does not name, values that
-    are not finite, and tracks from another rig.
+    tracks : `Tracks`, or a table like tracks.csv, which is compared with ``calibration``. Raises
+    InputError for data that cannot be read: sensors that rig.toml does not name, values that are
+    not finite, and tracks from another rig.
     """
     found = read_sensors(
         run.stage, run.accelerometers, run.rig, run.cameras, run.t_s,
@@ -188,12 +179,7 @@ def files_of(run: RunData) -> tuple[str, str]:
 def check_overlap(
     t: Array, frames_t_s: ArrayLike, *, where: str, code: Code, sensor: str = ""
 ) -> list[Finding]:
-    """Return a finding if the record does not cover all frames; with a code if it covers hardly
-    any.
-
-    t, frames_t_s : (N,) times of the record and (F,) times of the frames, in s.
-    sensor : name of an accelerometer; "" for the encoder.
-    """
+    """Return a finding if the record (N,) does not cover all frames (F,); a code if hardly any."""
     frames = np.asarray(frames_t_s, float)
     share = _covered(t, frames)
     if share >= _COVERED:
@@ -220,9 +206,7 @@ def _covered(t: Array, frames: Array) -> float:
 
 
 def _clock_remedy(t: Array, frames: Array) -> str:
-    """Return the unit or the offset that would make the record's clock agree with that of the
-    frames.
-    """
+    """Return the unit or the offset that would make the record's clock agree with the frames'."""
     length, wanted = t[-1] - t[0], frames[-1] - frames[0]
     for name, factor in _SMALLER_UNITS:
         near = t[0] / factor <= frames[-1] and t[-1] / factor >= frames[0]
@@ -233,12 +217,10 @@ def _clock_remedy(t: Array, frames: Array) -> str:
 
 
 def check_tracks(table: Any, calibration: Calibration) -> list[Finding]:
-    """Return a warning if points and pixels of a table of tracks do not agree with this
-    calibration.
+    """Return a warning if points and pixels of tracks do not agree with this calibration.
 
-    The pixels are triangulated again, and the old and the new points are projected. There is a
-    warning if they differ by more than 0.5 px (median). Raises InputError if they differ by more
-    than 5 px, or if a camera is missing from the table.
+    The pixels are triangulated again, and old and new points projected: a median difference above
+    0.5 px gives a warning, above 5 px or without a camera InputError.
     """
     for camera in calibration.cameras:
         if f"{camera.name}_u_px" not in table:

@@ -32,13 +32,10 @@ _SHOWN = 3
 
 @dataclass(frozen=True)
 class EncoderFault:
-    """Describes a fault in an encoder's record.
+    """A fault in an encoder's record: its error, from t_s on, the first reading after it.
 
-    t_s : time of the first reading after the fault.
-    size_mm : error of the reading.
     kind : "jump" if the error persists, "spike" if it ends after ``readings`` readings, "wrap" if
-        the counter overflows to the other end of its range.
-    step_s : time between the readings before and after the fault.
+    the counter overflows. step_s : time between the readings before and after the fault.
     """
 
     t_s: float
@@ -54,10 +51,7 @@ class EncoderFault:
         return 4e-3 * abs(self.size_mm) / self.step_s**2
 
     def affects(self, t_s: Array, frames_t_s: Array) -> bool:
-        """Return whether the fault changes differences of position between frames.
-
-        t_s, frames_t_s : times of all readings and of all frames.
-        """
+        """Return whether the fault changes differences of position between frames."""
         first = int(np.searchsorted(t_s, self.t_s))
         begin = t_s[max(first - 1, 0)]
         if self.kind == "spike":
@@ -87,12 +81,9 @@ class EncoderFault:
 def check_encoder(
     t_s: ArrayLike, position_mm: ArrayLike, frames_t_s: ArrayLike, *, where: str = "stage"
 ) -> tuple[Bools, list[Finding]]:
-    """Return which readings of the encoder can be used (E,), and what is wrong with the others.
+    """Return which readings (E,) can be used, and what is wrong with the others.
 
     Single wrong readings are masked. A jump that affects the frames is refused (`ENCODER_JUMP`).
-
-    t_s, position_mm : (E,) times and readings.
-    frames_t_s : (F,) times of the frames.
     """
     t, frames = np.asarray(t_s, float), np.asarray(frames_t_s, float)
     faults = encoder_faults(t, position_mm)
@@ -128,13 +119,11 @@ def check_encoder(
 
 
 def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]:
-    """Return the steps of the record that no motion can explain, in the order of time.
+    """Return the steps of the record (E,) that no motion can explain, in the order of time.
 
-    A step counts as a fault if its speed lies outside the speeds of the two steps before and the
-    two after it by 10 standard deviations of the record's own noise. A strong acceleration changes
-    the speed only once, whereas a jump changes it twice.
-
-    t_s, position_mm : (E,) times, which increase, and readings.
+    The speed of a fault lies outside the speeds of the two steps before and the two after by 10
+    standard deviations of the record's own noise. A strong acceleration changes the speed only
+    once, a jump twice.
     """
     t, position = np.asarray(t_s, float), np.asarray(position_mm, float)
     if len(t) < _LEAST_RECORD:
@@ -158,16 +147,14 @@ def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]
 
 
 def _excess_speed(speed: Array) -> Array:
-    """Return by how much each speed (E - 1,) lies outside the range of its two neighbours on each
-    side."""
+    """Return how far each speed (E - 1,) is outside the range of two neighbours on each side."""
     near = np.delete(sliding_window_view(np.pad(speed, 2, constant_values=np.nan), 5), 2, axis=1)
     high, low = np.nanmax(near, 1), np.nanmin(near, 1)
     return np.asarray(np.maximum(speed - high, 0) + np.minimum(speed - low, 0))
 
 
 def _least_fault(step: Array) -> float:
-    """Return the smallest fault (mm) that is looked for: a few counts of an encoder with coarse
-    counts."""
+    """Return the smallest fault (mm) that is looked for: a few of an encoder's coarse counts."""
     moved = np.abs(step[step != 0])
     coarse = len(moved) > 0 and len(np.unique(np.round(moved, 9))) < len(moved) / 4
     return max(_COUNTS * float(np.percentile(moved, 1)) if coarse else 0.0, _LEAST_MM)
@@ -176,11 +163,7 @@ def _least_fault(step: Array) -> float:
 def _classified(
     steps: NDArray[np.intp], excess: Array, t: Array, position: Array
 ) -> list[EncoderFault]:
-    """Return the faults at the given steps as jumps, spikes or wraps.
-
-    steps : indices of the faulty steps.
-    excess : (E - 1,) part of each step that no motion explains, in mm.
-    """
+    """Return the faults at ``steps`` as jumps, spikes or wraps; excess (E - 1,) in mm."""
     out: list[EncoderFault] = []
     left = [int(i) for i in steps]
     last = len(t) - 2

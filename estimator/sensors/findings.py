@@ -35,18 +35,15 @@ class Code(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Describe what a check found.
+    """What a check found.
 
-    words : the fault, as a sentence without its place.
-    where : the file, sensor or row in which it is.
-    todo : what the user can do about it.
-    code : the code of a fault that is refused unless it is accepted; None for a warning.
-    fix : the correction as data, for programs; empty if there is none. {"sensor": name} and one of
-        "unit": "g"; "axes": rows; "factor": number by which readings are multiplied; "add_m_s2":
-        [x, y, z], to be added to every reading; "offset_s": s, to be added to its times.
-        {"exchange": [name, name]} for the records of two sensors. {"encoder_factor": -1.0},
-        {"encoder_offset_s": s, to be added to its times}, {"encoder_jumps": [[t_s, mm], ...]} to
-        be subtracted from t_s on. {"frame_time_factor": 0.001}.
+    words : the fault, as a sentence without its place. where : file, sensor or row. todo : what the
+    user can do. code : of a fault that is refused unless it is accepted; None for a warning.
+    fix : the correction as data, or {}. {"sensor": name} and one of "unit": "g"; "axes": rows;
+    "factor": number by which readings are multiplied; "add_m_s2": [x, y, z]; "offset_s": s, added
+    to its times. {"exchange": [name, name]} for two records. {"encoder_factor": -1.0},
+    {"encoder_offset_s": s}, {"encoder_jumps": [[t_s, mm], ...]} subtracted from t_s on.
+    {"frame_time_factor": 0.001}.
     """
 
     words: str
@@ -63,10 +60,7 @@ class Finding:
 
 
 class SensorError(InputError):
-    """A sensor's record contradicts the images, the description of the rig, or another sensor.
-
-    findings : every refused finding, of which the message shows the first.
-    """
+    """A sensor's record contradicts the images, the rig, or another sensor; shows one finding."""
 
     def __init__(self, *args: Any, findings: Sequence[Finding] = (), **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -86,12 +80,7 @@ def accepted_codes(accept: Iterable[str]) -> frozenset[Code]:
 
 
 def settled(findings: Sequence[Finding], accept: frozenset[Code]) -> list[str]:
-    """Return the findings as warnings.
-
-    accept : the codes whose faults are used as they are; their warnings say so.
-
-    Raises SensorError if a finding has a code that is not accepted.
-    """
+    """Return findings as warnings; SensorError for one with a code that is not accepted."""
     refused = [f for f in findings if f.code is not None and f.code not in accept]
     if refused:
         first = refused[0]

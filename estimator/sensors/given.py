@@ -33,27 +33,23 @@ _SHOWN_TYPE = 60
 
 
 class AccelerometerRecord(TypedDict, total=False):
-    """Describe one accelerometer and hold its N samples, for `telerig.smooth`.
+    """One accelerometer and its N samples, for `telerig.smooth`.
 
     t_s : (N,) times of the samples in s, which increase.
     a_m_s2 : (N, 3) readings in m/s^2 along the sensor's own axes x, y, z. They contain gravity: a
-        sensor at rest reads +9.81 m/s^2 along the axis that points upwards.
-    a, unit : in place of ``a_m_s2``, readings (N, 3) in another unit: "m/s^2", "g", "mg", "mm/s^2",
-        "cm/s^2" or "ft/s^2". Without a unit it follows from the size of gravity, with a warning.
+    sensor at rest reads +9.81 m/s^2 along the axis that points upwards.
+    a, unit : in place of ``a_m_s2``, readings (N, 3) in "m/s^2", "g", "mg", "mm/s^2", "cm/s^2" or
+    "ft/s^2". Without a unit it follows from the size of gravity, with a warning.
     mounted_on : name of the camera whose arm carries the sensor, or "carriage" for the stage.
-    axes : (3, 3) whose rows are the sensor's x, y, z axes in rig coordinates (x right, y down, z
-        away from the first camera).
-    noise_density_ug_sqrt_hz : noise density of the data sheet in micro-g per root hertz; without
-        it, it is estimated from the record, with a warning.
-    bias_sigma_m_s2 : standard deviation of the constant error of each axis in m/s^2; 0.2 if
-        missing.
-    range_m_s2 : largest acceleration that the sensor can read in m/s^2; samples that reach it are
-        not used. Without it, limits at which readings are clipped are looked for in the record.
+    axes : (3, 3) whose rows are the sensor's x, y, z axes in rig coordinates.
+    noise_density_ug_sqrt_hz : of the data sheet, in micro-g per root hertz; otherwise it is
+    estimated from the record, with a warning. bias_sigma_m_s2 : of the constant error of each axis;
+    0.2 if missing. range_m_s2 : largest reading; samples that reach it are not used. Without it,
+    limits at which readings are clipped are looked for.
     clock : "frames" if ``t_s`` is the time of the frames, apart from a small delay; "unknown" (the
-        default) for a logger of its own, whose offset has to be found from the images.
-
-    What rig.toml states about a sensor of this name is used where a key is missing; ``t_s`` and
-    the readings are always needed.
+    default) for a logger of its own, whose offset has to be found from the images.
+    What rig.toml states about a sensor of this name is used where a key is missing; ``t_s`` and the
+    readings are always needed.
     """
 
     t_s: ArrayLike
@@ -80,14 +76,12 @@ _DESCRIBED = (
 
 @dataclass(frozen=True)
 class Sensor:
-    """Hold the record of one accelerometer as it was given.
+    """The record of one accelerometer as it was given.
 
-    where : file and sensor, or argument and sensor, for messages.
-    t_s : (N,) times, which increase.  reading_m_s2 : (N, 3) readings.
-    unit : the unit in which the readings were given.
-    mounted_on : a camera's name, or "carriage".  axes : (3, 3) the sensor's axes as unit rows.
-    noise_density_ug_sqrt_hz, range_m_s2 : None if nothing states them.
-    kept : (N,) whether each sample is used.  unused_axes : indices of axes that are not used.
+    where : file or argument, and sensor. t_s : (N,). reading_m_s2 : (N, 3). unit : in which
+    readings were given. mounted_on : a camera's name, or "carriage". axes : (3, 3) unit rows.
+    noise_density_ug_sqrt_hz, range_m_s2 : None if nothing states them. kept : (N,) usable samples.
+    unused_axes : indices.
     """
 
     name: str
@@ -110,13 +104,8 @@ def given_sensors(
 ) -> tuple[list[Sensor], list[Finding]]:
     """Return the accelerometers of a table or of a mapping, and what was assumed about them.
 
-    given : a table with the columns of accelerometer.csv, or a mapping of the sensor's name to an
-        `AccelerometerRecord`; None for none.
-    rig : the description in rig.toml, or None.
-    cameras : names of the cameras.
-    file : the file of the table, for messages; "" for an argument.
-
-    Raises InputError for everything that is not as described.
+    given : columns of accelerometer.csv, or an `AccelerometerRecord` by sensor. file : of the
+    table, for messages, or "". Raises InputError for everything that is not as described.
     """
     if given is None:
         return [], []
@@ -296,9 +285,8 @@ def _inferred(reading: Array, name: str, where: str) -> tuple[str, list[Finding]
 def unit_of_gravity(size: float) -> str | None:
     """Return the unit in which a reading at rest of this size is gravity; None if there is none.
 
-    The units differ so much that an error by a factor of 1.5 does no harm; a strong acceleration
-    at the start of a short record can cause such an error. mg and cm/s^2 differ by only 2 %, less
-    than the effect of a usual bias: mg is returned.
+    A factor of 1.5 (a strong acceleration at the start) does no harm. mg and cm/s^2 differ by only
+    2 %, less than a usual bias: mg is returned.
     """
     for unit in ("m/s^2", "g", "mm/s^2", "mg", "ft/s^2"):
         ratio = size * ACCELERATION_UNITS[unit] / STANDARD_GRAVITY_M_S2
@@ -308,10 +296,7 @@ def unit_of_gravity(size: float) -> str | None:
 
 
 def _in_order(t: Array, reading: Array, where: str) -> tuple[Array, Array, list[Finding]]:
-    """Return the samples without the few whose times are repeated or go back, and a warning.
-
-    Raises InputError if they are many, because then the times themselves are wrong.
-    """
+    """Return samples without a few whose times go back, and a warning; InputError for many."""
     kept = longest_increase(t)
     lost = np.flatnonzero(~kept)
     if not len(lost):
@@ -396,10 +381,7 @@ def _positive(fields: Mapping[str, Any], key: str, where: str) -> float | None:
 
 
 def numbers(values: Any, where: str, key: str) -> Array:
-    """Return an array of numbers as floats; masked entries become NaN.
-
-    Raises InputError for text, dates, objects, and lists of unequal length.
-    """
+    """Return an array of floats, masked entries as NaN; InputError for anything else."""
     dtype = getattr(values, "dtype", None)
     if not isinstance(dtype, np.dtype | None) and getattr(dtype, "kind", "") in "iuf":
         # a column of pandas' own types of numbers
@@ -466,12 +448,10 @@ def _one_of(word: str, known: Sequence[str]) -> str:
 
 
 def table_columns(table: Any, names: Sequence[str], where: str, *, what: str) -> list[Array]:
-    """Return columns of numbers of a table, which may also be a mapping of names to arrays.
+    """Return columns of numbers of a table, or of a mapping of names to arrays.
 
-    what : the table in words, for messages.
-
-    Raises InputError for anything else, for a missing column, an unknown key of a mapping, unequal
-    lengths, and values that are not finite.
+    Raises InputError for a missing or unknown column, unequal lengths, and values that are not
+    finite.
     """
     todo = f"give {what} with the columns {', '.join(names)}"
     if not (hasattr(table, "columns") or isinstance(table, Mapping)):

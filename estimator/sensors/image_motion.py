@@ -32,12 +32,9 @@ def directions(camera: Camera) -> Array:
 def frame_grid(t_s: Array, noise_mm: float, felt: Callable[[Grid], float] | None) -> Grid:
     """Return the grid on which images and sensors are compared.
 
-    The narrowest kernel is taken whose noise of the images is below half the motion that the
-    sensors feel, or else the widest.
-
-    t_s : (F,) times of the frames.  noise_mm : sd of the mean position in one frame.
-    felt : function that returns the RMS of what sensors feel with a grid's kernel, in mm/s^2; None
-        without a sensor, for a kernel in the middle.
+    It has the narrowest kernel at which the images' noise (noise_mm, of the mean position in a
+    frame) is below half the motion that sensors feel. felt : RMS in mm/s^2 with a grid's kernel;
+    None without a sensor, for a kernel in the middle.
     """
     pace = float(np.median(np.diff(t_s)))
     step = pace / np.ceil(pace / _COARSEST_STEP_S - 1e-9)
@@ -58,8 +55,7 @@ def accelerations(
 ) -> Accelerations:
     """Return the camera's accelerations (n, 2) along its two directions, in mm/s^2.
 
-    t_s : (F,) times of the frames.
-    item, frame, uv_px : (M,), (M,), (M, 2) marks or bubbles that the camera saw, and where.
+    item, frame, uv_px : (M,), (M,), (M, 2) marks or bubbles that the camera saw.
     """
     total, count = np.zeros((grid.count, 2)), np.zeros(grid.count)
     if len(item):

@@ -26,11 +26,9 @@ _LEAST_SAMPLES = 60
 
 @dataclass(frozen=True)
 class Felt:
-    """Hold an acceleration that a sensor should feel along one direction.
+    """An acceleration (n,) that a sensor should feel along a direction (3,) in the rig frame.
 
-    direction : (3,) in the rig frame.  values, known : (n,) in mm/s^2.
-    whole : whether the sensor feels just this, so that its gain follows; False if it also feels
-        something else, as an arm does beside the carriage.
+    whole : whether it feels just this, so that its gain follows; an arm also feels other motion.
     """
 
     direction: Array
@@ -41,11 +39,9 @@ class Felt:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Hold what the regression says about a sensor.
+    """Axes (3, 3) of a sensor that fit best, and whether clearly better than the stated ones.
 
-    axes : (3, 3) rows that fit best.  clear : whether they fit clearly better than the stated ones.
-    gain, gain_sd : the reading over the true acceleration, with the axes that fit best; NaN and
-        infinite where nothing is felt.
+    gain, gain_sd : the reading over the true acceleration; NaN and infinite where nothing is felt.
     """
 
     axes: Array
@@ -58,8 +54,7 @@ class Mounting:
     def wrong_gain(self) -> bool:
         """Whether the readings are clearly too large or too small for any usual scale error.
 
-        The regression's errors are those of the inverse of the gain. Readings that the images do
-        not show at all have no gain.
+        The regression's errors are those of 1 / gain; what images do not show has no gain.
         """
         inverse, sd = 1 / self.gain, self.gain_sd / self.gain**2
         clear = inverse > _SDS * sd and abs(inverse - 1) > _SDS * sd
@@ -81,9 +76,8 @@ def mounting(
 ) -> Mounting:
     """Return the axes, among exchanges and reversals of the stated ones, and the gain that fit.
 
-    axes : (3, 3) stated rows.  at_rest : (3,) median reading, whose direction must be up.
-    up : (3,) in the rig frame.  x, known : (n, 3) readings on the grid of the images, (n,).
-    felt : accelerations that this sensor feels.
+    at_rest : (3,) median reading, whose direction must be up (3,). x, known : (n, 3), (n,) readings
+    on the grid of the images.
     """
     turned = np.swapaxes(signed_permutations(), -1, -2) @ axes
     forces = np.einsum("pij,i->pj", turned, at_rest)
@@ -115,10 +109,7 @@ def mounting(
 def lead_of_axes(
     stated: Array, other: Array, x: Array, known: Bools, felt: Sequence[Felt]
 ) -> float:
-    """Return the log-likelihood of other axes (3, 3) less that of the stated ones.
-
-    x, known, felt : as for `mounting`.
-    """
+    """Return the log-likelihood of other axes (3, 3) less that of the stated ones."""
     parts = [p for f in felt if (p := _Part.of(f, x, known)) is not None]
     own, best = _scores(np.array([stated, other]), parts, 0)
     return float(best - own)
@@ -148,10 +139,7 @@ class _Part:
 
 
 def _scores(candidates: Array, parts: Sequence[_Part], shift: int) -> Array:
-    """Return the log-likelihood ratio (p,) of each candidate's axes (p, 3, 3), with its best gain.
-
-    shift : by so many samples the readings are rotated in time, to see what chance does.
-    """
+    """Return each candidate's log-likelihood ratio (p,) with its best gain, readings shifted."""
     total = np.zeros(len(candidates))
     for p in parts:
         x = np.roll(p.x, shift, axis=0)

@@ -56,12 +56,7 @@ _LEAST_UG_SQRT_HZ = 1.0
 
 @dataclass(frozen=True)
 class Clipping:
-    """Describes one axis of a sensor that is clipped at a limit of its range.
-
-    axis : 0, 1 or 2.
-    value : the limit (m/s^2).
-    samples : (N,) which samples are clipped.
-    """
+    """One axis of a sensor that is clipped at a limit (m/s^2), and which samples (N,) are."""
 
     axis: int
     value: float
@@ -69,11 +64,10 @@ class Clipping:
 
 
 def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
-    """Return the sensor with samples masked that cannot be right, and warnings that count them.
+    """Return the sensor with impossible samples masked, and warnings that count them.
 
-    An axis that is often clipped or never changes is not used at all. The readings of masked
-    samples are interpolated from their neighbours, so that filters of the record see nothing of
-    them. A noise density that nothing states is estimated.
+    An axis that is often clipped or never changes is not used. Masked readings are interpolated,
+    for filters of the record. A noise density that nothing states is estimated.
     """
     t, reading, where = sensor.t_s, sensor.reading_m_s2, sensor.where
     findings: list[Finding] = []
@@ -148,8 +142,8 @@ def sampling_rate(t_s: ArrayLike) -> float:
 def noise_density(t_s: ArrayLike, reading_m_s2: ArrayLike) -> float:
     """Return the noise density in micro-g per root hertz that a record (N, 3) shows.
 
-    It is the level of the spectrum between 1/8 and 0.45 of the sampling rate, where shake is small:
-    the median over frequencies, and the lower quartile over parts of the record.
+    It is the level of the spectrum between 1/8 and 0.45 of the sampling rate: the median over
+    frequencies, and the lower quartile over parts of the record.
     """
     from scipy.signal import spectrogram
 
@@ -178,8 +172,8 @@ def quantisation(values: ArrayLike) -> float:
 def clippings(reading: ArrayLike, range_m_s2: float | None = None) -> list[Clipping]:
     """Return the limits at which samples (N, 3) are clipped.
 
-    Without a range, the smallest or largest value of an axis counts as a limit if it occurs at
-    least 5 times, and at least 3 times as often as the next value.
+    Without a range, an extreme value counts as a limit if it occurs at least 5 times, and at least
+    3 times as often as the next value.
     """
     out = []
     for axis, a in enumerate(np.asarray(reading, float).T):
@@ -198,12 +192,9 @@ def clippings(reading: ArrayLike, range_m_s2: float | None = None) -> list[Clipp
 def frozen_samples(reading: ArrayLike, sigma: float) -> Bools:
     """Return which samples (N, 3) repeat the one before because the sensor had stopped.
 
-    A run of identical samples counts if it is too long to be a sensor at rest that reads in coarse
-    steps. How probable a repetition is follows from the noise and the step, and from how often
-    samples are repeated elsewhere; or, where this allows it, from the samples just before and just
-    after the run, because a sensor that comes to rest does so gradually.
-
-    sigma : noise standard deviation of one sample in m/s^2.
+    A run of identical samples counts if it is too long for coarse steps: by the noise, sigma, and
+    the step, by repetitions elsewhere, or by the samples around the run, because a sensor that
+    comes to rest does so gradually.
     """
     samples = np.asarray(reading, float)
     same = np.all(np.diff(samples, axis=0) == 0, axis=1)
@@ -244,8 +235,8 @@ def _repeated(same: Bools, first: int, last: int) -> Iterator[float]:
 def spike_samples(values: ArrayLike) -> Bools:
     """Return which values (N,) are spikes of at most three samples that stand alone.
 
-    A spike differs by 20 standard deviations from what its neighbours predict, of the whole record
-    and of the 64 samples about it.
+    They differ from what neighbours predict by 20 standard deviations, of the record and of 64
+    samples.
     """
     signal = np.asarray(values, float)
     out = np.zeros(len(signal), bool)
@@ -336,19 +327,14 @@ def _local_sd(residual: Array) -> Array:
 
 
 def prediction_residual(values: Array) -> Array:
-    """Return each value (N,) minus its prediction from four neighbours on each side.
-
-    The result is 0 for short records, and at the ends.
-    """
+    """Return each value (N,) minus its prediction from eight neighbours; 0 at the ends."""
     return _residual(values, _predictor(values))
 
 
 def _predictor(values: Array) -> Array | None:
-    """Return the weights (8,) of the four neighbours on each side, and a constant, that predict a
-    value best; None for short records.
+    """Return weights (8,) of neighbours and a constant that predict a value; None if too short.
 
-    They are fitted to the record itself by least squares, without the values that they predict
-    badly, so they also follow an oscillation.
+    They are fitted to the record without what they predict badly, so they follow an oscillation.
     """
     width = 2 * _NEIGHBOURS + 1
     if len(values) < _LEAST_TO_LEARN:

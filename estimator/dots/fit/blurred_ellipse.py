@@ -42,11 +42,7 @@ def extent_px(shape_px: Array) -> Array:
 
 
 def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Array:
-    """Signed distance to the ellipse to first order, positive outside; for the choice of pixels.
-
-    ``shape_px`` (..., 3); ``du_px, dv_px`` (..., P) offsets from the centre, or, for one ellipse,
-    any that broadcast together.
-    """
+    """Signed distance to ellipses (..., 3) to first order, positive outside, at (..., P)."""
     m11, m12, m22 = _columns(shape_px)
     determinant = m11 * m22 - m12 * m12
     x, y = (m22 * du_px - m12 * dv_px) / determinant, (m11 * dv_px - m12 * du_px) / determinant
@@ -81,10 +77,7 @@ def _row_kernel(z: Array, sigma: Array) -> tuple[Array, Array]:
 
 
 def quadrature_nodes(a_sigma: float) -> int:
-    """Nodes round a contour that make the periodic trapezoid rule exact to about 1e-6.
-
-    a_sigma : larger semi-axis over sigma.
-    """
+    """Number of nodes round a contour that make the trapezoid rule exact to about 1e-6."""
     return max(24, int(np.ceil(2.0 * np.pi * a_sigma / _NODE_SPACING_SIGMA)))
 
 
@@ -94,12 +87,10 @@ def coverage_on_grid(
     """Exact coverage of the pixels at columns ``u_px`` (..., U) and rows ``v_px`` (..., V).
 
     Returns ``F`` (..., V, U) and its derivatives (..., 6, V, U) by centre (2), shape (3), sigma.
-    ``centre_px`` (..., 2), ``shape_px`` (..., 3), ``sigma_px`` (...).
-
-    By Gauss's theorem with the field (P(x - u) p(y - v), 0), p the one-dimensional point spread
-    and P its integral, the convolution over the ellipse's area is an integral round its contour
-    of a smooth periodic function, so the trapezoid rule converges exponentially, and each node's
-    term is a product of a function of the row and one of the column: the sum is a matrix product.
+    By Gauss's theorem with the field (P(x - u) p(y - v), 0), p the one-dimensional point spread and
+    P its integral, the convolution over the ellipse's area is an integral round its contour of a
+    smooth periodic function: the trapezoid rule converges exponentially, and the sum of products of
+    row and column functions is a matrix product.
     """
     centre, shape = np.asarray(centre_px, dtype=np.float64), np.asarray(shape_px, dtype=np.float64)
     sigma = np.asarray(sigma_px, dtype=np.float64)
@@ -136,11 +127,10 @@ def coverage_on_grid(
 def foot_points(
     shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 2
 ) -> tuple[Array, Array]:
-    """Nearest points of ellipses: (cos t, sin t) with foot = M (cos t, sin t), each (..., P).
+    """Nearest points M (cos t, sin t) of ellipses (..., 3), as (cos t, sin t), to offsets (..., P).
 
-    ``shape_px`` (..., 3); offsets from the centre (..., P). Newton on (p - x(t)) . x'(t) = 0 from
-    the radial start, for points nearer than the smallest radius of curvature. Steps turn the unit
-    vector instead of its angle, which saves the trigonometry.
+    Newton on (p - x(t)) . x'(t) = 0 from the radial start, for points nearer than the smallest
+    radius of curvature. Steps turn the unit vector, which saves the trigonometry.
     """
     m11, m12, m22 = _columns(shape_px)
     c, s = m22 * du_px - m12 * dv_px, m11 * dv_px - m12 * du_px
@@ -220,10 +210,7 @@ def coverage_near_edge(
 def _bend(
     m11: Array, m12: Array, m22: Array, c: Array, s: Array, shrink: Array, sigma: Array
 ) -> tuple[Array, Array]:
-    """Curvature times sigma, and its second derivative by arc length times sigma^3, at feet.
-
-    ``shrink`` is 1 / |x'(t)|. With q = |x'|^2, k = det / q^(3/2).
-    """
+    """Curvature times sigma, and its second derivative by arc length times sigma^3, at feet."""
     g11, g12, g22 = m11 * m11 + m12 * m12, m12 * (m11 + m22), m12 * m12 + m22 * m22
     cs2, cos2 = 2.0 * c * s, 2.0 * c * c - 1.0
     slope = (g11 - g22) * cs2 - 2.0 * g12 * cos2

@@ -41,10 +41,7 @@ _MIN_PIECE_PIXELS = 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """A blob: the centre and ellipse of its second moments, its area, and its holes.
-
-    reason : why it is no dot; empty for a blob that may be one. holes : outline (N, 2) of each.
-    """
+    """A blob: ellipse of its moments, area, holes (N, 2), and why it is no dot, or ""."""
 
     label: int
     centre_px: Array
@@ -111,10 +108,7 @@ def edge_map(image: Float32, sigma: float) -> EdgeMap:
 
 
 def _away_from(bright: Bools) -> Bools:
-    """Pixels far from any crossing of the threshold: the greatest distance that leaves enough.
-
-    They are chosen by place alone: choosing quiet pixels would bias the noise measured in them.
-    """
+    """Pixels far from any crossing of the threshold, chosen by place alone to avoid a bias."""
     grey = bright.astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
@@ -220,8 +214,7 @@ def _outlines(
 def _pieces(above: Float32, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
     """Outlines of small dots whose blurs overlap, separated by a higher threshold.
 
-    Only blobs that are nowhere thicker than the blur are separated: larger dots that touch in the
-    image touch in the world.
+    Only blobs nowhere thicker than the blur are separated: larger dots touch in the world.
     """
     low, high = outline.min(axis=0), outline.max(axis=0) + 1
     filled = np.zeros((high - low)[::-1] + 2, np.uint8)

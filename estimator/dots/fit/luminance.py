@@ -61,10 +61,9 @@ class Reason(StrEnum):
 class Prior:
     """Prior knowledge about one dot, from the image's other dots.
 
-    u_per_px, v_per_px : relative contrast gradient (dC/du)/C, (dC/dv)/C, with standard deviation
-    ``sigma_per_px``. tie_to_background : take the background's own relative gradient instead, as
-    the same light falls on both. edge_px : sigma of the blurred edge, with standard deviation
-    ``edge_spread_px`` (infinite where it is unknown).
+    u_per_px, v_per_px : relative contrast gradient (dC/du)/C, (dC/dv)/C, with sd ``sigma_per_px``.
+    tie_to_background : take the background's own relative gradient instead, as the same light falls
+    on both. edge_px : sigma of the blurred edge, with sd ``edge_spread_px``, infinite if unknown.
     """
 
     u_per_px: float = 0.0
@@ -88,10 +87,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Start:
-    """Start values of a fit: centre (2,) and shape (3,) in image px, edge sigma [px].
-
-    previous : an earlier fit of the same dot, whose grey levels are then start values too.
-    """
+    """Start of a fit: centre (2,), shape (3,), edge sigma, and an earlier fit's grey levels."""
 
     centre_px: Array
     shape_px: Array
@@ -103,12 +99,10 @@ class Start:
 class DotFit:
     """One fitted dot.
 
-    centre_px (2,), shape_px (3,) (see ``blurred_ellipse``), sigma_px of the edge.
-    levels : (6,) B0, B1, B2, C, C1, C2 about the window's middle origin_px (2,) in units of
-        radius_px.
-    covariance_px2 : (2, 2) of the centre. contrast_sigma : of C.
-    dropped : number of pixels left out of chi-square, as outliers or because they are clipped.
-    edge_residual : RMS residual in the band of the edge over C.
+    centre_px (2,), shape_px (3,) (see ``blurred_ellipse``), sigma_px of the edge. levels : (6,) B0,
+    B1, B2, C, C1, C2 about the window's middle origin_px (2,) in units of radius_px.
+    covariance_px2 : (2, 2) of the centre. contrast_sigma : of C. dropped : number of pixels left
+    out as outliers or clipped. edge_residual : RMS residual in the band of the edge over C.
     inner_chi2 : mean whitened square residual of the inner_pixels that the dot covers.
     """
 
@@ -175,11 +169,9 @@ _prior_values = attrgetter(*(f.name for f in fields(Prior)))
 class Pixels:
     """Pixels of D fits, padded to P: offsets x, y from the origin pixel, and grey levels, (D, P).
 
-    there : (D, P) False for padding. counts : (D,) pixels that are there.
-    columns (D, U), rows (D, V) : offsets of the windows' columns and rows from the origin pixel,
-        padded by counting on. cell : (D, P) place of each pixel in its V x U window.
-    origin : (D, 2). radius : (D,) px.
-    prior : (D,) structured array with the fields of `Prior`.
+    there : (D, P) False for padding. counts : (D,). columns (D, U), rows (D, V) : offsets of the
+    windows' columns and rows, padded by counting on. cell : (D, P) place of each pixel in its
+    window. origin : (D, 2). radius : (D,) px. prior : (D,) with the fields of `Prior`.
     """
 
     x: Array
@@ -259,13 +251,11 @@ def _exact_coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
 
 
 def grey_levels(pixels: Pixels, theta: Array, levels: Array) -> tuple[Array, Array, Array]:
-    """Grey levels (D, P), their derivatives (D, 12, P) by theta and levels, and the levels (D, 6).
-
-    Levels that are NaN are replaced by those that fit best.
+    """Grey levels (D, P), derivatives (D, 12, P), and levels (D, 6), fitted where they are NaN.
 
     The contrast gradient acts before the blur: the Gaussian of x F_sharp is x F + sigma^2 dF/dx.
-    Without that term a centre would shift by sigma^2 times the relative gradient. The derivatives
-    of this small term by theta are neglected.
+    Without that term a centre would shift by sigma^2 times the relative gradient; its derivatives
+    by theta are neglected.
     """
     coverage, gradient = _coverage(pixels, theta)
     radius = pixels.radius[:, None]
@@ -332,8 +322,7 @@ def _admissible(theta: Array, radius: Array) -> Bools:
 
 @dataclass
 class _State:
-    """State of D iterations: parameters (D, 12), model, residual and weight (D, P), Jacobian
-    (D, 12, P), chi-square (D,). A weight of 0 leaves a pixel out."""
+    """Parameters (D, 12), model, residual, weight (D, P), Jacobian (D, 12, P), chi-square (D,)."""
 
     parameters: Array
     model: Array
@@ -396,8 +385,7 @@ def _descend(
     """Levenberg-Marquardt of some dots at fixed weights, in place; returns those that converged.
 
     A dot has converged when a step would reduce chi-square by less than ``tolerance``, relative to
-    the chi-square per degree of freedom where that is above 1. The last step is taken without
-    evaluating the model again, since it is small against the noise.
+    chi-square per degree of freedom above 1; that step is taken without another evaluation.
     """
     damping = np.full(len(state.chi2), 1e-4)
     done_parts: list[Ints] = []
@@ -449,10 +437,9 @@ def fit_dots(
     tolerance: float = 0.02,
     outlier_rounds: int = 3,
 ) -> list[DotFit]:
-    """Fit the luminance model of each dot to the pixels of its window, leaving outliers out.
+    """Fit the luminance model of each dot to the pixels of its window.
 
-    Pixels more than 5 sigma off (sigma widened by the fit's own spread, so that a rough print
-    edge is kept) are dropped and the fit goes on, as long as they are few.
+    A few pixels more than 5 sigma off (sigma widened by the fit's own spread) are left out.
     """
     fits: dict[int, DotFit] = {}
     for some in _chunks(windows):

@@ -41,12 +41,11 @@ def dot_window(
 ) -> Window:
     """Crop and mask round one dot: its edge, its inside, and the background as far as it is free.
 
-    Pixels nearer to another blob than to this dot, or near a hole in it, are left out. Of a large
-    dot only the surroundings of the edge are used, and of those beyond the blur one pixel in four
-    (coarse : one in four everywhere, for a first fit).
-
+    Pixels nearer to another blob, or near a hole, are left out. Of a large dot only the
+    surroundings of the edge are used, and of those beyond the blur one pixel in four (coarse :
+    everywhere).
     known : labels of blobs whose light is subtracted later, so that pixels which their blur shares
-        with this dot's stay. Without those pixels a third of the precision would be lost.
+    stay. Without those pixels a third of the precision would be lost.
     """
     a, b = semi_axes(start.shape_px)
     reach = 4.0 * start.sigma_px + 2.0
@@ -93,10 +92,7 @@ def _distance_to_others(
     high: NDArray[np.int_],
     reach: int,
 ) -> Array | None:
-    """Distance to the blobs whose label is not in ``own``; None where none is within reach.
-
-    low, high : (2,) first pixel (u, v) of the crop and the one after its last.
-    """
+    """Distance to blobs whose label is not in ``own``, in a crop; None where none is near."""
     first = np.maximum(low - reach, 0)
     wide = labels[first[1] : high[1] + reach, first[0] : high[0] + reach]
     others = wide != 0
@@ -165,9 +161,8 @@ _BLUR_SPREAD = 0.1
 def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
     """The relative contrast gradient expected at each fitted dot.
 
-    A quadratic in position is fitted robustly to log |contrast|. A prior on its coefficients (light
-    changes by about exp(0.4) over 1000 px) replaces thresholds on the number of dots. Below 6 dots
-    a bright background tells more than the other dots do: see `background_tie`.
+    A quadratic is fitted robustly to log |contrast|, with a prior (light changes by about exp(0.4)
+    over 1000 px). Below 6 dots a bright background tells more: see `background_tie`.
     """
     if len(fits) < _ENOUGH_DOTS:
         return [background_tie(fit) for fit in fits]
@@ -182,10 +177,7 @@ def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list
 
 
 def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
-    """The priors with the median edge sigma, to 10 % or to its spread over the image.
-
-    It matters for dots no larger than the blur, whose size, contrast and blur have similar effects.
-    """
+    """The priors with the median edge sigma, for dots no larger than the blur."""
     if len(fits) < _ENOUGH_DOTS:
         return priors
     sigmas = np.array([fit.sigma_px for fit in fits])

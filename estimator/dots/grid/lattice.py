@@ -34,10 +34,9 @@ def fit_neighbours(
 ) -> tuple[Array, Array, Array]:
     """Weighted affine fit of the values at the occupied places round each of (C, 2) places.
 
-    at : dot at each place or -1; values : (N, 2) per dot; basis : (N, 2, 2) pitch vectors per dot,
-    towards which the fit is pulled weakly. itself : use the place's own dot too. Returns the value
-    at the place (C, 2), the pitch vectors (C, 2, 2) and the variance of the value for dots of unit
-    variance (C,).
+    at : dot at each place or -1. values : (N, 2). basis : (N, 2, 2) pitch vectors, towards which
+    the fit is pulled weakly. itself : use the place's own dot too. Returns value (C, 2), pitch
+    vectors (C, 2, 2) and variance (C,) of the value for dots of unit variance.
     """
     steps = np.concatenate([NEIGHBOURS, [[0, 0]]]) if itself else NEIGHBOURS
     dots = at[places[:, :1] + steps[:, 0], places[:, 1:] + steps[:, 1]]
@@ -156,10 +155,7 @@ def shape_matrix(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> Arra
 
 
 def circle_from_ellipses(shapes_px2: ArrayLike) -> Array:
-    """Return the matrix (2, 2) that maps the median ellipse of N shapes to the unit circle.
-
-    The median is taken over the logarithms of the shapes, so that neither dirt nor marks matter.
-    """
+    """Return the matrix (2, 2) that maps the median ellipse of N shapes to the unit circle."""
     values, vectors = np.linalg.eigh(np.asarray(shapes_px2, float))
     values = np.maximum(values, 1e-6)
     logs = np.einsum("nij,nj,nkj->nik", vectors, np.log(values), vectors)
@@ -350,10 +346,7 @@ class _Growth:
 
 
 def _drop_false_dots(growth: _Growth, image_from_flat: Array, floor_px: float) -> None:
-    """Remove dots that are off their place as predicted by their neighbours, then grow again.
-
-    The residuals from one homography have to be smooth over the grid.
-    """
+    """Remove dots that are off their place as predicted by their neighbours, then grow again."""
     for _ in range(8):
         dots = np.flatnonzero(growth.placed())
         if len(dots) < MIN_DOTS:

@@ -49,11 +49,7 @@ LOG_UNSURE_GAP = -0.7
 
 @dataclass(frozen=True)
 class MarkEvidence:
-    """Evidence for marks at the places of a lattice.
-
-    gain : (H, W) log-likelihood ratio of mark to plain dot; place (i, j) is gain[i + 1, j + 1].
-    seen : (K, 2) places that look like marks.
-    """
+    """Log-likelihood ratios (H, W) of mark to dot, place (i, j) at [i + 1, j + 1]; seen marks."""
 
     gain: Array
     seen: Ints
@@ -79,10 +75,7 @@ def relative_diameter(lattice: Lattice) -> Array:
 
 
 def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
-    """Return the probability (n,) that each dot is a mark of the target's style.
-
-    rings : (n,) whether the image shows a ring.
-    """
+    """Return the probability (n,) that each dot is a mark; rings (n,) whether it has a hole."""
     if target.mark_style == "ring":
         return rings.astype(float)
     size = np.log(relative_diameter(lattice))
@@ -96,10 +89,7 @@ def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
 
 
 def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidence:
-    """Return the evidence at all places of the lattice and of a border one place wide.
-
-    rings : (n,) whether the image shows a ring.
-    """
+    """Return the evidence at all places of the lattice and of a border one place wide."""
     shape = lattice.places.max(0) + 3
     occupied = np.zeros(shape, bool)
     occupied[tuple((lattice.places + 1).T)] = True
@@ -230,7 +220,7 @@ def listed_lattice(points_mm: bytes) -> tuple[Array, Ints] | None:
 class Placements:
     """K placements of the grid on a lattice, best first: (column, row) = turn @ place - shift.
 
-    turn : (K, 2, 2), det -1 where the image is mirrored; shift : (K, 2); score : (K,)
+    turn : (K, 2, 2), det -1 where the image is mirrored. shift : (K, 2). score : (K,)
     log-likelihoods.
     """
 
@@ -239,10 +229,7 @@ class Placements:
     score: Array
 
     def columns_rows(self, places: Ints) -> Ints:
-        """(K, n, 2) column and row on the target, for each of the K placements.
-
-        places : (n, 2) indices of dots in the lattice of the image.
-        """
+        """(K, n, 2) column and row on the target of places (n, 2), for each of the K placements."""
         turned = np.einsum("kab,nb->kna", self.turn, places)
         return np.asarray(turned - self.shift[:, None])
 
@@ -384,16 +371,12 @@ AT_A_GAP = "at the place of a missing mark"
 class Numbering:
     """Which dot of the target each located dot is.
 
-    table : dot, row, column, index (position in the frame of dots); by dot.
-    unplaced : index, reason.
-    handedness : +1 when the image shows the target's x and y as u and v turn, -1 when mirrored,
-        0 when the image cannot tell; +1 is assumed for targets equal to their mirror image.
-    equivalents : (K, n) dot ids of the table's n rows under each numbering that fits the image as
-        well; row 0 is the table's own, -1 is no dot of the target.
-    equivalent_handedness : (K,).
-    ambiguous : the numberings differ by more than the target's own symmetry, so that the table
-        may be wrong.
-    marks_found : dot ids of the marks that were seen.
+    table : dot, row, column, index (position in the frame of dots). unplaced : index, reason.
+    handedness : +1 when the target's x and y turn as u and v, -1 when mirrored, 0 when the image
+    cannot tell; +1 is assumed for targets equal to their mirror image.
+    equivalents : (K, n) dot ids of the table's n rows under each numbering that fits as well; row 0
+    is the table's own, -1 is no dot of the target. equivalent_handedness : (K,).
+    ambiguous : the numberings differ by more than the target's own symmetry. marks_found : dot ids.
     """
 
     table: pd.DataFrame
@@ -447,11 +430,7 @@ def _check_columns(dots: pd.DataFrame) -> None:
 
 
 def check_handedness(handedness_by_image: Mapping[tuple[str, str], int], two_sided: bool) -> None:
-    """Raise DetectionError when the images (view, camera) of an opaque plate disagree.
-
-    handedness_by_image : `Numbering.handedness` of each; 0, unknown, agrees with both. Views from
-    behind a transparent plate (``two_sided``) are legal.
-    """
+    """Raise DetectionError when the images (view, camera) of an opaque plate disagree."""
     signs = {image: hand for image, hand in handedness_by_image.items() if hand}
     if two_sided or len(set(signs.values())) < 2:
         return

@@ -30,16 +30,12 @@ Places = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class SeenTarget:
-    """Hold what one image or several show of a grid of dots.
+    """What one image or several show of a grid of dots.
 
-    rows, columns : size of the part of the grid that is seen.
-    whole : whether the grid ends inside the image on all four sides.
-    marks : (row, column) of each mark, counted from the first corner of what is seen. A quarter
-        turn of the target is not told from another one.
-    mark_style : None if there are no marks.
-    mark_diameter : of large marks, in diameters of the other dots; NaN for other marks.
-    pitch : (x, y) in diameters of the dots.
-    diameter_px : of the dots, without foreshortening.
+    rows, columns : size of the part that is seen. whole : whether the grid ends inside the image on
+    all sides. marks : (row, column) of each mark from the first corner of what is seen, up to
+    quarter turns.
+    mark_diameter, pitch (x, y) : in diameters of the dots, diameter_px, without foreshortening.
     """
 
     rows: int
@@ -91,13 +87,7 @@ def _from_first(marks: Places) -> Places:
 
 
 def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
-    """Describe the grid among the dots of one image.
-
-    dots : table of dots as `locate_dots` returns it.
-    image_shape : (rows, columns) of the image in px.
-
-    Raises DetectionError if the dots lie on no grid.
-    """
+    """Describe the grid among the dots (`locate_dots`) of an image; DetectionError without one."""
     points = dots[["u_px", "v_px"]].to_numpy(float)
     shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
     lattice = _best_lattice(points, shapes)
@@ -175,8 +165,8 @@ def _marks(places: Ints, rings: Bools, large: Bools, empty: Ints) -> tuple[MarkS
 def agreed_target(seen: Sequence[SeenTarget]) -> SeenTarget:
     """Return the description that most images agree with.
 
-    A grid that at least every third image shows as a whole, or that has no marks, is bounded. Of
-    one that is seen in part the most frequent of the largest sets of marks is taken.
+    A grid that every third image shows as a whole, or that has no marks, is bounded. Of one that is
+    seen in part the most frequent of the largest sets of marks is taken.
     """
     whole = [one for one in seen if one.whole]
     bounded = 3 * len(whole) >= len(seen) or not any(one.marks for one in seen)
@@ -198,11 +188,7 @@ def agreed_target(seen: Sequence[SeenTarget]) -> SeenTarget:
 
 
 def contradiction(seen: SeenTarget, target: Target) -> str:
-    """Say where the image shows the target's marks, if `rig.toml` has them elsewhere; else "".
-
-    Marks that the image does not show, or shows as further ones, are no contradiction if the
-    others are at places that the target has.
-    """
+    """Say where the image shows the target's marks, if `rig.toml` has them elsewhere; else ""."""
     words, lines = [], []
     stated = _as_places(target.marks_column_row()[:, ::-1])
     counted = seen.counted(like=stated)

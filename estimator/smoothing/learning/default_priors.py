@@ -74,10 +74,10 @@ def _band(camera: int) -> BroadBand:
 
 
 def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeModel:
-    """The broad-band priors with the RMS and the dominant frequency that were found.
+    """Return the broad-band priors with the RMS and the dominant frequency that were found.
 
-    rms_mm : (C, 3) of each camera's offset (posterior mean and variance), the expectation step
-    of expectation maximisation. What is common to the cameras keeps its share.
+    rms_mm : (C, 3) of each camera's offset (posterior mean and variance), the expectation step of
+    expectation maximisation. What is common to the cameras keeps its share.
     """
     own = [b for b in model.broad_bands if b.camera != CARRIAGE]
     common = [b for b in model.broad_bands if b.camera == CARRIAGE]
@@ -119,10 +119,7 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Frequency (Hz) and RMS (mm) of the bubbles' swing across the vertical; None without tracks.
-
-    Lomb-Scargle periodogram of each track, drift removed.
-    """
+    """Frequency (Hz) and RMS (mm) of the bubbles' swing (Lomb-Scargle), None without tracks."""
     from scipy.signal import lombscargle
 
     trials = np.arange(_ZIGZAG_HZ[0], _ZIGZAG_HZ[1], 0.25)
@@ -194,10 +191,7 @@ _INDEPENDENT = 0.5
 
 
 def adapted(solution: Solution) -> ShakeModel | None:
-    """The model with noise, broad band's RMS and prior of the encoder's scale that the data show.
-
-    None if that is it.
-    """
+    """Return the model with noise, RMS and encoder's scale as the data show, None if unchanged."""
     model = solution.graph.model
     inflation = _noise_factor(solution)
     better = model
@@ -225,15 +219,14 @@ def _with_floor(model: ShakeModel, floor: float | None) -> ShakeModel:
 
 
 def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) -> float | None:
-    """The bands' floor that offsets show below the frequencies of the shake itself.
+    """Return the bands' floor that offsets show below the frequencies of the shake itself.
 
-    t_s (F,) times; offsets_mm (F, C, 3) of the cameras, 0 where unseen; a band for each camera.
-
+    t_s (F,); offsets_mm (F, C, 3) of the cameras, 0 where unseen; a band for each camera.
     How far a mode yields to slow forces, its damping, decides how well the slow motion of a bubble
     is known. Whittle's likelihood of the low end of the spectra (Whittle, Arkiv foer Matematik 2,
-    1953), with a prior of a factor of two about `DEFAULT_FLOOR`. None where the run is too short
-    to see it, where a band is common to the cameras, so that the offsets are not its own, and where
-    the shake is so strong that the first solution's offsets are the prior's as much as the data's.
+    1953), with a prior of a factor of two about `DEFAULT_FLOOR`. None where the run is too short,
+    where a band is common to the cameras, and where the first solution's offsets are the prior's as
+    much as the data's.
     """
     t = np.asarray(t_s, float)
     if any(b.camera == CARRIAGE or b.tail > 2 for b in bands) or not bands[0].floor or len(t) < 2:
@@ -295,12 +288,11 @@ def _dominant_hz(solution: Solution) -> float:
 
 
 def _noise_factor(solution: Solution) -> float:
-    """By how much the pixels' stated noise is too small, 1 at least.
+    """Return by how much the pixels' stated noise is too small, 1 at least.
 
-    From the median square of single coordinates, which outliers do not move; what the fit takes up
-    is given back to each by its leverage. Those that it follows closely are left out. The noise is
-    never taken for smaller than stated: the error of a bubble's outline changes slowly
-    with its shape, and the fit takes that for motion.
+    It follows from the median square of single coordinates, each divided by one less its leverage;
+    those of high leverage are left out. The noise is never taken for smaller than stated: the error
+    of a bubble's outline changes slowly, and the fit takes that for motion.
     """
     square, spare = [], []
     for which, leverage in leverages(solution):

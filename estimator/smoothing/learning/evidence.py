@@ -54,10 +54,10 @@ _EVERY = 8
 
 @dataclass(frozen=True)
 class Chain:
-    """upper : (F, D, D) L_t^T.
+    """The factor of a chain: upper (F, D, D) L_t^T, and following (F - 1, D, D) M_t.
 
-    sides : (F, S, D) what was joined to each frame, times L_t^-T.  following : (F - 1, D, D) M_t.
-    steady : the frames from which on, and before which, L_t and M_t no longer change.
+    sides : (F, S, D) what was joined to each frame, times L_t^-T. steady : the frames between which
+    these no longer change.
     """
 
     upper: Array
@@ -138,7 +138,7 @@ def _carry_on(values: Array, gain: Array) -> None:
 
 
 def eliminated(own: Array, following: Array, sides: Array) -> Chain:
-    """The factor of diagonal blocks (F, D, D) and those below (F - 1, D, D), with sides (F, S, D).
+    """Return the factor of diagonal (F, D, D) and lower (F - 1, D, D) blocks, with sides (F, S, D).
 
     Raises numpy's LinAlgError where the precision is not positive definite. The input is used up.
     """
@@ -152,11 +152,11 @@ def eliminated(own: Array, following: Array, sides: Array) -> Chain:
 def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
     """Eliminate frame by frame, in place; return `Chain.steady`.
 
-    own : (F, D, D), in: diagonal blocks, out: L_t^T.
-    joined : (F, S + D, D), in: rows of the sides and of the next frame, out: the same times L_t^-T.
-    Where frames are alike (equal steps and weights), the recursion comes to rest after the filter's
-    memory. From then on only the sides are carried on.
-    Raises numpy's LinAlgError where the precision is not positive definite.
+    own : (F, D, D), in: diagonal blocks, out: L_t^T. joined : (F, S + D, D), in: rows of the sides
+    and of the next frame, out: the same times L_t^-T.
+    Where frames are alike, the recursion comes to rest after the filter's memory: from then on only
+    the sides are carried on. Raises numpy's LinAlgError for a precision that is not positive
+    definite.
     """
     from scipy.linalg.blas import dtrsm
     from scipy.linalg.lapack import dpotrf, dtrtri
@@ -206,10 +206,9 @@ _DIFFERENCE = 1e-4
 
 @dataclass(frozen=True)
 class SignalPosterior:
-    """log_evidence : of the measurements.  position_mm : (B, F) of the moving items, lab, along
-    the direction, less their start.  offset_mm : (J, F) of each camera.
+    """The log evidence of a signal, and posterior means of moving items (B, F) and offsets (J, F).
 
-    Of a signal of R replicates (B R, F) and (J R, F), those of an item one after the other.
+    position_mm : along the direction, less their start. R replicates of an item follow each other.
     """
 
     log_evidence: float
@@ -220,10 +219,10 @@ class SignalPosterior:
 
 @dataclass(frozen=True)
 class _System:
-    """States per frame: the shake's components , then each moving item's.
+    """States per frame: the shake's components, then each moving item's.
 
-    rows : (P, D) that read a pair's measurement.  columns : (F, P, c) effects of the constants.
-    prior_sigma : (c,).  offset : (J, D).
+    rows : (P, D) that read a pair's measurement. columns : (F, P, c) effects of the constants.
+    prior_sigma : (c,). offset : (J, D).
     """
 
     components: tuple[Component, ...]
@@ -290,8 +289,8 @@ def _constants(signal: Signal, model: ShakeModel) -> tuple[Array, Array]:
 class Factor:
     """The Cholesky factor of the states' precision, and the constants' after them.
 
-    which : (F,) of each frame among ``bases``, (U + 1, D, D) in which its states are.
-    rows : (U + 1, P, D).  rest : (F, P, R) measured less ``guess``.  constants : (c, R).
+    which : (F,) of each frame among ``bases`` (U + 1, D, D). rows : (U + 1, P, D). rest : (F, P, R)
+    measured less ``guess``. constants : (c, R).
     """
 
     def __init__(self, signal: Signal, model: ShakeModel) -> None:
@@ -340,11 +339,10 @@ class Factor:
         return float(self.count * each - self.square / 2)
 
     def spread(self) -> tuple[Array, Array]:
-        """Right sides (F, K, D) of F frames' states and values (c, K) of the c constants.
+        """Return right sides (F, K, D) of F frames' states and values (c, K) of the c constants.
 
-        Solved for, and their squares summed over the K columns, they give what has to be added to
-        the second moments of states whose constants are known: the replicates' posterior means,
-        and the uncertainty of the constants.
+        Solved for, and their squares summed over K, they add to the second moments for known
+        constants: the replicates' posterior means, and the uncertainty of the constants.
         """
         from scipy.linalg import solve_triangular
 
@@ -400,10 +398,7 @@ def _replicates(signal: Signal) -> Array:
 
 
 def _fitted(signal: Signal, system: _System, weight: Array) -> Array:
-    """(c, R) constants near the answer: what is small without them keeps its digits.
-
-    Moving items by straight lines, what is fixed where it was guessed.
-    """
+    """Return constants (c, R) near the answer: what is small without them keeps its digits."""
     values = _replicates(signal)
     out = np.zeros((len(signal.moving), values.shape[-1]))
     for item in np.flatnonzero(signal.moving):
@@ -420,10 +415,7 @@ def _fitted(signal: Signal, system: _System, weight: Array) -> Array:
 
 
 def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
-    """Diagonal (F, D, D) and lower (F - 1, D, D) blocks of the prior; half log of its determinant.
-
-    The determinant is of the states' precision in the whitening bases.
-    """
+    """Return diagonal (F, D, D) and lower (F - 1, D, D) blocks of the prior; half log det."""
     which = np.append(steps.index, len(steps.basis) - 1)
     last, ahead, place = steps.distinct_in_basis(which[1:])
     backward, forward = (np.swapaxes(a, -1, -2) for a in (last, ahead))
@@ -445,8 +437,7 @@ class _Moments:
     """Second moments under the posterior, summed over replicates.
 
     step : (U, 2 D, 2 D) of (w, x), the whitened noise of a step and the state before it, summed
-    over the steps of one length.  start : (D, D) of the first state.  residual : of the whitened
-    measurements less what is predicted, summed.
+    over the steps of one length. start : (D, D). residual : of the whitened measurements.
     """
 
     step: Array
@@ -456,10 +447,7 @@ class _Moments:
 
 @dataclass(frozen=True)
 class _Change:
-    """A process with one hyper-parameter moved.
-
-    process : place among the signal's.  name : index into the names.  sign : up or down.
-    """
+    """A process (its place among the signal's) with one hyper-parameter moved up or down."""
 
     process: int
     name: int

@@ -29,12 +29,10 @@ _LARGEST_SQUARE = 1.3
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Compare one window with the model learned from another.
+    """One window compared with the model learned from another.
 
-    from_s, to_s : times of the window.
-    square : mean squared distance of a sample from the model; 1 if the model is right.
-    frequencies : by name of a mode's frequency, its value in the window and the sd of the ratio of
-        this to the learned one.
+    square : mean squared distance of a sample from the model; 1 if it is right. frequencies : by
+    name of a mode's frequency, its value in the window and the sd of the ratio to the learned one.
     """
 
     from_s: float

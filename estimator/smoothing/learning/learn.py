@@ -72,16 +72,14 @@ def learn(
     options: Learning | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> ShakeModel:
-    """A model whose modes, dampings and intensities are the most probable for the run.
+    """Return a model whose modes, dampings and intensities are the most probable for the run.
 
     start : gives what is not learned. Its modes are kept and improved, unless they are the default
-    guess (its name is "default").
-    progress : called with what was found and the share (0 to 1) that is done.
-
-    Returns a model named "learned", with the standard deviations of its log-parameters in
-    ``learned``. Of a long run only the frames of `learning_signals` are used. Accelerometers are
-    not learned from: where there are any, a default start is returned unchanged, since its broad
-    band needs no modes.
+    guess (its name is "default"). progress : called with what was found and the share (0 to 1)
+    done.
+    The model's name is "learned"; ``learned`` has the standard deviations of its log-parameters. Of
+    a long run only the frames of `learning_signals` are used. With accelerometers a default start
+    is returned unchanged, since its broad band needs no modes.
     """
     options = options or Learning()
     if start.name == "default" and problem.accelerometers:
@@ -151,10 +149,10 @@ def _learn_group(
 
 
 def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeModel, Learning]:
-    """The modes found so far, moving across too, their frequencies and dampings held.
+    """Return the modes found so far, moving across too, their frequencies and dampings held.
 
-    A single camera and bubble cannot show whether they do: a rig that shakes along one axis is
-    not taken for still along the others.
+    A single camera and bubble cannot show whether they do; a rig that shakes along one axis is not
+    taken for still along the others.
     """
     at, rig = len(model.modes), [m for m in model.modes if max(m.rms_mm) > 0]
     added = []
@@ -177,10 +175,10 @@ def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
 
 
 def posterior_rms(signals: Sequence[Signal], model: ShakeModel, name: str, median: float) -> float:
-    """An RMS that the data hardly determine as the root of its posterior's mean square.
+    """Return an RMS that the data hardly determine as the root of its posterior's mean square.
 
-    The most probable RMS of a line that bubbles' wide swings hide is next to 0, as if the rig stood
-    still. median : of the log-normal prior.
+    The most probable RMS of a line that bubbles' wide swings hide is next to 0. median : of the
+    log-normal prior.
     """
     values = median * np.exp(_LOG_RATIOS)
     found = np.array([evidence(signals, with_values(model, [name], [v])) for v in values])
@@ -254,10 +252,7 @@ def with_one_more_mode(group: Group, step: Step, options: Learning, first: bool)
 
 
 def try_low_pass_force(group: Group, step: Step, options: Learning, first: bool) -> Step:
-    """The modes' white forces low-pass filtered, where the information criterion prefers that.
-
-    Both ways get as many steps more.
-    """
+    """Low-pass filter the modes' white forces, where the information criterion prefers that."""
     model = step.fit.model
     white = bool(model.modes) and all(m.force_hz is None for m in model.modes)
     if not first or not white or is_held(FORCE, model, options) or step.found[-1:] == (BUBBLE,):
@@ -283,10 +278,7 @@ def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
 
 
 def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeModel:
-    """After an arm's first mode, the same for the other arms, to be fitted like any mode.
-
-    Arms are built alike, and an arm's mode left out would be taken for one of the whole rig.
-    """
+    """After an arm's first mode, add the same for the other arms, which are built alike."""
     cameras = group.signals[0].cameras
     have = {m.camera for m in model.modes[:-1] if m.camera != CARRIAGE}
     if where not in cameras or have:
@@ -297,7 +289,7 @@ def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeMode
 
 
 def _bic_penalty(group: Group, model: ShakeModel) -> float:
-    """Log-likelihood ratio that a line's three parameters must bring: half of Schwarz's 3 log n.
+    """Return the log-likelihood ratio that a line must bring, 3/2 log n (Schwarz).
 
     n : two samples for each cycle of the fastest line. More frames inform on the noise alone.
     """
@@ -319,10 +311,9 @@ def _distinct(
 
 
 def _preference(model: ShakeModel, where: Owner, rival: Owner, up: Array) -> float:
-    """Log-likelihood ratio by which an owner must win over another.
+    """Return the log-likelihood ratio by which an owner must win over another.
 
-    A line that fits both goes to the rig, since the other error hides the rig's shake. Only the
-    second harmonic of the zigzag is taken for the bubble's own.
+    A line that fits both goes to the rig, but the zigzag's second harmonic to the bubble.
     """
     if BUBBLE not in (where, rival) or where == rival:
         return 0.0
@@ -372,10 +363,7 @@ def _last_line(model: ShakeModel, where: Owner) -> list[str]:
 
 
 def pruned(group: Group, fit: Fit, options: Learning, first: bool, given: int = 0) -> Fit:
-    """Lines removed again that the information criterion does not need.
-
-    given : so many modes were there before the search, and stay, so that their names do.
-    """
+    """Remove lines that the information criterion does not need; the first ``given`` modes stay."""
     at = 0
     while True:
         names = [
@@ -423,13 +411,12 @@ BUBBLE = "bubble"
 class Learning:
     """What may be learned.
 
-    most_modes : lines of one kind (common, each arm, bubble) at most, in the vertical and across.
-    hold : patterns of names (see ``parameters``) that keep the start's values,
-        "modes.*" for instance for a rig that is known. The forces' cut-off, which all modes
-        share, is held with any mode of which all is held.
-    target : the tracks are those of a target standing still in the lab, not of bubbles.
-    force_hz : low-pass cut-off of the modes' force to begin with; None: white, with a cut-off only
-        where the information criterion prefers one.
+    most_modes : lines of one kind (common, each arm, bubble) at most. hold : patterns of names (see
+    ``parameters``) that keep the start's values, "modes.*" for a rig that is known; the forces'
+    cut-off is held with any mode of which all is held. target : the tracks are those of a target at
+    rest.
+    force_hz : first low-pass cut-off of the modes' force; None: white, with a cut-off only where
+    the information criterion prefers one.
     """
 
     most_modes: int = 3
@@ -440,10 +427,9 @@ class Learning:
 
 @dataclass(frozen=True)
 class Group:
-    """Channels learned together.
+    """Signals that are learned together; ``fast`` as `pooled` has them.
 
-    pattern : (3,) share of a line's RMS along the rig's axes.  owners : what a line could be.
-    fast : the signals as their likelihood is worked out, see `pooled`.
+    pattern : (3,) share of a line's RMS along the rig's axes. owners : what a line could be.
     """
 
     signals: tuple[Signal, ...]

@@ -152,9 +152,8 @@ _Triple = tuple[Array, Array, Array]
 def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
     """Return the solution with the spread by its model's ``learned`` parameters in its covariances.
 
-    Bubbles beyond those that learning looks at get the mean spread of those, and all frames of a
-    long run that of the frames that learning looks at. The solution is unchanged without
-    covariances, learned parameters or measurements of positive weight.
+    Bubbles and frames beyond those that learning uses get the mean spread of those. The solution is
+    unchanged without covariances, learned parameters or measurements of positive weight.
     """
     found, model, problem = solution.covariances, solution.graph.model, solution.graph.problem
     if found is None or not model.learned or not problem.bubbles:
@@ -181,10 +180,7 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
 
 
 def _spread(signal: Signal, model: ShakeModel) -> _Triple:
-    """Return the variances (B, F) of positions and velocities, and (J, F) of offsets.
-
-    NaN before a bubble is seen for the first time and after the last.
-    """
+    """Return variances (B, F) of position and velocity, NaN if unseen, and (J, F) of offsets."""
     parts = pooled(signal)
     total = [np.zeros((1, len(signal.t_s)))] * 3
     for name, sigma in model.learned.items():

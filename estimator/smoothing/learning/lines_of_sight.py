@@ -30,15 +30,15 @@ PRESENT = 0.75
 class Signal:
     """Measurements of one coordinate.
 
-    direction : (3,) unit vector in rig axes.  cameras : indices of those that see it.
-    t_s : (F,).  value_mm, weight : (F, P) measured d . (item - offset) less ``start_mm``, and
-    1 / variance, 0 where nothing was seen; P = pairs of an item and a camera.
-    item, camera : (P,) of each pair, the camera as index into ``cameras``.
-    moving : (I,) False for what is fixed to the tank.  first : (I,) frame it was first seen.
-    start_mm : (I,).  start_sigma_mm : (I,) prior of a fixed item's place.
-    bubble : (I,) index into the problem's bubbles, -1 for marks.
-    pooled : number of bubbles whose mean the moving item is.  shaken : False for differences of
-    bubbles, (F, P, R) values that no shake reaches.
+    direction : (3,) unit vector in rig axes. cameras : indices of those that see it.
+    t_s : (F,). value_mm, weight : (F, P) measured d . (item - offset) less ``start_mm``, and 1 /
+    variance, 0 where nothing was seen; P = pairs of an item and a camera.
+    item, camera : (P,) of each pair, the camera as index into ``cameras``. moving : (I,) False for
+    what is fixed to the tank. first : (I,) frame it was first seen. start_mm : (I,). start_sigma_mm
+    : (I,) prior of a fixed item's place. bubble : (I,) index into the problem's bubbles, -1 for
+    marks.
+    pooled : number of bubbles whose mean the moving item is. shaken : False for differences of
+    bubbles, which no shake reaches.
     Values (F, P, R) are replicates, which differ in nothing but their values: differences of
     bubbles, or pieces of a run (`stacked`).
     """
@@ -98,10 +98,10 @@ def signals_of(
     fixed: bool = False,
     most_bubbles: int = MOST_BUBBLES,
 ) -> tuple[Signal, ...]:
-    """The problem's signals, of the bubbles that were seen longest and all marks.
+    """Return the problem's signals, of the bubbles that were seen longest and all marks.
 
-    weights : of the bubbles' and the marks' pixels, those below 0.5 are left out.
-    fixed : the tracks are those of a target that stands still in the lab.
+    weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. fixed : the
+    tracks are those of a target at rest.
     """
     bubbles, marks = problem.observations, problem.references
     if weights is not None:
@@ -202,11 +202,11 @@ def _signal(
 
 
 def pooled(signal: Signal) -> tuple[Signal, ...]:
-    """The mean of the bubbles, and their differences, where all were seen nearly all of the time.
+    """Return the mean of the bubbles and their differences, where all were nearly always seen.
 
-    For bubbles alike in noise and presence the two are independent, and the likelihood is that of
-    a single bubble twice, whatever their number. Few missing pixels are bridged by straight lines:
-    good enough to learn from. Other signals come back as they are.
+    For bubbles alike in noise and presence the two are independent, and the likelihood is that of a
+    single bubble twice. Few missing pixels are bridged by straight lines. Other signals stay as
+    they are.
     """
     movers = np.flatnonzero(signal.moving)
     cameras, count = len(signal.cameras), len(movers)
@@ -234,10 +234,7 @@ def pooled(signal: Signal) -> tuple[Signal, ...]:
 
 
 def stacked(pieces: Sequence[Signal]) -> Signal:
-    """Return one signal of pieces of a run as replicates, (F, P, R) values.
-
-    pieces : signals of as many frames and bubbles, all seen nearly all of the time by all cameras.
-    """
+    """Return one signal of equally long pieces of a run, as replicates (F, P, R)."""
     parts = [_bridged(p.t_s, p.value_mm, p.weight) for p in pieces]
     value = np.stack([v for v, _ in parts], -1)
     weight = np.mean([w for _, w in parts], axis=0)

@@ -162,10 +162,7 @@ def _along(signal: Signal, rms_mm: tuple[float, float, float], camera: int) -> f
 
 
 def moving_processes(signal: Signal, model: ShakeModel) -> list[Process]:
-    """Return the processes of one bubble along the signal's direction; none if nothing moves.
-
-    The mean velocity is a constant of the signal, no input of the states.
-    """
+    """Return the processes of one bubble along the signal's direction; none if nothing moves."""
     if not signal.moving.any():
         return []
     return bubble_processes(model.bubble, signal.direction, bubbles=signal.pooled, mean_known=True)

@@ -91,7 +91,7 @@ def unexplained(signal: Signal, model: ShakeModel, where: int | str, count: int 
     """Return the highest peaks of a spectrum over the model's.
 
     where : CARRIAGE: the mean of all items and cameras; "bubble": bubbles less their mean (of one
-    bubble: the same as CARRIAGE); a camera: its difference from the mean of the cameras.
+    bubble: as CARRIAGE); a camera: its difference from the mean of the cameras.
     """
     frequency, power, expected = _spectra(signal, model, where)
     if not len(frequency):
@@ -203,11 +203,10 @@ _LEAST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Attribution:
-    """Holds a line's owner and the log-likelihood ratio to the other owner.
+    """A line's owner, and the log-likelihood ratio to the other owner, lines refitted.
 
-    owner : "rig" or "bubble".  index : into the model's modes or zigzags.
-    log_likelihood_ratio : of this owner to the other, lines refitted (natural logarithm).
-    log_prior_ratio : of what is known before any image, as of a zigzag's second harmonic.
+    owner : "rig" or "bubble". index : into the model's modes or zigzags. log_prior_ratio : of what
+    is known before any image, as of a zigzag's second harmonic.
     """
 
     owner: str
@@ -227,7 +226,7 @@ def attributions(
 ) -> list[Attribution]:
     """Return the lines of these signals that could be the whole rig's or the bubbles'.
 
-    pattern : (3,) the directions along rig axes in which lines are moved.  up : (3,).
+    pattern : (3,) the directions along rig axes in which lines are moved. up : (3,).
     """
     if not any(c.moving.any() for c in signals):
         return []
@@ -276,8 +275,8 @@ def _line_names(model: ShakeModel) -> list[str]:
 def _own_motion_log_ratio(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
     """Return the prior log ratio: wide swings and their second harmonic are the bubbles'.
 
-    The second harmonic is not taken for theirs where the cameras shake against each other, which
-    shows a rig that may well shake as a whole.
+    Where the cameras shake against each other, the rig may well shake as a whole: then the second
+    harmonic is not taken for the bubbles'.
     """
     line = model.bubble.zigzags[index]
     swings = [z for z in model.bubble.zigzags if is_zigzag(z, up)]
@@ -356,10 +355,9 @@ def with_hidden_modes(
     """Return the model with hidden modes: modes of the rig at the frequency of a bubbles' line.
 
     The bubbles' differences show their own line; a rig's line of the same frequency adds to what
-    they have in common, where a share of 1 / bubbles is theirs anyway, and a few cycles do not
-    tell it from none. Its RMS is the root of the posterior's mean square, under a flat prior up
-    to the bubbles' own, less where the rig's main line is seen elsewhere. Wide swings across the
-    vertical are the bubbles'.
+    they have in common, where a share of 1 / bubbles is theirs anyway. Its RMS is the root of the
+    posterior's mean square, under a flat prior up to the bubbles' own, less where the rig's main
+    line is seen elsewhere. Wide swings across the vertical are the bubbles'.
     """
     own = [m for m in model.modes if _lies_in(m.rms_mm, pattern) and not _is_half(m, model)]
     for index, line in enumerate(model.bubble.zigzags):
@@ -400,11 +398,9 @@ def _is_half(mode: RigMode, model: ShakeModel) -> bool:
 def hidden_mode_weights(line: Zigzag, own: Sequence[RigMode]) -> Array:
     """Return the prior weights of hidden modes, by their `_SHARES` of the line's RMS.
 
-    All alike where the rig shows no line of its own elsewhere (a quarter of the frequency away):
-    its main one must be somewhere. One that is weaker than the strongest there, or any where that
-    is as strong as the arms', would be one more, and lie just here by chance: with the probability
-    that one of `_MORE` falls so near under the prior of modes. What it loses goes to none (the
-    first).
+    They are alike where the rig shows no line of its own elsewhere (a quarter of the frequency
+    away). A mode weaker than the strongest there would be one more, and lie just here by chance:
+    with the probability that one of `_MORE` falls so near. What it loses goes to none (the first).
     """
     away = [max(m.rms_mm) for m in own if m.camera == CARRIAGE and _is_elsewhere(m, line)]
     strongest = max(away, default=0.0)

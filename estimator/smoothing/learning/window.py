@@ -30,10 +30,7 @@ much the steps of frames may differ then."""
 def learning_signals(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
 ) -> tuple[Signal, ...]:
-    """Return the signals of `learning_parts`, those of several parts as replicates of each other.
-
-    weights : as for `learning_window`.  fixed : as for `signals_of`.
-    """
+    """Return the signals of `learning_parts`, several parts as replicates of each other."""
     parts = [part.problem for part in learning_parts(problem, weights, fixed=fixed)]
     if len(parts) > 1:
         return tuple(stacked(some) for some in zip(*map(signals_of, parts)))
@@ -45,10 +42,8 @@ def learning_parts(
 ) -> list[Window]:
     """Return the parts of a run that hyper-parameters are learned from, in their order.
 
-    That is `learning_window`, or, of tracks that come and go, short pieces of the run in which
-    some bubbles are seen all the time.
-
-    weights, fixed : as for `learning_signals`.
+    That is `learning_window`, or, of tracks that come and go, short pieces of the run in which some
+    bubbles are seen all the time.
     """
     window = learning_window(problem, weights)
     return ([] if fixed else _pieces(problem, weights, window)) or [window]
@@ -57,10 +52,10 @@ def learning_parts(
 def _pieces(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None, window: Window
 ) -> list[Window]:
-    """Return pieces of a run in which enough bubbles are seen all the time, the longest possible.
+    """Return the longest pieces of a run in which enough bubbles are seen all the time.
 
-    window : what is learned from otherwise. None where enough bubbles are seen all of its time,
-    where it is so short that all can be learned from jointly, and where something stands still.
+    None where enough are seen all of the ``window``, for short runs, and where something stands
+    still.
     """
     length, end = len(window.problem.t_s), window.first + len(window.problem.t_s)
     firsts, lasts = (np.array([getattr(b, n) for b in problem.bubbles]) for n in ("first", "last"))
@@ -109,10 +104,9 @@ def learning_window(
 ) -> Window:
     """Return the `MOST_FRAMES` frames in which the bubbles that learning uses are seen most.
 
-    Fewer frames where tracks are shorter: bubbles that are seen nearly all of the time are learned
-    from as one (`pooled`), at a fraction of the cost.
-
-    weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. None for all.
+    They are fewer where tracks are shorter: bubbles that are seen nearly all of the time are
+    learned from as one (`pooled`), at a fraction of the cost. weights : those below 0.5 are left
+    out.
     """
     count = len(problem.t_s)
     if weights is not None:
@@ -129,8 +123,7 @@ def learning_window(
 
 
 def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tuple[int, int]:
-    """First frame of the window in which most is seen of the bubbles that learning uses, and how
-    many of them are seen in a share of its frames."""
+    """Return the first frame of the window in which most is seen, and how many bubbles are."""
     count, step = len(problem.t_s), max(length // _PLACES, 1)
     firsts = np.unique(np.append(np.arange(0, count - length, step), count - length))
     seen, cameras = problem.observations, len(problem.cameras)

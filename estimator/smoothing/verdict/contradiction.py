@@ -40,10 +40,7 @@ _BEYOND_NOISE = 3.0
 
 @dataclass(frozen=True)
 class Contradictions:
-    """found : the worst first; empty if nothing disagrees.
-
-    inflation : (3,) factor by which the standard deviations along each axis have to be multiplied.
-    """
+    """Contradictions, the worst first, and factors (3,) for the standard deviations by axis."""
 
     found: tuple[Contradiction, ...] = ()
     inflation: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -125,7 +122,7 @@ def _speeds(solution: Solution) -> Iterator[Contradiction]:
 
 
 def speed_warnings(solution: Solution) -> list[str]:
-    """Return a warning for bubbles that hover or sink, which only a flow downwards explains.
+    """Return a warning for bubbles that hover or sink, as in a flow downwards.
 
     An encoder with another sign or unit has the same effect, and without marks no residual shows
     it.
@@ -144,10 +141,7 @@ def speed_warnings(solution: Solution) -> list[str]:
 
 
 def sample_warnings(solution: Solution) -> list[str]:
-    """Return a warning for each accelerometer with samples that the other measurements contradict.
-
-    Where several samples near each other go, those of the other accelerometers go, too.
-    """
+    """Return a warning for each accelerometer with samples that other measurements contradict."""
     words = []
     for sensor, weight in zip(solution.graph.problem.accelerometers, solution.sample_weights):
         if weight is None:
@@ -167,10 +161,7 @@ def sample_warnings(solution: Solution) -> list[str]:
 
 @dataclass(frozen=True)
 class Group:
-    """Squared residuals of one source along one axis.
-
-    t_s : (n,) times.  square : (n,) of the solution.  expected : (n, K) of draws from the model.
-    """
+    """Squared residuals of one source along one axis (n,), and of draws from the model (n, K)."""
 
     source: str
     axis: str
@@ -180,11 +171,9 @@ class Group:
 
 
 def residual_contradictions(solution: Solution, draws: Draws) -> Iterator[Contradiction]:
-    """Return the sources whose residuals are larger than a right model leaves them, and larger
-    than the noise itself.
+    """Return the sources whose residuals are larger than a right model leaves them, and than noise.
 
-    The second keeps short runs, whose fit takes up most of the noise, from false alarms where the
-    noise is not quite as stated.
+    The latter keeps short runs, whose fit takes up most of the noise, from false alarms.
     """
     for group in groups(solution, draws):
         seen, number = float(group.square.sum()), group.expected.shape[-1]

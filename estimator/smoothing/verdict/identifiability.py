@@ -37,9 +37,8 @@ _SEEN = 0.25
 class AxisVerdict:
     """One axis of the rig.
 
-    q : sigma(position) over sigma(position | shake known).  eta : 1 - posterior over prior variance
-    of the shake, None without a shake in the model.
-    shake_rms_mm : of the camera that shakes most.  lines : spectral lines and their owners.
+    q : sigma(position) over sigma(position | shake known). eta : 1 - posterior over prior variance
+    of the shake, None without a shake in the model. shake_rms_mm : of the camera that shakes most.
     """
 
     verdict: Verdict
@@ -94,10 +93,7 @@ def _axis(
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
-    """Return the sd (n, 3) of positions, and those if the shake were known, away from the ends.
-
-    The uncertainty of the encoder's scale is in neither.
-    """
+    """Return the sd (n, 3) of positions, and those if the shake were known, away from the ends."""
     still = solve(
         without_sensors(window.problem),
         replace(
@@ -188,10 +184,7 @@ def _inner_frames(solution: Solution) -> Ints:
 def _lines(
     problem: SmoothingProblem, model: ShakeModel
 ) -> list[tuple[Sequence[float], Attribution]]:
-    """Return the spectral lines with their owners and the directions in which each moves.
-
-    Sensors on the cameras' arms answer the question by themselves: none then.
-    """
+    """Return spectral lines with owners and directions; none with sensors on the arms."""
     if problem.arms_with_sensor:
         return []
     signals = [c for c in signals_of(problem) if c.samples]

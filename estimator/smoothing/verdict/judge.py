@@ -34,11 +34,9 @@ from telerig.io.results.verdict_words import (
 
 
 def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> dict[str, Any]:
-    """The verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ``modes``,
-    ``contradictions``, ``inflation`` and ``usable_for``.
+    """Return the verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ...
 
-    solution : of the problem under the model; without covariances the answer is empty. Without
-        bubbles there is nothing to judge, and only the modes are listed.
+    Without covariances it is empty; without bubbles only the modes are listed.
     """
     if solution.covariances is None:
         return {}

@@ -26,13 +26,11 @@ _STRONGER = 2.0
 
 @dataclass(frozen=True)
 class ShakeMode:
-    """Describe one vibration of the rig.
+    """One vibration of the rig.
 
-    place : what vibrates.
-    camera : name of the camera, if the mode belongs to an arm or to a single view; otherwise "".
-    damping : damping ratio.
-    rms_mm : RMS displacement along x, y and z of the rig frame.
-    source : "model", or "estimate" for a peak in the spectrum of the estimated offsets.
+    place : what vibrates. camera : its name, if the mode belongs to an arm or to a single view.
+    rms_mm : along x, y and z of the rig frame. source : "model", or "estimate" for a peak in the
+    spectrum of the estimated offsets.
     """
 
     place: Place
@@ -48,10 +46,7 @@ class ShakeMode:
 
 
 def shake_modes(solution: Solution) -> list[ShakeMode]:
-    """The strongest first: those of the model, or peaks in the spectrum of the estimated offsets.
-
-    Peaks of the carriage about its travel are the servo's.
-    """
+    """Return modes of the model, or peaks in the offsets' spectrum, the strongest first."""
     graph = solution.graph
     names = [c.name for c in graph.problem.cameras]
     rows = _from_offsets(solution, names)
@@ -69,10 +64,10 @@ def _from_model(mode: RigMode, names: Sequence[str]) -> ShakeMode:
 
 
 def _from_offsets(solution: Solution, names: Sequence[str]) -> list[ShakeMode]:
-    """Lines of the cameras' offsets: who moves shows where two cameras see the same axis.
+    """Return lines of the cameras' offsets: who moves shows where two cameras see the same axis.
 
     There the cameras move alike (common), one alone or both independently (arms). An axis that one
-    camera sees shares in the lines found so; a line that shows nowhere else has no known owner.
+    camera sees shares in the lines found so; another line has no known owner.
     """
     graph, found = solution.graph, solution.covariances
     if not graph.shake.size or not graph.model.broad_bands:

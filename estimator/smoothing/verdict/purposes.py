@@ -31,9 +31,8 @@ def uses(
 ) -> list[Use]:
     """Return what a solved run is good for, axis by axis; [] without bubbles or covariances.
 
-    draws : at the solution.
-    inflation : (3,) factor of the standard deviations along each axis where measurements disagree.
-        Then nothing is called better than limited.
+    draws : at the solution. inflation : (3,) factor of the standard deviations where measurements
+    disagree; then nothing is called better than limited.
     """
     graph = solution.graph
     if solution.covariances is None or not graph.rows:

@@ -37,12 +37,12 @@ residuals move by some hundredths of a standard deviation, their variance by les
 
 
 def pixel_whiteness(solution: Solution) -> dict[str, Any]:
-    """By camera, of the bubbles' kept pixels: autocorrelation beside the model's, and a test.
+    """Return by camera the autocorrelation of pixel residuals beside the model's, and a test.
 
-    Residuals of one bubble a number of frames apart, both coordinates, in sigmas, in a stretch of
-    the run. ``expected`` and the test's covariance (Hotelling, Ann. Math. Stat. 2:360, 1931) are
-    drawn from the model. ``verdict``: "as expected", or "correlated" where the test's p is below
-    0.001. Empty where there are too few frames, or too much moves in them.
+    Residuals of one bubble are some frames apart, in sigmas, in a stretch of the run. ``expected``
+    and the test's covariance (Hotelling, Ann. Math. Stat. 2:360, 1931) are drawn from the model.
+    ``verdict``: "as expected", or "correlated" where p is below 0.001. Empty for few frames, or too
+    much that moves.
     """
     obs, kept = solution.graph.problem.observations, solution.weights[0] > 0.5
     if not kept.any():
@@ -107,9 +107,9 @@ def _lagged(residuals: Array, item: Ints, frame: Ints) -> Array | None:
 
 
 def accelerometer_spectra(solution: Solution) -> dict[str, Any]:
-    """By sensor: one-sided densities, (m/s^2)^2/Hz, of readings and of what the model leaves.
+    """Return one-sided densities, (m/s^2)^2/Hz, by sensor: of readings, residuals and noise.
 
-    Summed over the directions in which its mount's motion is modelled; ``noise`` as stated.
+    They are summed over the directions in which the mount's motion is modelled.
     """
     graph, state = solution.graph, solution.state
     out: dict[str, Any] = {}
@@ -148,8 +148,8 @@ def _density(values: Array, rate_hz: float) -> tuple[Array, Array]:
 class Stretch:
     """Some frames with what moves in them; the rest is held.
 
-    column : of each key of shake and bubbles its first, -1 where it is held.  size : columns.
-    inner : (first, last) frames far enough from those that are held.
+    column : of each key of shake and bubbles its first, -1 where it is held. inner : (first, last)
+    frames far enough from those that are held.
     """
 
     graph: GraphLayout
@@ -197,9 +197,9 @@ def stretch_of(graph: GraphLayout, middle: int) -> Stretch | None:
 def drawn_residuals(
     solution: Solution, stretch: Stretch, draws: int, rng: Generator
 ) -> list[tuple[Ints, Array]]:
-    """By camera: which of its bubbles' pixels (m,), and residuals (m, 2, draws) in sigmas.
+    """Return by camera which bubbles' pixels (m,), and residuals (m, 2, draws) in sigmas.
 
-    Kept pixels in the inner frames. Raises numpy.linalg.LinAlgError where digits run out.
+    Raises numpy.linalg.LinAlgError where digits run out.
     """
     graph, observed = solution.graph, solution.graph.problem.observations
     factors = all_factors(graph, solution.state, solution.weights, solution.sample_weights)
@@ -223,10 +223,10 @@ def drawn_residuals(
 
 @dataclass(frozen=True)
 class _Part:
-    """Factors of one kind that reach into a stretch.
+    """Factors (m,) of one kind that reach into a stretch, with blocks (m, rows, columns).
 
-    which : (m,) of them.  block : (m, rows, columns), zero where the key is held.
-    column : (m, columns) the stretch's.  of_bubbles : images of them.
+    Blocks are zero where the key is held. column : (m, columns) of the stretch. of_bubbles : images
+    of them.
     """
 
     which: Ints

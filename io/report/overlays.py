@@ -43,14 +43,12 @@ def draw_overlay(
     *,
     max_width_px: int = 480,
 ) -> Picture:
-    """The image, small, with its dots: an RGB picture (h, w, 3) with a legend underneath.
+    """Return an RGB picture (h, w, 3) of the image with its dots, and a legend underneath.
 
     image : grey (H, W), 8 or 16 bit or float. accepted : u_px, v_px, a_px, b_px, angle_rad, dot,
-    row, column; its dots are green with their index (row,column where ids are opaque), as far as
-    there is room for it. rejected : u_px, v_px, a_px, b_px, angle_rad, reason; red with the
-    number of the reason, which the legend spells out with the count of its dots.
-
-    Raises InputError for what is no grey image or a table without these columns.
+    row, column; green with their index, as far as there is room. rejected : u_px, v_px, a_px, b_px,
+    angle_rad, reason; red with the number of the reason, which the legend spells out. Raises
+    InputError for what is no grey image or a table without these columns.
     """
     for table, extra, name in (
         (accepted, ["dot", "row", "column"], "accepted"),
@@ -95,16 +93,13 @@ def draw_bubble_overlay(
     found: str | None = None,
     max_width_px: int = 900,
 ) -> Picture:
-    """The image, not wider than max_width_px, with its bubbles: an RGB picture (h, w, 3).
+    """Return an RGB picture (h, w, 3) of the image, not wider than max_width_px, with its bubbles.
 
-    image : grey (H, W), 8 or 16 bit or float. outlines : each (N, 2) px of the image, closed;
-    points that are not finite are passed over. labels : one each, "" for none; a label stands in
-    the outline's middle, or beside it where other text is, or nowhere. colours : RGB, one each or
-    one for all. rejected : (u, v, radius, reason) is circled in red with the number of its reason,
-    which the legend underneath spells out with its count. found : what the outlines are, for the
-    legend; None for bubbles.
-
-    Raises InputError for what is no grey image, and for labels or colours that do not fit.
+    image : grey (H, W), 8 or 16 bit or float. outlines : each (N, 2) px, closed; points that are
+    not finite are passed over. labels : one each, "" for none, where there is room. colours : RGB,
+    one each or one for all. rejected : (u, v, radius, reason) is circled in red with the number of
+    its reason, which the legend spells out. found : what the outlines are; None for bubbles. Raises
+    InputError for what is no grey image, and for labels or colours that do not fit.
     """
     alike = len(colours) == 3 and all(np.ndim(part) == 0 for part in colours)
     shades: list[Any] = [colours] * len(outlines) if alike else list(colours)
@@ -127,10 +122,7 @@ def draw_bubble_overlay(
 def draw_binary(
     shape: tuple[int, int], outlines: Sequence[Array], max_width_px: int = 900
 ) -> Picture:
-    """(h, w), 255 where the middle of a pixel lies inside an outline, else 0.
-
-    shape : (H, W) of the image, whose pixels the outlines (N, 2) are in.
-    """
+    """Return (h, w), 255 where a pixel's middle is in an outline (N, 2) of an (H, W) image."""
     from skimage.draw import polygon
 
     factor = min(1.0, max_width_px / shape[1])
@@ -154,10 +146,7 @@ def _overlay(
     max_width_px: int,
     least_contrast: float = 0.0,
 ) -> Picture:
-    """The image with closed outlines, each (N, 2) px, their labels, and a legend underneath.
-
-    rejected : outlines in red with the numbers of their ``reasons``.
-    """
+    """Return the image with outlines (N, 2) and labels, those rejected in red, and a legend."""
     if image.ndim != 2 or min(image.shape) < 1:
         raise InputError(
             f"an overlay is drawn on a grey image, this one has shape {image.shape}",
@@ -180,10 +169,9 @@ def _overlay(
 
 
 def _grey_picture(image: NDArray[Any], factor: float, least_contrast: float = 0.0) -> Picture:
-    """8-bit RGB; the darkest and brightest thousandth of the pixels become black and white.
+    """Return 8-bit RGB; the darkest and brightest thousandth become black and white.
 
-    What is brighter than 1 - least_contrast of the brightest never becomes black, so that an
-    empty image does not look like snow.
+    What is brighter than 1 - least_contrast of the brightest never becomes black.
     """
     stride = 1 + int(np.sqrt(factor**2 * image.size / _ENOUGH_PIXELS))
     grey = shrunk(image, factor)
@@ -221,10 +209,7 @@ def draw_line(picture: Picture, points: Array, colour: Colour, *, closed: bool) 
 def write_label(
     picture: Picture, label: str, centre: Array, colour: Colour, taken: Bools | None = None
 ) -> bool:
-    """Write text round a point, with a dark rim; whether it was, as other text may be there.
-
-    taken : (h, w) the pixels under labels that are already there; None writes over them.
-    """
+    """Write text round a point, with a dark rim; return whether there was room among ``taken``."""
     import cv2
 
     (width, height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, 1)

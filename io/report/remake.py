@@ -27,11 +27,10 @@ class ResultsFolder:
 
 
 def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
-    """What a results folder, or a dataset's folder, holds results of, by name.
+    """Return the results folders by name in a results folder or a dataset, the calibration first.
 
-    calibration.json, tracking.json, validation.json or batch.json say which kind a folder is; of a
-    dataset, those in its ``results`` are taken, the calibration first. Raises InputError where
-    there is none.
+    calibration.json, tracking.json, validation.json or batch.json say which kind a folder is.
+    Raises InputError where there is none.
     """
     place = Path(folder)
     if not place.is_dir():
@@ -52,12 +51,7 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
 
 
 def remake_report(results: ResultsFolder, out: Path | None = None) -> Path:
-    """Write the page of a results folder into it, or into ``out``; returns its path.
-
-    The page of a validation is made beside that of a run.
-
-    Raises InputError for results that cannot be read.
-    """
+    """Write the page of a results folder into it, or into ``out``; return its path."""
     if out is not None:
         return _write_page(results, out)
     again = f"telerig report {shlex.quote(str(results.folder))}"

@@ -25,10 +25,7 @@ _MOST_DRAWN = 12
 
 
 def write_validation_report(folder: Path, out: Path | None = None) -> Path:
-    """Write validation.html beside validation.json, or into ``out``; returns its path.
-
-    Raises InputError for a folder without validation.json, or one that cannot be read.
-    """
+    """Write validation.html beside validation.json, or into ``out``; InputError without that."""
     content = ValidationFile.read(Path(folder) / "validation.json")
     page = (folder if out is None else out) / NAME
     write_text_atomic(page, render(content))

@@ -48,10 +48,7 @@ class Line:
 
 
 def write_batch_report(folder: Path, out: Path | None = None) -> Path:
-    """Write report.html beside batch.json, or into ``out``; returns its path.
-
-    Raises InputError for a folder without a batch, or one that cannot be read.
-    """
+    """Write report.html beside batch.json, or into ``out``; InputError where there is no batch."""
     file, todo = Path(folder) / "batch.json", "run `telerig batch` with --out of this folder"
     with reading(file.parent, [file.name]):
         content = read_object(file, todo)

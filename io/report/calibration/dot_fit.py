@@ -22,10 +22,7 @@ _MOST_SHAPES = 1500
 
 
 def edge_distance_px(example: Mapping[str, Array]) -> Array:
-    """(h, w) signed distance of each pixel of the patch from the ellipse, positive outside.
-
-    To first order, (rho - 1) / |grad rho| with rho = 1 on the ellipse.
-    """
+    """Return the signed distance (h, w) of pixels from the ellipse, positive outside."""
     height, width = example["patch"].shape
     u = float(example["u0"]) + np.arange(width) - float(example["u_px"])
     v = float(example["v0"]) + np.arange(height)[:, None] - float(example["v_px"])

@@ -158,10 +158,9 @@ def coverage(results: CalibrationResults, index: int) -> Picture:
 
 
 def tilt_angles_rad(results: CalibrationResults, index: int) -> tuple[list[str], Array, Array]:
-    """Views that a camera saw, tilt of the target against the image, and the tilt's direction.
+    """Return the views that a camera saw, the target's tilt (0 to pi/2) and the tilt's direction.
 
-    The tilt is the angle between the optical axis and the target's normal, 0 to pi/2; the
-    direction is that of the normal towards the camera, in the image from +u towards +v.
+    The direction is that of the normal towards the camera, in the image from +u towards +v.
     """
     camera = results.cameras[index]
     seen = set(results.residuals.loc[results.residuals["camera"] == camera.name, "view"])

@@ -45,14 +45,11 @@ _SHOWN = {
 def write_calibration_report(
     results_folder: Path, out: Path | None = None, *, dot: list[Picture] | None = None
 ) -> Path:
-    """Write report.html into a calibration's results folder, or into ``out``; returns its path.
+    """Write report.html into a calibration's results folder, or into ``out``; return its path.
 
-    It reads nothing but that folder: calibration.json and residuals.csv, and if they are there
-    dots.csv, covariance.npz, run.json, overlays/<camera>/<view>.jpg and dot_example.npz. The page
-    is written whole or not at all. Raises InputError for a folder that holds no calibration, or
-    files that cannot be read or do not fit together.
-
-    dot : what `dot_pictures` made of that dot_example.npz before; None draws it now.
+    The page is made from nothing but that folder. dot : what `dot_pictures` made of dot_example.npz
+    before; None draws it now. Raises InputError for a folder that holds no calibration, or files
+    that cannot be read or do not fit together.
     """
     folder = Path(results_folder)
     with reading(folder, ()):
@@ -65,10 +62,7 @@ def write_calibration_report(
 def render(
     results: CalibrationResults, dot: list[Picture] | None = None, outdated: Sequence[str] = ()
 ) -> str:
-    """The page as text.
-
-    dot : as for `write_calibration_report`. outdated : what `stale` found.
-    """
+    """Return the page as text; ``outdated`` is what `stale` found."""
     context = {"stale": outdated} | _words(results) | _tables(results) | _pictures(results, dot)
     return render_page("template_calibration.html", context, scene_json(results))
 

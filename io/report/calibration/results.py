@@ -40,18 +40,12 @@ _FILES = (
 
 @dataclass(frozen=True)
 class CalibrationResults:
-    """A results folder in memory.
+    """A results folder in memory; what optional files are missing is in ``absent``.
 
-    file : calibration.json.
-    views : view name -> rig_from_target.
-    row_column : (N, 2) of the target's dots, NaN where no residual names the dot.
-    residuals : residuals.csv with ``kept`` and ``length_px`` added, and ``whitened_u``,
-        ``whitened_v`` when dots.csv states every dot's covariance.
-    component : name of a component -> its place in ``joint``, the whole covariance.
-    overlays : (camera, view) -> picture.
-    dot_example, uncertainty : arrays of dot_example.npz and uncertainty.npz, or empty.
-    comparison : comparison.json with an earlier calibration, or an empty one.
-    absent : what optional files are missing, in words.
+    views : rig_from_target by view. row_column : (N, 2) of the dots, NaN where no residual names
+    it. residuals : with ``kept`` and ``length_px``, and ``whitened_u``, ``whitened_v`` when
+    dots.csv states covariances. component : place in ``joint``, the whole covariance, by name.
+    overlays : picture by (camera, view). dot_example, uncertainty : arrays, or empty.
     """
 
     file: CalibrationFile
@@ -93,11 +87,8 @@ class CalibrationResults:
 
 
 def read_results(folder: Path) -> CalibrationResults:
-    """Read a calibration's results folder.
+    """Read a calibration's results folder: calibration.json, residuals.csv, and what else is there.
 
-    calibration.json and residuals.csv are needed; dots.csv, covariance.npz, run.json,
-    uncertainty.npz, comparison.json, overlays/<camera>/<view>.jpg and dot_example.npz are used
-    when they are there.
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
     with reading(folder, _FILES):

@@ -30,9 +30,9 @@ _BEFORE, _BEHIND = 1.7, 1.2
 
 @dataclass(frozen=True)
 class CameraOutline:
-    """field_mm : (2, 4, 3) corners of the seen field, near and far; body_mm : (2, 4, 3) a box.
+    """Corners (2, 4, 3) of the seen field and of a box, and ends (2, 3) of the optical axis, in mm.
 
-    axis_mm : (2, 3) ends of the optical axis. The body's distance is drawn, not measured.
+    The body's distance is drawn, not measured.
     """
 
     name: str
@@ -71,10 +71,9 @@ def plate_corners(points_mm: Array, margin: float = 0.0) -> Array:
 
 
 def common_plane(results: CalibrationResults) -> Array:
-    """(2, 3) unit vectors, across and along the first optical axis, of the plane of both axes.
+    """Return unit vectors (2, 3), across and along the first axis, of the plane of both axes.
 
-    Across is to the right in the first camera's image where it can be. One camera, or parallel
-    axes: the first camera's x and z.
+    For one camera or parallel axes they are the first camera's x and z.
     """
     along = results.cameras[0].camera_from_rig.rotation[2]
     across = results.cameras[-1].camera_from_rig.rotation[2]

@@ -20,10 +20,9 @@ _MOST_SHAPES = 1500
 class TargetShape:
     """Dots against the best perfect target.
 
-    place_mm : (N, 2) where the best target has them; off_um : (N, 3) estimated minus best.
-    sd_um : (N, 3), zeros when the covariance is not at hand.
-    stretch : per-mille stretch of the nominal target along its two principal directions, or None.
-    in_plane : False when the files do not tell the nominal places, only flatness is known then.
+    place_mm : (N, 2) where the best target has them. off_um, sd_um : (N, 3) estimated minus best.
+    stretch : per mille, along two principal directions, or None. in_plane : False when only
+    flatness is known.
     """
 
     place_mm: Array
@@ -33,9 +32,8 @@ class TargetShape:
 
 
 def target_shape(results: CalibrationResults) -> TargetShape | None:
-    """Deviations from an affinely fitted nominal target and plane; None for under five dots.
+    """Return deviations from an affinely fitted nominal target; None for under five dots.
 
-    The fit takes out the position, the turn, the stretch and the shear, which are no bending.
     Nominal places come from row and column of each dot, up to the pitch that the fit finds.
     """
     lattice = results.row_column

@@ -48,15 +48,12 @@ _SHADES = ((1.0, 0.62), (0.72, 0.74), (0.42, 0.86))
 def write_path_film(
     results_folder: Path, files: Sequence[Path], *, stage: Progress | None = None
 ) -> tuple[str, ...]:
-    """Film the path that a run's results folder holds, from 180 sides; what to know, in words.
+    """Film the path that a run's results folder holds, from 180 sides; return remarks in words.
 
-    The view goes round the vertical in steps of 2 degrees, 25 pictures a second. Bubbles are
-    ellipsoids from both outlines where the calibration is at hand (`results_cameras`), else
-    spheres; the band round a path is +-2 sd, widened by a factor that stands in the film where it
-    would be thinner than a line. A long run's path is thinned.
-
-    files : .mp4 (needs PyAV), .gif. Raises InputError for results that cannot be read or hold no
-    path, and files that cannot be written.
+    Bubbles are ellipsoids from both outlines where the calibration is at hand (`results_cameras`),
+    else spheres; the band round a path is +-2 sd, widened where it would be thinner than a line, by
+    a factor that stands in the film. A long run's path is thinned. Raises InputError for results
+    that cannot be read or hold no path, and files that cannot be written.
     """
     folder = Path(results_folder)
     cameras, why = run_cameras(folder, read_track_results(folder))
@@ -72,10 +69,9 @@ def write_path_film(
 class FilmPath:
     """Paths in the film's axes: right and forward (away from the viewer) at angle 0, and up.
 
-    points_mm, sd_mm : (N, 3), by particle and frame. particle : (N,). new : (N,), rows before
-    which the line is interrupted. bodies : (B,) rows of the points whose bubble is drawn.
-    quadrics_mm2 : (B, 3, 3), Q of the ellipsoid x^T Q^-1 x = 1. names : of the three axes.
-    notes : what a viewer must know.
+    points_mm, sd_mm : (N, 3), by particle and frame. particle : (N,). new : (N,), rows before which
+    the line is interrupted. bodies : (B,) rows whose bubble is drawn. quadrics_mm2 : (B, 3, 3), Q
+    of the ellipsoid x^T Q^-1 x = 1. names : of the axes. notes : for the viewer.
     """
 
     points_mm: Array
@@ -90,10 +86,7 @@ class FilmPath:
 
 
 def film_axes(up: Array) -> Array:
-    """(3, 3) rows right, forward, up in rig axes; (right, up, -forward) is right-handed.
-
-    right is the rig axis x, or z where x is upright.
-    """
+    """Return rows right, forward, up (3, 3) in rig axes; right is x, or z where x is upright."""
     first = np.eye(3)[0 if abs(up[0]) < 0.7 else 2]
     right = first - (first @ up) * up
     right /= np.linalg.norm(right)
@@ -101,10 +94,10 @@ def film_axes(up: Array) -> Array:
 
 
 def read_film_path(folder: Path, cameras: tuple[Camera, Camera] | None) -> FilmPath:
-    """The path that a run's results folder holds: smoothed in the lab frame, else the tracks.
+    """Return the path that a run's results folder holds: smoothed in the lab frame, or tracks.
 
-    cameras : for the bubbles' bodies from both outlines; without them they are spheres.
-    Raises InputError for a folder that cannot be read, or holds no point.
+    cameras : for the bubbles' bodies; without them they are spheres. Raises InputError for a folder
+    that cannot be read, or holds no point.
     """
     with reading(folder, ()):
         results = read_track_results(folder)
@@ -189,9 +182,8 @@ def _apart(kept: pd.DataFrame, sizes: pd.DataFrame) -> list[int]:
 class Panel:
     """Where a drawing stands and how it is scaled, in px at 100 dpi.
 
-    low_mm, high_mm : (3,) the box. stretch : how much wider than high a mm is drawn.
-    px_per_mm : of the vertical. centre_px : (2,), where the box's middle is. band : how much the
-    +-2 sd band is widened, 0 without one. bodies : whether bubbles are drawn. words : above it.
+    low_mm, high_mm : (3,) the box. stretch : how much wider than high a mm is drawn. band : how
+    much the +-2 sd band is widened, 0 without one. words : above it.
     """
 
     low_mm: Array
@@ -260,10 +252,9 @@ def _elevation_deg(stretch: int) -> float:
 
 
 def view_matrix(angle_deg: float, elevation_deg: float) -> Array:
-    """(3, 3) rows: right, up and away on the screen, in the film's axes right, forward, up.
+    """Return rows right, up and away (3, 3) on the screen, in the film's axes right, forward, up.
 
-    The viewer walks round the vertical and looks down a little; 180 degrees further on every
-    point of the axis' height has its horizontal coordinate mirrored.
+    180 degrees further on the horizontal coordinates are mirrored.
     """
     turn, tilt = np.deg2rad(angle_deg), np.deg2rad(elevation_deg)
     cos, sin, down, level = np.cos(turn), np.sin(turn), np.sin(tilt), np.cos(tilt)
@@ -307,10 +298,7 @@ def draw_path(path: FilmPath, layout: Layout, angle_deg: float) -> Picture:
 
 
 class _Page:
-    """A figure without axes: what is drawn is in px at 100 dpi, v down.
-
-    Text is written by Pillow, which takes a tenth of the time that matplotlib takes for it.
-    """
+    """A figure without axes, in px at 100 dpi, v down. Pillow writes text ten times as fast."""
 
     def __init__(self, size_px: tuple[int, int]) -> None:
         from matplotlib.figure import Figure
@@ -440,10 +428,7 @@ def _draw_tracks(page: _Page, path: FilmPath, panel: Panel, matrix: Array, offse
 
 
 def _shaded(centres: Array, shapes: Array, particles: Ints) -> tuple[Array, Array, Array]:
-    """Three discs to a bubble as polygons (3 B, 48, 2), their face and their edge colours (RGBA).
-
-    centres : (B, 2) px. shapes : (B, 2, 2), Q of the outlines x^T Q^-1 x = 1.
-    """
+    """Return three discs per bubble as polygons (3 B, 48, 2), and their face and edge colours."""
     from matplotlib.colors import to_rgb
 
     turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)

@@ -21,11 +21,11 @@ def write_films(
     recording: Path | None,
     stage: Progress,
 ) -> Iterator[str]:
-    """Write path.* and views.* into the folder ``place``; a line for each file, and for each note.
+    """Write path.* and views.* into the folder ``place``; return a line for each file and note.
 
-    endings : "mp4", "gif" or both. recording : the run's folder; None looks in the dataset that
-    holds the results, and leaves out the film of the views where it is not there.
-    Raises InputError for results or a recording that cannot be used.
+    endings : "mp4", "gif" or both. recording : the run's folder; None looks in the dataset, and
+    leaves out the film of the views where it is not there. Raises InputError for what cannot be
+    used.
     """
     files = [place / f"path.{ending}" for ending in endings]
     yield from _lines(files, write_path_film(results_folder, files, stage=stage))

@@ -68,14 +68,11 @@ def write_views_film(
     t_s: Array | None = None,
     stage: Progress | None = None,
 ) -> tuple[str, ...]:
-    """Film the cameras' images with what was found in them; what to know, in words.
+    """Film the cameras' images with what was found in them; return remarks in words.
 
-    results_folder : a tracked run's; detections.csv is read. images : gives the grey image (H, W)
-    of a camera and frame, or None where there is none; it is called from several processes.
-    image_sizes_px : (width, height) by camera, in the order of the film. t_s : (frame_count,).
-
-    25 frames a second; of a run of more than 1,000 frames every k-th is shown. Raises InputError
-    for a folder without detections.csv, and files that cannot be written.
+    images : gives the grey image (H, W) of a camera and frame, or None; it is called from several
+    processes. t_s : (frame_count,). Of a run of more than 1,000 frames every k-th is shown. Raises
+    InputError for a folder without detections.csv, and files that cannot be written.
     """
     cameras = tuple(image_sizes_px)
     folder = Path(results_folder)
@@ -114,10 +111,7 @@ def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
 
 
 def outlines_px(table: pd.DataFrame, points: int = 72) -> Array:
-    """(N, points, 2) px: ellipse and normal displacement, as docs/files.md defines them.
-
-    Without semi-axes there is no outline: a small circle round the place.
-    """
+    """Return outlines (N, points, 2) as docs/files.md defines them; circles without semi-axes."""
     phi = np.linspace(0, 2 * np.pi, points, endpoint=False)
     u, v, a, b, angle = table[_ELLIPSE].to_numpy(float).T[:, :, None]
     bare = ~np.isfinite(a * b * angle)

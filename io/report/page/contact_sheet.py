@@ -48,11 +48,10 @@ def picture_sheet(
     small_width_px: int = SMALL_WIDTH_PX,
     budget_bytes: int | None = None,
 ) -> ContactSheet:
-    """As they are if they fit; else smaller; else those of the last rows linked only.
+    """Return pictures as they are if they fit; else smaller; else the last rows linked only.
 
-    files : (column, row) -> JPEG or PNG, <results>/<kind>/<folder>/<name>. budget_bytes : of all
-    pictures, `BUDGET_BYTES` unless told.
-    Raises InputError for a picture that cannot be read.
+    files : JPEG or PNG by (column, row), <results>/<kind>/<folder>/<name>. Raises InputError for a
+    picture that cannot be read.
     """
     pictures = {key: read_picture(file) for key, file in files.items()}
     left = BUDGET_BYTES if budget_bytes is None else budget_bytes

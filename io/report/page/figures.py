@@ -58,11 +58,7 @@ def prepare_drawing() -> None:
 
 @dataclass
 class Sheet:
-    """A figure that is being drawn.
-
-    points : how many marks and vertices it holds; with many it is stored as pixels.
-    source : its data URI, once the drawing is finished.
-    """
+    """A figure that is being drawn; with many ``points`` it is stored as pixels in ``source``."""
 
     figure: Any
     axes: Any
@@ -74,10 +70,10 @@ class Sheet:
 def drawing(
     height_in: float, *, legend: str = "", grid: bool = False, **settings: Any
 ) -> Iterator[Sheet]:
-    """A figure and its axes in the report's style, `WIDTH_IN` wide.
+    """Yield a figure and its axes in the report's style, `WIDTH_IN` wide.
 
-    legend : "above" the axes, or a place in them by its name in matplotlib; "" for none.
-    settings : of the axes, as ``axes.set`` takes them.
+    legend : "above" the axes, or a place by its name in matplotlib; "" for none. settings : as
+    ``axes.set`` takes them.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -106,10 +102,7 @@ def svg(figure: Any) -> str:
 
 
 def png(figure: Any, dpi: int = 130, colours: int | None = None) -> str:
-    """``figure`` as a data URI of pixels, for what would be thousands of shapes.
-
-    colours : so many shades are enough, which makes a drawing of lines a third as large.
-    """
+    """Return ``figure`` as a data URI of pixels; few ``colours`` make drawings of lines small."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
     if colours is not None:
@@ -152,11 +145,7 @@ _DPI = 190
 
 @dataclass(frozen=True)
 class Curve:
-    """A line of a plot.
-
-    x, y : (N,). sd : (N,) of a band of ± `BAND_SDS` of it, or None. style : as matplotlib's plot
-    takes it.
-    """
+    """A line (N,) of a plot, with a band of ± `BAND_SDS` sd (N,); style : as matplotlib has it."""
 
     x: Array
     y: Array

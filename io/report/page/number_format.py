@@ -69,10 +69,7 @@ UNITS = {
 def name_with_unit(
     name: str, shown: Mapping[str, tuple[str, float]] | None = None
 ) -> tuple[str, float]:
-    """A name of the files in words, with its unit; and the factor to that unit.
-
-    shown : unit -> (the unit that a reader gets instead, the factor to it).
-    """
+    """Return a name in words, with its unit or the one ``shown`` for it, and the factor to it."""
     end = next((end for end in UNITS if name.endswith(end) and name != end), "")
     unit, factor = (shown or {}).get(UNITS.get(end, ""), (UNITS.get(end, ""), 1.0))
     words = name.removesuffix(end).replace("_", " ").replace(".", ": ")

@@ -41,11 +41,7 @@ class Row:
 
 
 def render_page(template: str, context: Mapping[str, Any], scene: str) -> str:
-    """The page as text.
-
-    template : a file of this package; it includes "scene_script.html" where the 3-D library goes.
-    context : escaped where it is text. scene : what `scene.scene_text` gives.
-    """
+    """Return the page as text; ``context`` is escaped, ``scene`` is what `scene_text` gives."""
     from markupsafe import Markup
 
     carried = {
@@ -106,10 +102,10 @@ def scene_text(
     distance: float = 1.0,
     ratio: Sequence[float] | None = None,
 ) -> str:
-    """Traces with a layout for them, safe inside a script element.
+    """Return traces with a layout for them, safe inside a script element.
 
-    up : (3,) unit vector, up on the screen. distance : of the eye; from afar it looks a little
-    lower, where tilted boxes reach farthest. ratio : of the box' sides, None: true proportions.
+    up : (3,) unit vector on the screen. distance : of the eye. ratio : of the box' sides, None:
+    true proportions.
     """
     axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
     lower = [-min(0.3 * (distance - 1), 0.12) * float(part) for part in up]
@@ -133,10 +129,7 @@ def scene_text(
 
 
 def script_data(content: Any) -> str:
-    """Return data as JSON that is safe inside a script element of a page.
-
-    There a browser looks for ``</script`` and ``<!--<script`` before it reads the data.
-    """
+    """Return data as JSON that is safe inside a script element of a page."""
     return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
 
 

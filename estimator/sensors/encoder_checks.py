@@ -171,7 +171,8 @@ def _classified(
     while left:
         i = left.pop(0)
         size, at, step = float(excess[i]), float(t[i + 1]), float(t[i + 1] - t[i])
-        if left and left[0] - i <= _LONGEST_SPIKE and _ends(size, float(excess[left[0]])):
+        near = left and left[0] - i <= _LONGEST_SPIKE
+        if near and abs(size + float(excess[left[0]])) < _RETURNS * abs(size):
             out.append(EncoderFault(at, size, "spike", step, left.pop(0) - i))
         elif i < _LONGEST_SPIKE and i + _LONGEST_SPIKE < last:
             out.append(EncoderFault(float(t[0]), -size, "spike", step, i + 1))
@@ -182,8 +183,3 @@ def _classified(
         else:
             out.append(EncoderFault(at, size, "jump", step))
     return out
-
-
-def _ends(size: float, after: float) -> bool:
-    """Return whether a step ends the error that began with the step before."""
-    return abs(size + after) < _RETURNS * abs(size)

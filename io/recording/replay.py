@@ -278,7 +278,8 @@ def _judged(line: _Line, start_ns: int, times: Callable[..., _Timed]) -> DeviceR
     timed = times(line, arrived[kept], stamps, slot, start_ns)
     t_s[kept] = np.round(timed.t_s, TIME_DIGITS)
     refuse(np.isnan(t_s[kept]), timed.reason)
-    refuse(~_later(t_s[kept]), "not later than the one before")
+    latest = np.maximum.accumulate(np.append(-np.inf, t_s[kept][:-1]))
+    refuse(t_s[kept] <= latest, "not later than the one before")
     if device.kind != "frames":
         unit = device.counts_per_mm or 1.0 if "counts" in found.values else 1.0
         most = _ACCELERATION_MM_S2 * abs(unit) if device.kind == "encoder" else 0.0
@@ -339,8 +340,3 @@ def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
     half = (arrived - sent[asked]) / 2
     t_s = np.where(clear, arrived - half, np.nan)
     return t_s, float(np.median(half[clear])) if clear.any() else 0.0
-
-
-def _later(t_s: Array) -> Bools:
-    """(N,) whether a time is later than all before it."""
-    return np.asarray(t_s > np.maximum.accumulate(np.append(-np.inf, t_s[:-1])))

@@ -129,8 +129,9 @@ class QuadraticCost:
 
     def penalty_of(self, lens: Lens) -> float:
         """Return the penalty of a model; a tilt counts as two groups, stretch and homography."""
-        free = sum(len(GROUPS[g]) for g in lens - {"centre"})
-        return self.penalty * free + self.group_penalty * len((lens - {"centre"}) | _also(lens))
+        own = lens - {"centre"}
+        groups = own | {"affine"} if "tilt" in own else own
+        return self.penalty * sum(len(GROUPS[g]) for g in own) + self.group_penalty * len(groups)
 
     def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
         """Return the largest ratio of posterior to prior standard deviation among the parameters of
@@ -148,10 +149,6 @@ class QuadraticCost:
             i for i, (camera, parameter) in enumerate(self.names)
             if parameter in _held_by(lenses[camera])
         ]  # fmt: skip
-
-
-def _also(lens: Lens) -> Lens:
-    return Lens({"affine"}) if "tilt" in lens else Lens()
 
 
 @cache

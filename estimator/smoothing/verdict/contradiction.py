@@ -259,16 +259,13 @@ def _blamed(
             other = solve(rest, model, Options(draws=True))
         except CalibrationError:
             continue
-        off = sum(f.statistic for f in [*_outliers(other), *_constants(other), *_misfit(other)])
+        misfit = residual_contradictions(other, drawn(other))
+        off = sum(f.statistic for f in [*_outliers(other), *_constants(other), *misfit])
         if off < best[0]:
             best = off, names, other
         if not off:
             break
     return best[1], best[2]
-
-
-def _misfit(solution: Solution) -> list[Contradiction]:
-    return list(residual_contradictions(solution, drawn(solution)))
 
 
 def _named(one: Contradiction, blamed: tuple[str, ...]) -> Contradiction:

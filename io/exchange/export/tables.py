@@ -17,7 +17,6 @@ from telerig.io.files.csv_table import write_table
 from telerig.io.files.hdf5 import hdf5_file
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
-from telerig.rig.windows import Wall
 
 
 def write_hdf5(
@@ -84,6 +83,7 @@ def _unique(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
+    wall = {} if camera.wall is None else camera.wall.as_dict()
     return {
         "image_size_px": np.array(camera.image_size_px),
         "parameter_names": ", ".join(PARAMETERS),
@@ -93,12 +93,8 @@ def _camera(camera: Camera) -> dict[str, Any]:
         "translation_camera_from_rig_mm": camera.camera_from_rig.translation_mm,
         "undistorted_matrix": undistorted_matrix(camera),
         "pixel_origin": "centre of the top-left pixel is (0, 0)",
-        **({} if camera.wall is None else _wall(camera.wall)),
+        **{f"wall_{name}": np.array(value) for name, value in wall.items()},
     }
-
-
-def _wall(wall: Wall) -> dict[str, Any]:
-    return {f"wall_{name}": np.array(value) for name, value in wall.as_dict().items()}
 
 
 def trackpy_table(results: RunResults) -> pd.DataFrame:

@@ -39,7 +39,7 @@ def target_shape(results: CalibrationResults) -> TargetShape | None:
     lattice = results.row_column
     known = np.isfinite(lattice).all(axis=1)
     points = results.points_mm
-    in_plane = bool(known.all()) and len(points) > 4 and _spread(lattice)
+    in_plane = bool(known.all()) and len(points) > 4 and bool(np.ptp(lattice, axis=0).min() > 0)
     design = np.c_[lattice if in_plane else points[:, :2], np.ones(len(points))]
     if len(points) < 5 or np.linalg.matrix_rank(design) < 3:
         return None
@@ -47,10 +47,6 @@ def target_shape(results: CalibrationResults) -> TargetShape | None:
     best = basis @ (basis.T @ points)
     off = 1e3 * (points - best)
     return TargetShape(best[:, :2], off, 1e3 * _sd_mm(results, basis), in_plane)
-
-
-def _spread(lattice: Array) -> bool:
-    return bool(np.ptp(lattice, axis=0).min() > 0)
 
 
 def _sd_mm(results: CalibrationResults, basis: Array) -> Array:

@@ -47,12 +47,7 @@ _stopped = threading.Event()
 
 
 def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
-    """Do a job in this process and return its status, words and figures.
-
-    stage : function that is called with the progress of the job.
-
-    Raises the errors of calibration, tracking and smoothing.
-    """
+    """Do a job in this process; return status, words and figures. ``stage`` gets the progress."""
     return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
 
 
@@ -78,8 +73,7 @@ def allow() -> None:
 def stop_all() -> None:
     """End the processes of `perform` in all threads. Jobs that start later fail at once.
 
-    Each process is interrupted in the same way as by Ctrl-C, so that it removes its temporary
-    files. It is killed if it has not ended after `_END_WITHIN_S` seconds.
+    Each process is interrupted as by Ctrl-C, and killed after `_END_WITHIN_S` seconds.
     """
     _stopped.set()
     ending = list(_children)
@@ -255,11 +249,7 @@ FIGURES = (
 
 
 class Journal:
-    """Keeps the records of a batch in its folder ``jobs``, so that an interrupted batch can
-    continue.
-
-    Several processes may write records of different jobs to it.
-    """
+    """Keeps the records of a batch in its folder ``jobs``, so that it can continue."""
 
     def __init__(self, batch: Path) -> None:
         self.folder = Path(batch) / "jobs"
@@ -283,8 +273,8 @@ class Journal:
     def write(self, job: Job, result: Mapping[str, Any], inputs: str) -> dict[str, Any]:
         """Write the result of a job to the journal and return the record.
 
-        inputs : `fingerprint` of the job before it began. If an input changes while the job runs,
-            the job is therefore done again by the next batch.
+        inputs : `fingerprint` of the job before it began: if one changes meanwhile, the job is done
+        again.
         """
         record = {
             "kind": job.kind, "dataset": job.dataset, "run": job.run, **result,
@@ -363,14 +353,11 @@ _CONNECT_S = 20
 def run_batch(
     jobs: Sequence[Job], executor: Executor, journal: Journal, *, tell: Tell | None = None
 ) -> list[dict[str, Any]]:
-    """Do all jobs, each after the jobs that it needs, and return their records in the order of
-    ``jobs``.
+    """Do all jobs, each after those that it needs, and return their records in the same order.
 
     A job that ``journal`` records as done with the same inputs is not done again. If a job fails,
-    only the jobs that need it are left out, and their records name it.
-
-    executor : runs `perform`, see `local_executor` and `dask_executor`.
-    tell : function that is called after each job.
+    only the jobs that need it are left out, and their records name it. executor : runs `perform`.
+    tell : is called after each job.
     """
     by_name = {job.name: job for job in jobs}
     records: dict[str, dict[str, Any]] = {}
@@ -413,11 +400,7 @@ def _known_record(
 
 
 def _result(future: Future[dict[str, Any]]) -> dict[str, Any]:
-    """Return the result of a job that an executor has finished.
-
-    An executor raises an error if it gives up a job, for instance because the workers of a cluster
-    died; the job then counts as crashed.
-    """
+    """Return the result of a finished job; one that the executor gave up counts as crashed."""
     error = future.exception()
     if error is None:
         return future.result()
@@ -426,13 +409,7 @@ def _result(future: Future[dict[str, Any]]) -> dict[str, Any]:
 
 @contextmanager
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
-    """Give an executor that runs ``workers`` jobs at once on this computer, each in its own
-    process.
-
-    workers : None means one per core.
-
-    Raises InputError for fewer than 1.
-    """
+    """Give an executor for ``workers`` jobs at once (None: one per core), each in a process."""
     count = cores() if workers is None else workers
     if count < 1:
         raise InputError(f"{count} workers", where="--workers", todo="give 1 or more")
@@ -451,13 +428,10 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 def dask_executor(address: str, option: str = "--scheduler") -> Iterator[Executor]:
     """Give an executor that uses the workers of a running Dask cluster.
 
-    The datasets must be at the same paths on every worker, because only the descriptions of the
-    jobs and their results are sent. If a worker dies, its job is done again by another one, as
-    often as the cluster's setting allowed-failures permits (3 by default).
-
-    address : tcp://host:port of the scheduler; option : the one that named it, for messages.
-
-    Raises InputError if Dask is not installed, if no scheduler answers, or if it has no workers.
+    The datasets must be at the same paths on every worker. If a worker dies, its job is done again
+    by another one, as often as the cluster's setting allowed-failures permits. address :
+    tcp://host:port of the scheduler; option : the one that named it, for messages. Raises
+    InputError if Dask is not installed, if no scheduler answers, or if it has no workers.
     """
     try:
         from distributed import Client

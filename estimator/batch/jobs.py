@@ -28,17 +28,12 @@ _INPUTS = {"calibrate": ("calibration", "stage_axis")}
 
 @dataclass(frozen=True)
 class Job:
-    """Describes the calibration of one dataset, or the tracking or smoothing of one run.
+    """The calibration of one dataset, or the tracking or smoothing of one run; paths are text.
 
-    Paths are text, so that a job can be sent to another computer.
-
-    run : name of the run; empty for a calibration.
-    calibration : file that is used for all runs; empty for the dataset's own calibration.
-    model, medium : lens model of a calibration, and the medium in which the target was.
-    shake, refine_rig, accept : of a smoothing: see ``model``, ``refine_rig`` and ``accept`` of
-        `telerig.smooth`.
-    tracks : of a smoothing: tracks.csv, or the folder that has it; empty for the results folder.
-    needs : names of the jobs that must be done before this one.
+    run : "" for a calibration. calibration : file for all runs; "" for the dataset's own. model,
+    medium : of a calibration. shake, refine_rig, accept : of a smoothing, see `telerig.smooth`.
+    tracks : tracks.csv or its folder; "" for the results folder. needs : names of jobs to be done
+    before.
     """
 
     kind: Kind
@@ -119,21 +114,14 @@ def jobs_of(
     only: Sequence[str] = (),
     strict: bool = False,
 ) -> list[Job]:
-    """Return the calibration, tracking and smoothing of every dataset, each after the jobs that it
-    needs.
+    """Return calibration, tracking and smoothing of every dataset, each after what it needs.
 
-    calibration : a calibration for all datasets; then none is calibrated.
-    model : the lens model of calibrations.
-    shake, refine_rig, accept : of smoothings, see `Job`.
-    tracks : a folder with tracks in a folder for each run, or None; only where nothing is tracked.
-    only : kinds of jobs (`KINDS`) and names of runs to be done; without kinds all kinds are done,
-        without names all runs.
-    strict : if True, a dataset that cannot be used raises InputError; otherwise it becomes a
-        calibration job that fails, so that the other datasets are still done.
-
-    A dataset without views of the target must have been calibrated before. Raises InputError for
-    folders that do not exist or are named twice, for unknown runs, and for options of jobs that are
-    not done.
+    calibration : for all datasets; then none is calibrated. tracks : a folder with tracks in a
+    folder for each run, or None; only where nothing is tracked. only : kinds of jobs (`KINDS`) and
+    names of runs to be done. strict : a dataset that cannot be used raises InputError; otherwise it
+    becomes a calibration job that fails.
+    A dataset without views must have been calibrated before. Raises InputError for folders that do
+    not exist or are named twice, for unknown runs, and for options of jobs that are not done.
     """
     kinds, only = kinds_and_runs(only)
     if tracks is not None and "track" in kinds:
@@ -173,9 +161,8 @@ def kinds_and_runs(only: Iterable[str]) -> tuple[tuple[Kind, ...], list[str]]:
 def shake_model(model: str, shake: str | None, only: Iterable[str]) -> tuple[str, str]:
     """Return the lens model and the shake's priors that `--model` and `--shake` mean.
 
-    Where only smoothing is done there is no lens model, and `--model` has the meaning that it has
-    for `telerig smooth`. Raises InputError for unknown priors, and for a model that belongs to jobs
-    that are not done.
+    Where only smoothing is done, `--model` has the meaning that it has for `telerig smooth`. Raises
+    InputError for unknown priors, and for a model of jobs that are not done.
     """
     smooths_only = kinds_and_runs(only)[0] == ("smooth",)
     if smooths_only and shake is None:
@@ -295,8 +282,7 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
 
 
 def fingerprint(job: Job) -> str:
-    """Return a hash of everything on which the result of a job depends: version, options, input
-    files.
+    """Return a hash of everything on which the result of a job depends: version, options, inputs.
 
     Recorded files enter by size and time of change, calibrations and tracks by their content.
     """

@@ -42,12 +42,7 @@ LATENCY = Path("/sys/bus/usb-serial/devices")
 
 @dataclass(frozen=True)
 class Check:
-    """Holds the answer to one question.
-
-    what : what was checked.
-    words : what was found.
-    todo : what the user can do about it, if anything.
-    """
+    """The answer to one question: what was checked, what was found, and what to do about it."""
 
     what: str
     status: Status

@@ -21,8 +21,7 @@ _TRACK_MB, _TRACK_MB_PER_MPX = 200.0, 300.0
 def cost_words(run: RunData) -> str:
     """Return in words how long a run takes to track and to smooth, and the memory for tracking.
 
-    Of a run of images, the bubbles of the frame in the middle are detected. Returns "" when that
-    frame cannot be read.
+    The bubbles of the frame in the middle are detected for it; "" when it cannot be read.
     """
     detect_s = background_s = pixels = 0.0
     if run.detections is not None:

@@ -63,11 +63,7 @@ _PIXEL = ("u_px", "v_px")
 
 @dataclass(frozen=True)
 class Seen:
-    """Hold the pixels of one mark.
-
-    cameras : indices of the cameras whose pixels are used, one or two.
-    frame, camera : (N,) of each pixel.  uv_px : (N, 2).  sigma_px : (N,).
-    """
+    """The pixels (N, 2) of one mark in one camera or two, with frames, cameras and sd (N,)."""
 
     mark: str
     cameras: tuple[int, ...]
@@ -103,16 +99,12 @@ def validate(
     """Withhold marks of a run in turn, and smooth each as a bubble whose own motion is known.
 
     Each mark is smoothed beside the other marks and all sensors, and, if the run has
-    accelerometers, also beside the sensors only, as in a run without marks. A mark that both
-    cameras see is a bubble that both see; of any other mark only the two axes of its image count.
-
-    run : a run with references, whose stage moves.
-    marks : how many marks are withheld; those that are seen longest, of each camera in turn.
-    model, accept : see `telerig.smooth`.
-    seed : of the motions that the marks are given.
-    progress : function that is called with the name of the step and the share that is done.
-
-    Raises InputError if no mark is seen long enough, and what `telerig.smooth` raises.
+    accelerometers, also beside the sensors only. A mark that both cameras see is a bubble that both
+    see; of any other mark only the two axes of its image count.
+    marks : how many are withheld, those that are seen longest, of each camera in turn. model,
+    accept : see `telerig.smooth`. seed : of the motions. progress : called with the name of the
+    step and the share that is done. Raises InputError if no mark is seen long enough, and what
+    `telerig.smooth` raises.
     """
     calibration = pair_of_run(calibration, run.cameras)
     every = seen_marks(run, calibration)
@@ -192,10 +184,10 @@ def validate_run(
 
 
 def seen_marks(run: RunData, calibration: Calibration) -> list[Seen]:
-    """Return the marks of a run.
+    """Return the marks of a run; InputError without marks.
 
     A mark counts as seen by two cameras if both see it in `FEWEST_FRAMES` frames; otherwise the
-    camera that sees it more often counts. Raises InputError for a run without marks.
+    camera that sees it more often counts.
     """
     table = run.references
     if table is None or not len(table):
@@ -294,10 +286,9 @@ def _nearest(origin: Array, direction: Array) -> Array:
 
 
 def track_of(mark: Seen, calibration: Calibration, t_s: Array) -> Tracks:
-    """Return a mark's pixels as the track of a bubble.
+    """Return a mark's pixels as a track, which begins and ends with pixels of both cameras.
 
-    A track begins and ends with pixels of both cameras. Where only one camera sees the mark, the
-    other's pixel there is a guess with a standard deviation of `_UNSEEN_PX`.
+    Where only one camera sees the mark, the other's pixel is a guess with an sd of `_UNSEEN_PX`.
     """
     cameras = calibration.cameras
     by_camera = [
@@ -353,8 +344,8 @@ def judged(
 ) -> WithheldMark:
     """Compare the smoothed path of a mark with the motion that it was given.
 
-    The place where the mark stands is not known, so the mean of the path is subtracted, which
-    makes NEES of the position a little too small. The velocity has no such unknown.
+    The mean of the path is subtracted, because the mark's place is not known; this makes NEES of
+    the position a little too small.
     """
     solution = _solution(found)
     graph, covariances = solution.graph, solution.covariances

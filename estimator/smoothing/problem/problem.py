@@ -23,15 +23,12 @@ a vibration that is common to all cameras.
 
 @dataclass(frozen=True)
 class RigMode:
-    """Describe one vibration of the rig.
+    """One vibration of the rig; those along the axes x, y and z are independent.
 
-    The vibrations along the axes x, y and z of the rig frame are independent of each other.
-
-    damping : damping ratio.
-    rms_mm : RMS displacement along x, y and z; 0 for no vibration along an axis.
-    camera : index of the camera whose arm vibrates, or CARRIAGE for all cameras.
+    damping : damping ratio. rms_mm : RMS displacement along x, y and z. camera : index of the
+    camera whose arm vibrates, or CARRIAGE for all cameras.
     force_hz : cut-off frequency of the two-pole low-pass filter of the driving force; None for a
-        white force, which is possible only without accelerometers.
+    white force, which is possible only without accelerometers.
     """
 
     frequency_hz: float
@@ -43,14 +40,12 @@ class RigMode:
 
 @dataclass(frozen=True)
 class BroadBand:
-    """Describe shake whose modes are unknown, of one camera or of all cameras.
+    """Shake whose modes are unknown, of one camera or of all cameras.
 
-    rms_mm : RMS displacement along the axes x, y and z of the rig frame.
-    camera : index of the camera, or CARRIAGE for all cameras.
-    low_hz, high_hz, floor, tail : shape of the spectrum, see
-        `telerig.factors.state_space.broad_band`.
+    rms_mm : RMS displacement along x, y and z. camera : its index, or CARRIAGE. low_hz, high_hz,
+    floor, tail : see `telerig.factors.state_space.broad_band`.
     slow_rms_mm, slow_tau_s : RMS and correlation time of an additional slow offset
-        (Ornstein-Uhlenbeck process), which accelerometers do not measure.
+    (Ornstein-Uhlenbeck process), which accelerometers do not measure.
     """
 
     rms_mm: Triple
@@ -65,14 +60,13 @@ class BroadBand:
 
 @dataclass(frozen=True)
 class CarriageModel:
-    """Describe the prior of the carriage's motion along the travel axis.
+    """The prior of the carriage's motion along the travel axis.
 
     kind : "readings" for no dynamics, where the position at a frame is what the encoder reads;
-        "force" for a random acceleration, which accelerometers and slow encoders need.
-    acceleration_rms_mm_s2, corner_hz : RMS of this acceleration, and cut-off frequency of its
-        three-pole low-pass filter.
-    servo : RMS (mm), frequency (Hz) and damping ratio of an additional oscillation about the
-        commanded position; None for none.
+    "force" for a random acceleration, which accelerometers and slow encoders need.
+    acceleration_rms_mm_s2, corner_hz : its RMS, and cut-off frequency of its three-pole low-pass
+    filter. servo : RMS (mm), frequency (Hz) and damping ratio of an additional oscillation, or
+    None.
     """
 
     kind: Literal["readings", "force"] = "readings"
@@ -83,20 +77,14 @@ class CarriageModel:
 
 @dataclass(frozen=True)
 class ShakeModel:
-    """Hold every hyper-parameter of the smoother.
+    """Every hyper-parameter of the smoother.
 
-    bubble : prior of the bubbles' motion.
-    modes, broad_bands : vibrations of the rig.
-    carriage : prior of the carriage's motion.
-    encoder_sigma_mm : standard deviation (sd) of one reading of the encoder.
-    encoder_scale_sigma, accelerometer_scale_sigma : prior sd of the relative scale errors; 0 if the
-        scale is not estimated.
-    encoder_delay_sigma_s, accelerometer_delay_sigma_s : prior sd of the delays; 0 if the delay is
-        not estimated.
-    pixel_inflation : factor by which the stated pixel noise is multiplied.
-    name : origin of the values, in words.
-    learned : for a model that was learned, the sd of the natural logarithm of each hyper-parameter,
-        by name.
+    modes, broad_bands : vibrations of the rig. encoder_sigma_mm : standard deviation (sd) of one
+    reading. encoder_scale_sigma, accelerometer_scale_sigma, encoder_delay_sigma_s,
+    accelerometer_delay_sigma_s : prior sd of relative scale errors and delays; 0 if they are not
+    estimated.
+    pixel_inflation : factor of the stated pixel noise. name : origin of the values, in words.
+    learned : sd of the natural logarithm of each learned hyper-parameter, by name.
     """
 
     bubble: BubbleModel = field(default_factory=BubbleModel)
@@ -127,12 +115,9 @@ class ShakeModel:
 
 @dataclass(frozen=True)
 class Observations:
-    """Hold the M pixels at which bubbles, or marks, were measured.
+    """The M pixels (M, 2) at which bubbles, or marks, were measured, with covariances (M, 2, 2).
 
-    item : (M,) index of the bubble or mark.
-    frame, camera : (M,) indices of the frame and of the camera.
-    uv_px : (M, 2) pixels (u, v).
-    covariance_px2 : (M, 2, 2) covariances of the pixels in px^2.
+    item, frame, camera : (M,) indices.
     """
 
     item: Ints
@@ -161,13 +146,10 @@ class Observations:
 
 @dataclass(frozen=True)
 class Bubble:
-    """Describe one bubble that is smoothed.
+    """One bubble that is smoothed, from its first to its last frame.
 
-    particle : id of its track.
-    first, last : its first and its last frame.
-    start_mm : (3,) prior mean of its position in the first frame, in the laboratory frame.
-    guess_mm : (last - first + 1, 3) positions in the laboratory frame at which the projection is
-        linearised in the first pass.
+    start_mm : (3,) prior mean of its first position, in the laboratory frame. guess_mm : (last -
+    first + 1, 3) positions at which the projection is linearised in the first pass.
     """
 
     particle: int
@@ -182,11 +164,7 @@ class Bubble:
 
 @dataclass(frozen=True)
 class Mark:
-    """Describe a mark, a feature fixed to the tank.
-
-    guess_mm : (3,) prior mean of its position in the laboratory frame.
-    sigma_mm : prior standard deviation of its position along each axis.
-    """
+    """A feature fixed to the tank: prior mean (3,) of its laboratory position, and its sd."""
 
     name: str
     guess_mm: Array
@@ -195,11 +173,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Stage:
-    """Hold the record of the encoder, which has E readings.
-
-    t_s : (E,) times.
-    position_mm : (E,) positions along the travel axis, already corrected for a calibrated scale.
-    """
+    """The encoder's E times (E,) and positions (E,), corrected for a calibrated scale."""
 
     t_s: Array
     position_mm: Array
@@ -207,15 +181,12 @@ class Stage:
 
 @dataclass(frozen=True)
 class Travel:
-    """Hold what is known about the stage's travel before the run.
+    """What is known about the stage's travel before the run.
 
-    axis : (3,) unit vector of the travel axis in the rig frame.
-    basis : (3, 2) two unit vectors perpendicular to it, as columns.
-    scale : relative scale error of the encoder, (reading - travel) / travel. The readings of
-        `Stage` are already corrected for it.
-    covariance : (3, 3) covariance of the axis' two tilts (rad, along the columns of ``basis``) and
-        of the scale.
-    source : "stage_axis" if calibrated, "rig.toml" if stated there, or "assumed".
+    axis : (3,) unit vector in the rig frame. basis : (3, 2) two unit vectors perpendicular to it.
+    scale : relative scale error of the encoder, for which the readings of `Stage` are corrected.
+    covariance : (3, 3) of the axis' two tilts (rad, along ``basis``) and of the scale. source :
+    "stage_axis" if calibrated, "rig.toml" if stated there, or "assumed".
     """
 
     axis: Array
@@ -227,22 +198,17 @@ class Travel:
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """Hold the record of one accelerometer, which has N samples.
+    """The record of one accelerometer, which has N samples.
 
-    camera : index of the camera that carries it, or CARRIAGE.
-    t_s : (N,) times.  reading_mm_s2 : (N, 3) readings.
+    camera : index of the camera that carries it, or CARRIAGE. t_s : (N,). reading_mm_s2 : (N, 3).
     axes : (3, 3) the sensor's axes as rows, in the rig frame.
-    sigma_mm_s2 : noise standard deviation of one sample along each axis.
-    bias_sigma_mm_s2 : prior standard deviation of the bias along each axis.
-    delay_s : a sample with time t was measured at t - delay_s.
-    clock : "frames" if its times are those of the frames' clock, apart from a small delay;
-        "unknown" if only an alignment with the images can place it.
-    kept : (N,) whether each sample is used. The readings of the others are interpolated. None if
-        all are used.
-    unused_axes : indices of the sensor's axes whose readings are not used.
-    offset_s, drift_ppm : what alignment with the images subtracted from its stamps, and the drift
-        that it took out. offset_sd_s : sd of the offset; None if it was not found.
-    confirmed : whether the images confirm its clock; None if that was not tried.
+    sigma_mm_s2 : noise standard deviation of one sample. bias_sigma_mm_s2 : prior standard
+    deviation of the bias of each axis. delay_s : a sample with time t was measured at t - delay_s.
+    clock : "frames" if its times are those of the frames' clock, "unknown" if only an alignment
+    with the images can place it. kept : (N,) whether each sample is used; the others are
+    interpolated. unused_axes : indices of axes that are not used.
+    offset_s, drift_ppm : what alignment with the images took out of its stamps; offset_sd_s : None
+    if no offset was found. confirmed : whether the images confirm its clock; None if not tried.
     """
 
     name: str
@@ -276,17 +242,12 @@ class Accelerometer:
 
 @dataclass(frozen=True)
 class CalibrationShare:
-    """Hold the part of the calibration's uncertainty that moves pixels, as r independent
-    directions.
+    """The calibration's uncertainty that moves pixels, in r independent unit directions.
 
-    The P parameters are those of the calibration's rig block. Each direction has unit variance.
-
-    root : (P, r); root root^T is the covariance, except for directions that move no pixel.
-    free : for each camera the names of its free intrinsics, in the order of the P parameters.
-    covariance : (P, P) whole covariance before the run.
-    drift : (6, 6) prior covariance of a movement of the second camera since the calibration
-        (rotation in rad, translation in mm), which ``covariance`` includes; None if it is assumed
-        not to have moved.
+    root : (P, r); root root^T is the covariance of the rig block's P parameters, except for
+    directions that move no pixel. free : for each camera its free intrinsics. covariance : (P, P)
+    before the run. drift : (6, 6) prior covariance, included in it, of a movement of the second
+    camera since the calibration (rad, mm); None if it is assumed not to have moved.
     """
 
     root: Array

@@ -80,11 +80,9 @@ def aligned(
 ) -> tuple[SmoothingProblem, list[Finding]]:
     """Return the problem with its sensors on the clock of the frames, and what was found.
 
-    Sensors whose clock is unknown and cannot be found are left out.
-
-    known : what other checks have found. They are returned as well; of axes that gravity alone
-        has shown to be wrong, the images tell which would be right, and a clock that hardly covers
-        the frames is no fault if they show its offset.
+    Sensors whose clock is unknown and cannot be found are left out. known : what other checks have
+    found, which is returned, too. Of axes that gravity alone has shown to be wrong, the images tell
+    which would be right; a clock that hardly covers the frames is no fault if they show its offset.
     """
     placed, found = _aligned(problem, [f for f in known if f.code is not None])
     better: dict[tuple[Code | None, Any], Finding] = {
@@ -194,10 +192,10 @@ def _groups(problem: SmoothingProblem) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class _Images:
-    """Hold what the images and the encoder show, on one grid.
+    """What the images and the encoder show, on one grid.
 
-    cameras : (camera, source, accelerations (n, 2)), where the source is "marks" or "bubbles".
-    encoder : accelerations (n, 1) of the carriage along its axis; None without an encoder.
+    cameras : (camera, "marks" or "bubbles", accelerations (n, 2)). encoder : accelerations (n, 1)
+    of the carriage along its axis; None without an encoder.
     """
 
     grid: Grid
@@ -530,11 +528,7 @@ def _corrected_drift(
     images: _Images,
     least_sds: float,
 ) -> Accelerometer | None:
-    """Return the sensor without the drift that its offsets in parts of the run show, None where
-    they show none.
-
-    t_s : (F,) times of the frames.  least_sds : standard deviations that the drift must exceed.
-    """
+    """Return the sensor without the drift that its offsets in parts of the run show, or None."""
     length_s = float(t_s[-1] - t_s[0])
     windows = max(round(length_s / _WINDOW_S), _LEAST_WINDOWS)
     edges = np.linspace(t_s[0], t_s[-1], windows + 1)
@@ -586,11 +580,8 @@ def _mountings(
 ) -> list[Finding]:
     """Return the sensors whose axes, place or unit contradict the images, encoder and each other.
 
-    The sensor with the clearest contradiction is corrected first; then the others are compared
-    with it.
-
-    refused : faults that are known. The unit of a sensor is not judged twice, and without gravity
-        its axes are not.
+    The sensor with the clearest contradiction is corrected first; then the others are compared with
+    it. refused : known faults; their units are not judged twice, and without gravity no axes.
     """
     without = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_GRAVITY}
     measured = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_UNIT}

@@ -114,8 +114,7 @@ def _thinned(sensor: Accelerometer, step_s: float) -> Accelerometer:
 def references_of(
     table: Any, cameras: Sequence[Camera], t_s: Array, positions_mm: Array, axis: Array
 ) -> tuple[tuple[Mark, ...], Observations, list[Finding]]:
-    """Return the marks fixed to the tank where their rays come closest, the pixels at which they
-    were seen, and a warning about pixels outside the frames.
+    """Return the marks where their rays come closest, their pixels, and a warning about frames.
 
     Raises InputError for a table that cannot be used.
     """
@@ -185,10 +184,10 @@ def _marks(
 def calibration_share(
     calibration: Calibration, points_mm: Array, sigma_px: float, drift: Array | None = None
 ) -> CalibrationShare | None:
-    """The directions of the calibration's covariance that move the pixels of these rig points.
+    """Return the directions of the calibration's covariance that move the pixels of rig points.
 
-    A direction whose effect stays far below the noise of a mean over the run is left out.
-    drift : (6, 6) prior of a movement of the second camera since the calibration.
+    A direction whose effect stays far below the noise of a mean over the run is left out. drift :
+    (6, 6) prior of a movement of the second camera.
     """
     from telerig.estimator.rig_drift import rig_block, with_drift
     from telerig.rig.triangulation import rig_jacobian
@@ -234,9 +233,8 @@ class Tracked:
 
 
 def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | None) -> Tracked:
-    """Pixels out of a tracks table, and of detections that only one camera made.
+    """Return pixels of a tracks table, and of detections that only one camera made.
 
-    tracks : `Tracks`, or a table with the columns of tracks.csv.
     Raises InputError for missing columns, cameras that the calibration does not have, NaN.
     """
     table = getattr(tracks, "table", tracks)

@@ -12,11 +12,7 @@ from telerig.estimator.smoothing.problem.problem import Bubble, Observations, Sm
 
 @dataclass(frozen=True)
 class Window:
-    """Hold a part of a run.
-
-    problem : of the frames from ``first`` on; sensors and encoder are not cut.
-    bubbles : which of the whole run's bubbles it holds.
-    """
+    """The problem of the frames from ``first`` on, with uncut sensors, and its bubbles."""
 
     problem: SmoothingProblem
     first: int
@@ -34,10 +30,9 @@ def cut_out(
 ) -> Window:
     """Return the frames from ``first`` to before ``end``, with the bubbles seen more than once.
 
-    weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. None for all.
-    most_bubbles : so many bubbles, those seen in most frames; None for all.
-    least_share : share of the frames in which all cameras together have to see a bubble.
-    throughout : whether only tracks are taken that last from the first to the last frame.
+    weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. most_bubbles : at
+    most, those seen in most frames. least_share : share of the frames in which all cameras together
+    have to see a bubble. throughout : only tracks from the first to the last frame.
     """
     seen, marks = problem.observations, problem.references
     if weights is not None:

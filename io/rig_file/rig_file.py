@@ -160,12 +160,7 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
     tracking = _tracking(raw, names, problems)
     stage = _stage(raw, names, problems)
     accelerometers = _accelerometers(raw, names, problems)
-    references = None
-    if "references" in raw:
-        content = raw["references"]
-        references = read_table(
-            ReferencesDescription, content, "references", problems, homes=_HOMES
-        )
+    references = _references(raw, problems)
     walls = _walls(raw, cameras, problems)
     bubbles = _bubbles(raw, names, problems)
     fluid = _fluid(raw, problems)

@@ -174,8 +174,8 @@ def bubble_summary(
     bubbles : what `bubble_table` returned for the same fluid; None to compute it.
     fluid : as for `bubble_table`. `docs/bubbles.md` describes the columns.
     """
-    from telerig.estimator.physics.frames import liquid_of
     from telerig.estimator.physics.summary import summary_table
+    from telerig.io.rig_file.fluid import liquid_of
 
     up, gravity, known = _surroundings(smoothing, fluid)
     frames = bubble_table(smoothing, fluid) if bubbles is None else bubbles

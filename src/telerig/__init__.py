@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from telerig.io.dataset.dataset import Dataset as Dataset
     from telerig.io.dataset.dataset import load_dataset as load_dataset
     from telerig.io.dataset.run import load_run as load_run
+    from telerig.io.report import plot as plot
     from telerig.io.simulation.config import SimulationConfig as SimulationConfig
     from telerig.io.simulation.simulate import simulate as simulate
     from telerig.rig.triangulation import Triangulation as Triangulation
@@ -71,6 +72,7 @@ _WHERE = {
     "load_smoothing": "telerig.estimator.smoothing.result",
     "load_tracks": "telerig.estimator.tracking.tracks",
     "locate_dots": "telerig.estimator.dots.locate",
+    "plot": "telerig.io.report.plot",
     "simulate": "telerig.io.simulation.simulate",
     "smooth": "telerig.estimator.smoothing.smooth",
     "track": "telerig.estimator.tracking.track",
@@ -82,7 +84,8 @@ __all__ = ["__version__", *_WHERE]
 def __getattr__(name: str) -> Any:
     if name not in _WHERE:
         raise AttributeError(f"module 'telerig' has no attribute {name!r}")
-    return getattr(import_module(_WHERE[name]), name)
+    module = import_module(_WHERE[name])
+    return module if name == "plot" else getattr(module, name)
 
 
 def __dir__() -> list[str]:

@@ -70,8 +70,8 @@ class RunScene:
     """Everything true of a run.
 
     t_s, position_mm, velocity_mm_s : (F,) at the frames; shake_mm, shake_mm_s : (C, F, 3).
-    lab_mm, lab_mm_s : (B, F, 3) centres of volume and their velocities; lab_mm_s2, drag :
-    accelerations (B, F, 3) and drag coefficients (B,) of the path "forces", otherwise None.
+    lab_mm, lab_mm_s : (B, F, 3) centres of volume and their velocities; lab_mm_s2 (B, F, 3),
+    forces : accelerations and what causes them for the path "forces", otherwise None.
     closest_s : (pairs,) when each pair passes; empty without pairs.
     """
 
@@ -83,7 +83,7 @@ class RunScene:
     lab_mm_s: Array
     closest_s: Array
     lab_mm_s2: Array | None = None
-    drag: Array | None = None
+    forces: Forces | None = None
 
     @property
     def t_s(self) -> Array:
@@ -143,10 +143,10 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     count = _bubble_count(config, position, size_mm)
     population = random_population(config, count, shape_rng)
     if config.motion.path == "forces":
-        forces, drag = _forces(config, population, path_rng)
+        forces = _forces(config, population, path_rng)
         paths = driven_paths(1 / config.frame_rate_hz, config.frames, forces)
     else:
-        paths, drag = _paths(config, count, path_rng), None
+        paths, forces = _paths(config, count, path_rng), None
     lab, velocity, closest = _lab_paths(config, paths, path_rng)
     acceleration = None
     if paths.height_mm_s2 is not None and paths.lateral_mm_s2 is not None:
@@ -154,7 +154,7 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     start = _starts(config, lab, position, population.d_eq_mm, size_mm, place_rng)
     return RunScene(
         config, cameras, carriage, population, lab + start[:, None], velocity, closest,
-        acceleration, drag,
+        acceleration, forces,
     )  # fmt: skip
 
 
@@ -177,8 +177,8 @@ _NOISES = 8
 _NOISE_HZ = (0.5, 4.0)
 
 
-def _forces(config: RunConfig, population: Population, rng: Generator) -> tuple[Forces, Array]:
-    """The forces on each bubble, and its drag coefficient.
+def _forces(config: RunConfig, population: Population, rng: Generator) -> Forces:
+    """The forces on each bubble.
 
     Raises InputError for bubbles so small that the law does not hold.
     """
@@ -207,7 +207,7 @@ def _forces(config: RunConfig, population: Population, rng: Generator) -> tuple[
         turn,
         np.stack([np.cos(azimuth), np.sin(azimuth)], -1),
         gravity,
-    ), drag
+    )
 
 
 def _mean_rise(motion: MotionConfig) -> float:

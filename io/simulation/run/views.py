@@ -161,10 +161,11 @@ def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dic
         columns[f"{name}_lab_mm"] = lab[:, axis]
         columns[f"v{name}_lab_mm_s"] = velocity[:, axis]
         columns[f"{name}_rig_mm"] = rig[:, axis]
-    if scene.lab_mm_s2 is not None and scene.drag is not None:
+    if scene.lab_mm_s2 is not None and scene.forces is not None:
         for axis, name in enumerate("xyz"):
             columns[f"a{name}_lab_mm_s2"] = scene.lab_mm_s2[particle, frame, axis]
-        columns["drag"] = scene.drag[particle]
+        drag = scene.forces.drag_1_mm * scene.population.d_eq_mm * 4 / 3
+        columns["drag"] = drag[particle]
     columns["d_eq_mm"] = scene.population.d_eq_mm[particle]
     for name, view in views.items():
         columns |= _camera_columns(name, view, particle)

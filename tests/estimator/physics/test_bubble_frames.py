@@ -8,10 +8,11 @@ import pytest
 
 from telerig.errors import InputError
 from telerig.estimator.physics.bodies import bodies_table
-from telerig.estimator.physics.frames import frames_table, liquid_of, propagated
+from telerig.estimator.physics.frames import frames_table, propagated
 from telerig.estimator.physics.oscillation import dominant_oscillation
 from telerig.estimator.physics.summary import mean_of_body, summary_table
 from telerig.io.results.bubbles import BODY_COLUMNS, FRAME_COLUMNS, NUMBERS, SUMMARY_COLUMNS
+from telerig.io.rig_file.fluid import liquid_of
 
 UP = np.array([0.0, -1.0, 0.0])
 WATER = {"density_kg_m3": 998.2, "viscosity_pa_s": 1e-3, "surface_tension_n_m": 0.0728}

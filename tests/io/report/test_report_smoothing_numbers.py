@@ -20,9 +20,9 @@ from smoothed_folder import (
     write_folder,
 )
 
+from telerig.io.report.plot.spectrum import evenly
 from telerig.io.report.run.smoothing.results import (
     axis_sd,
-    evenly,
     shake_rms_um,
     shake_spectrum,
     taken_away,

@@ -24,6 +24,7 @@ from telerig.io.report.page.figures import (
     drawing,
 )
 from telerig.io.report.page.number_format import is_number, number
+from telerig.io.report.run.smoothing.bubbles import BUBBLE_PICTURES
 from telerig.io.report.run.smoothing.results import (
     AXES,
     PLACE,
@@ -39,7 +40,7 @@ from telerig.io.report.run.smoothing.results import (
 from telerig.io.report.run.tracking.results import median, rms
 from telerig.io.report.run.tracking.scene import track_colour
 
-PLACES = ("lab", "taken", "velocity", "shake", "spectra", "white")
+PLACES = ("bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")
 """Sections that hold drawings."""
 
 
@@ -63,6 +64,7 @@ def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[]
         for sensor in accelerometer_names(results)
     ]
     judged = known_parts(results, "whiteness", "expected")
+    drawings += [("bubbles", partial(draw, results)) for draw in BUBBLE_PICTURES]
     return [*drawings, *([("white", partial(autocorrelation, results))] if judged else [])]
 
 
@@ -136,7 +138,8 @@ def taken_off(results: SmoothingResults, axis: int) -> Picture:
     )
     title, label = f"{AXES[axis]}: what smoothing took off", f"{AXES[axis]}, less smoothed / µm"
     curves = _three(t, np.zeros(len(t)), naive, rts, sd)
-    return _in_time(results, None, title, label, curves, caption, table)
+    caption += f" {_upside_down(results, axis)}"
+    return _in_time(results, axis, title, label, curves, caption, table)
 
 
 def velocities(results: SmoothingResults, axis: int) -> Picture:
@@ -250,9 +253,12 @@ def shake_in_time(results: SmoothingResults, camera: str, axis: str) -> Picture:
             f" This axis lies partly ({100 * part:.0f} %) along the camera's depth, which it does "
             "not see: the band holds the prior's spread there."
         )
+    index = AXES.index(axis)
+    if words := _upside_down(results, index):
+        caption += f" {words}"
     title, colour = f"Shake of camera {camera} in {axis}", results.cameras.index(camera)
     curves = [Curve(t, value, camera_colour(colour), sd=sd)]
-    return _in_time(results, None, title, f"{axis} / µm", curves, caption, height_in=2.3)
+    return _in_time(results, index, title, f"{axis} / µm", curves, caption, height_in=2.3)
 
 
 def velocity_before_and_after(results: SmoothingResults, axis: int) -> Picture | None:

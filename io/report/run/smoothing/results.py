@@ -16,7 +16,14 @@ import pandas as pd
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.csv_table import header_of, read_columns
+from telerig.io.report.plot.spectrum import (
+    LEAST_FRAMES,
+    segment,
+    velocity_density,
+    welch_density,
+)
 from telerig.io.report.run.tracking.results import median, rms
+from telerig.io.results.bubbles import BUBBLES, SUMMARY
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import (
     AXES,
@@ -30,7 +37,7 @@ from telerig.io.results.smoothing import VELOCITY as SPEED
 
 __all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
 
-_FILES = ("smoothing.json", "shake.csv", "trajectories.csv")
+_FILES = ("smoothing.json", "shake.csv", "trajectories.csv", "bubbles.csv", "bubble_summary.csv")
 _ALONG = 0.9
 
 
@@ -40,6 +47,7 @@ class SmoothingResults:
 
     file : smoothing.json. cameras : names, in the rig's order. trajectories,
     shake : the tables, by bubble and frame. up : (3,) unit vector in rig axes.
+    bubble_frames, bubble_summary : bubbles.csv and bubble_summary.csv, empty where they are not.
     """
 
     file: SmoothingFile
@@ -47,6 +55,8 @@ class SmoothingResults:
     trajectories: pd.DataFrame
     shake: pd.DataFrame
     up: Array
+    bubble_frames: pd.DataFrame
+    bubble_summary: pd.DataFrame
 
     @property
     def content(self) -> Mapping[str, Any]:
@@ -126,7 +136,11 @@ def _read_smoothing_results(folder: Path, up: Array) -> SmoothingResults:
     table = table.sort_values(["particle", "frame"], kind="stable", ignore_index=True)
     for particle, mine in table.groupby("particle", sort=False):
         _check_times(mine, file, f" of bubble {particle}")
-    return SmoothingResults(stated, tuple(known), table, shake, up)
+    more = (
+        read_columns(folder / name, columns, optional=True)
+        for name, columns in (("bubbles.csv", BUBBLES), ("bubble_summary.csv", SUMMARY))
+    )
+    return SmoothingResults(stated, tuple(known), table, shake, up, *more)
 
 
 def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:
@@ -135,12 +149,6 @@ def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:
         frame = int(table["frame"].iloc[int(np.argmin(steps > 0)) + 1])
         what = f"the times{whose} do not increase at frame {frame}"
         raise InputError(what, where=f"{file}, column t_s", todo=SmoothingFile.AGAIN)
-
-
-LEAST_FRAMES = 32
-_LONGEST_SEGMENT = 1024
-_MOST_TRACKS = 20
-_FINITE_SHARE = 0.7
 
 
 @dataclass(frozen=True)
@@ -191,33 +199,16 @@ def shake_rms_um(results: SmoothingResults, camera: str, axis: str) -> float | N
     return float(1e3 * np.std(column(results.shake, f"{camera}_{axis}_mm")))
 
 
-def segment(frames: int) -> int:
-    """Frames of a segment of Welch's estimate: about five of them, half overlapping."""
-    return min(frames, _LONGEST_SEGMENT, max(64, frames // 3))
-
-
 def velocity_spectrum(results: SmoothingResults, kind: str = "") -> Spectrum | None:
     """Mean over the longest tracks of the velocity's density, (mm/s)²/Hz.
 
     kind : "", "naive_" or "rts_". None where no track is long enough or the columns are empty.
     """
-    tracks = [results.track(k) for k in results.bubbles[:_MOST_TRACKS]]
-    if not tracks or len(tracks[0]) < LEAST_FRAMES:
+    try:
+        frequency, density = velocity_density(results.trajectories, kind)
+    except InputError:
         return None
-    length = segment(len(tracks[0]))
-    names = [kind + SPEED.format(axis) for axis in AXES]
-    found, weights = [], []
-    for track in tracks:
-        values = np.stack([column(track, name) for name in names], 1)
-        if len(track) >= length and np.isfinite(values).all(1).mean() >= _FINITE_SHARE:
-            frequency, density = _welch(track["t_s"].to_numpy(float), values, length)
-            found.append(density)
-            weights.append(len(track))
-    if not found:
-        return None
-    same = [d for d in found if d.shape == found[0].shape]
-    mean = np.average(same, axis=0, weights=weights[: len(same)])
-    return Spectrum(frequency, np.asarray(mean), float(frequency[1]))
+    return Spectrum(frequency, density, float(frequency[1]))
 
 
 def shake_spectrum(results: SmoothingResults, camera: str) -> Spectrum | None:
@@ -226,26 +217,5 @@ def shake_spectrum(results: SmoothingResults, camera: str) -> Spectrum | None:
     if len(values) < LEAST_FRAMES:
         return None
     time = results.shake["t_s"].to_numpy(float)
-    frequency, density = _welch(time, values, segment(len(values)))
+    frequency, density = welch_density(time, values, segment(len(values)))
     return Spectrum(frequency, density, float(frequency[1]))
-
-
-def _welch(t_s: Array, values: Array, length: int) -> tuple[Array, Array]:
-    from scipy.signal import detrend, welch
-
-    even, rate_hz = evenly(t_s, values)
-    level = np.asarray(detrend(even, axis=0))
-    frequency, density = welch(level, rate_hz, nperseg=min(length, len(even)), axis=0)
-    return np.asarray(frequency), np.asarray(density)
-
-
-def evenly(t_s: Array, values: Array) -> tuple[Array, float]:
-    """Columns of (N, K) at even times, straight lines over what is missing; and the rate in Hz."""
-    step = float(np.median(np.diff(t_s)))
-    count = min(round((t_s[-1] - t_s[0]) / step) + 1, 4 * len(t_s))
-    wanted = np.linspace(t_s[0], t_s[-1], count)
-    columns = []
-    for one in values.T:
-        there = np.isfinite(one)
-        columns.append(np.interp(wanted, t_s[there], one[there]) if there.any() else 0 * wanted)
-    return np.stack(columns, 1), (count - 1) / (t_s[-1] - t_s[0])

@@ -19,6 +19,7 @@ from telerig.io.report.page.number_format import (
     with_sd,
 )
 from telerig.io.report.page.page import Figure, Row
+from telerig.io.report.run.smoothing.bubbles import bubble_words, summary_rows
 from telerig.io.report.run.smoothing.results import (
     AXES,
     SPEED,
@@ -66,6 +67,8 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
         "whiteness_words": whiteness_words(results),
         "constants": constant_rows(results),
         "means": mean_rows(results),
+        "bubble_table": summary_rows(results),
+        "bubble_words": bubble_words(results),
         "model": model_rows(results),
         "model_words": model_words(results),
     }
@@ -186,8 +189,8 @@ def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
         "naive minus smoothed, µm": [_scaled(v, 1e3) for v in taken_away(results)],
         "RTS minus smoothed, µm": [_scaled(v, 1e3) for v in taken_away(results, "rts_")],
     }
-    if "sigma_mm" not in keys:
-        columns = {"sd, µm": [_scaled(v, 1e3) for v in axis_sd(results)]} | columns
+    name = "sd in trajectories.csv, µm" if "sigma_mm" in keys else "sd, µm"
+    columns = {name: [_scaled(v, 1e3) for v in axis_sd(results)]} | columns
     for camera in results.cameras:
         columns[f"shake of {camera}, µm"] = [
             "unseen" if axis in results.unseen(camera)

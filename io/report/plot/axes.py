@@ -1,0 +1,57 @@
+"""What every plot needs: its axes, columns of its table, and the direction up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from telerig.arrays import Array
+from telerig.errors import InputError
+
+COLOURS = ("#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0")
+"""Of data, and of the components x, y, z."""
+
+MUTED = "#8a8f98"
+
+
+def axes_of(axes: Any, **settings: Any) -> Any:
+    """The given axes, or new ones (``projection`` "3d" for three dimensions), with settings."""
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        _, axes = plt.subplots(subplot_kw={"projection": settings.pop("projection", None)})
+    settings.pop("projection", None)
+    axes.set(**settings)
+    return axes
+
+
+def columns_of(table: pd.DataFrame, *names: str, made_by: str) -> list[Array]:
+    """Columns of a table as numbers. Raises InputError for one that it does not have."""
+    out = []
+    for name in names:
+        if name not in table:
+            what = f"the table has no column {name}"
+            raise InputError(what, where="telerig.plot", todo=f"give {made_by}")
+        out.append(table[name].to_numpy(float))
+    return out
+
+
+def finite(*columns: Array) -> list[Array]:
+    """The rows in which all columns are finite. Raises InputError if there are none."""
+    good = np.isfinite(np.stack(columns)).all(0)
+    if not good.any():
+        todo = "see `telerig.bubble_table`: some columns need [fluid] in rig.toml, or outlines"
+        raise InputError("there is nothing to draw", where="telerig.plot", todo=todo)
+    return [column[good] for column in columns]
+
+
+def height_and_sides(table: pd.DataFrame, pattern: str, y_up: bool) -> list[tuple[str, Array]]:
+    """(name, values) of three components for drawing: both horizontal ones, then the vertical.
+
+    pattern : of the columns' names, like "{}_mm". y_up : the vertical is the height, -y, which is
+    positive upwards; otherwise y, which points down in the frame of a camera that stands upright.
+    """
+    x, y, z = columns_of(table, *(pattern.format(a) for a in "xyz"), made_by="trajectories")
+    return [("x", x), ("z", z), ("height" if y_up else "y", -y if y_up else y)]

@@ -1,0 +1,201 @@
+"""Pictures of bubbles: paths, velocity, drag, sizes, spectra, from the tables of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from telerig.arrays import Array
+from telerig.io.report.plot.axes import (
+    COLOURS,
+    MUTED,
+    axes_of,
+    columns_of,
+    finite,
+    height_and_sides,
+)
+from telerig.io.report.plot.spectrum import velocity_density
+from telerig.io.rig_file.fluid import liquid_of
+from telerig.rig.bubble_physics import (
+    Liquid,
+    clift_clean_velocity,
+    clift_velocity,
+    mendelson_velocity,
+    moore_velocity,
+    tomiyama_velocity,
+)
+
+_SUMMARY = "what telerig.bubble_summary returns, or bubble_summary.csv"
+_WAVES_FROM_M = 1.3e-3
+_MOST_CLOUD = 4000
+
+
+def path(
+    trajectories: pd.DataFrame,
+    particles: Iterable[int] | None = None,
+    *,
+    colour_by: str | None = None,
+    y_up: bool = True,
+    axes: Any = None,
+) -> Any:
+    """Draw the paths of bubbles in space; returns 3-D axes.
+
+    trajectories : `Smoothing.trajectories`, bubbles.csv or tracks.csv. particles : which bubbles;
+    None for all. colour_by : a column that colours the path, like "slip_mm_s"; None for a colour
+    per bubble. y_up : the vertical axis is the height, -y.
+    Raises InputError for a table without positions.
+    """
+    axes = axes_of(axes, projection="3d")
+    chosen = trajectories
+    if particles is not None:
+        chosen = trajectories[trajectories["particle"].isin(list(particles))]
+    named = height_and_sides(chosen, "{}_mm", y_up)
+    whose = chosen["particle"].to_numpy()
+    colours = None if colour_by is None else columns_of(chosen, colour_by, made_by="bubbles.csv")[0]
+    drawn = None
+    for i, k in enumerate(np.unique(whose)):
+        mine = whose == k
+        place = [values[mine] for _, values in named]
+        if colours is None:
+            axes.plot(*place, color=COLOURS[i % 4], linewidth=1.0)
+        else:
+            known = colours[np.isfinite(colours)]
+            limits = {"vmin": known.min(), "vmax": known.max()} if len(known) else {}
+            drawn = axes.scatter(*place, c=colours[mine], s=3, **limits)
+    if drawn is not None:
+        axes.figure.colorbar(drawn, ax=axes, label=colour_by, shrink=0.7, pad=0.12)
+    for side, (name, _) in zip("xyz", named):
+        getattr(axes, f"set_{side}label")(f"{name} / mm")
+    axes.set_aspect("equal")
+    return axes
+
+
+def velocity(summary: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
+    """Draw each bubble's mean velocity against its diameter, beside published laws; returns axes.
+
+    summary : what `telerig.bubble_summary` returns. fluid : a mapping with the keys of [fluid] in
+    rig.toml, for the laws (`telerig.rig.bubble_physics`); None for none.
+    Bars are one standard deviation. Raises InputError for a table without sizes or velocities.
+    """
+    found = columns_of(summary, "d_eq_mm", "sd_eq_mm", "slip_mm_s", "s_slip_mm_s", made_by=_SUMMARY)
+    d, _, speed, _ = finite(found[0], 0 * found[0], found[2], 0 * found[2])
+    known = np.isfinite(found[0]) & np.isfinite(found[2])
+    axes = axes_of(axes, xlabel="equivalent diameter / mm", ylabel="velocity / (mm/s)")
+    _points(axes, d, speed, found[1][known], found[3][known])
+    known_liquid = liquid_of(fluid)
+    if known_liquid is not None:
+        grid = _grid(d)
+        for name, colour, style, values in _laws(grid, known_liquid[0]):
+            axes.plot(1e3 * grid, 1e3 * values, style, color=colour, linewidth=1.0, label=name)
+    low, high = float(speed.min()), float(speed.max())
+    axes.set_ylim(max(0.0, 0.6 * low), 1.35 * high)
+    return axes
+
+
+def drag(table: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
+    """Draw drag coefficients against Reynolds numbers, beside published laws; returns axes.
+
+    table : what `telerig.bubble_summary` returns (with one standard deviation), or
+    `telerig.bubble_table` (a point per frame). fluid : as for `velocity`: the laws are drawn for
+    bubbles of these sizes that rise steadily.
+    Raises InputError for a table without drag coefficients.
+    """
+    found = columns_of(table, "reynolds", "drag", "s_reynolds", "s_drag", made_by=_SUMMARY)
+    good = np.isfinite(found[0]) & np.isfinite(found[1])
+    re, coefficient = finite(*found[:2])
+    axes = axes_of(axes, xlabel="Reynolds number", ylabel="drag coefficient")
+    if "frame" in table:
+        every = len(re) // _MOST_CLOUD + 1
+        dots = {"markersize": 2, "alpha": 0.3, "color": COLOURS[0], "markeredgewidth": 0}
+        axes.plot(re[::every], coefficient[::every], ".", label="frames", **dots)
+    else:
+        _points(axes, re, coefficient, found[2][good], found[3][good])
+    liquid = liquid_of(fluid)
+    d = table["d_eq_mm"].to_numpy(float) if "d_eq_mm" in table else np.zeros(0)
+    d = d[np.isfinite(d)]
+    if liquid is not None and len(d):
+        grid = _grid(d)
+        for name, colour, style, speed in _laws(grid, liquid[0]):
+            law = liquid[0].terminal_drag(grid, speed)
+            axes.plot(liquid[0].reynolds(grid, speed), law, style, color=colour, linewidth=1.0,
+                      label=name)  # fmt: skip
+    low, high = np.quantile(coefficient, [0.02, 0.98])
+    axes.set_ylim(max(0.0, low - 0.5 * abs(high)), 1.5 * high)
+    room = 0.15 * (re.max() - re.min()) + 0.05 * re.max()
+    axes.set_xlim(max(0.0, re.min() - room), re.max() + room)
+    return axes
+
+
+def _points(axes: Any, x: Array, y: Array, x_sd: Array, y_sd: Array) -> None:
+    bars = [np.nan_to_num(sd) for sd in (x_sd, y_sd)]
+    axes.errorbar(x, y, bars[1], bars[0], fmt="o", markersize=4, color=COLOURS[0], linewidth=1.0,
+                  capsize=2, label="bubbles, ± 1 sd")  # fmt: skip
+
+
+def _grid(d_mm: Array) -> Array:
+    """Diameters in m about those of the bubbles."""
+    low, high = float(d_mm.min()), float(d_mm.max())
+    room = 0.25 * (high - low) + 0.1 * high
+    return np.asarray(1e-3 * np.linspace(max(0.2, low - room), high + room, 160))
+
+
+def _laws(d: Array, liquid: Liquid) -> list[tuple[str, str, str, Array]]:
+    """(name, colour, line, velocities in m/s at diameters in m, NaN where the law does not hold).
+
+    The wave analogies hold where surface tension does not keep bubbles round.
+    """
+    waves = d >= _WAVES_FROM_M
+    laws = [
+        ("Clift 1978, contaminated", COLOURS[1], "-", clift_velocity(d, liquid)),
+        (
+            "Clift 1978, pure",
+            COLOURS[1],
+            "--",
+            np.where(waves, clift_clean_velocity(d, liquid), np.nan),
+        ),
+        ("Mendelson 1967", MUTED, ":", np.where(waves, mendelson_velocity(d, liquid), np.nan)),
+        ("Tomiyama 1998, pure", COLOURS[2], "--", tomiyama_velocity(d, liquid)),
+        ("Tomiyama 1998, contaminated", COLOURS[2], "-", tomiyama_velocity(d, liquid, "full")),
+        ("Moore 1965", COLOURS[3], "--", moore_velocity(d, liquid)),
+    ]
+    return [law for law in laws if np.isfinite(law[3]).any()]
+
+
+def sizes(summary: pd.DataFrame, *, bins: int = 20, axes: Any = None) -> Any:
+    """Draw the distribution of the diameters by number and by volume; returns axes.
+
+    summary : what `telerig.bubble_summary` returns: every bubble counts once. Lines stand at the
+    mean and at the Sauter mean diameter, sum d^3 / sum d^2.
+    Raises InputError for a table without sizes.
+    """
+    (d,) = finite(columns_of(summary, "d_eq_mm", made_by=_SUMMARY)[0])
+    axes = axes_of(axes, xlabel="equivalent diameter / mm", ylabel="share of a bin / %")
+    span = float(np.ptp(d)) or 0.1 * float(d[0])
+    edges = np.linspace(d.min() - 0.05 * span, d.max() + 0.05 * span, min(bins, 2 + 2 * len(d)) + 1)
+    for i, (name, weights) in enumerate((("number", np.ones(len(d))), ("volume", d**3))):
+        share, _ = np.histogram(d, edges, weights=100 * weights / weights.sum())
+        look = {"fill": i == 0, "alpha": 0.45 if i == 0 else 1.0, "linewidth": 1.3}
+        axes.stairs(share, edges, color=COLOURS[i], label=f"by {name}", **look)
+    sauter = float((d**3).sum() / (d**2).sum())
+    axes.axvline(d.mean(), color=COLOURS[0], linewidth=1.0, linestyle="--", label="mean")
+    axes.axvline(sauter, color=COLOURS[1], linewidth=1.0, linestyle="--", label="Sauter mean")
+    return axes
+
+
+def spectra(
+    trajectories: pd.DataFrame, *, kind: str = "", y_up: bool = True, axes: Any = None
+) -> Any:
+    """Draw the power spectral density of the velocity along each axis; returns axes.
+
+    trajectories : `Smoothing.trajectories` or bubbles.csv: the mean over the longest tracks. kind :
+    "" for the smoothed velocity, "naive_" or "rts_" for the others of trajectories.csv.
+    y_up : the vertical is called height. Raises InputError for tracks below 32 frames.
+    """
+    found = velocity_density(trajectories, kind)
+    axes = axes_of(axes, xlabel="Hz", ylabel="(mm/s)²/Hz", yscale="log")
+    for i, name in enumerate(("x", "height" if y_up else "y", "z")):
+        axes.plot(found[0][1:], found[1][1:, i], color=COLOURS[i], linewidth=1.0, label=name)
+    return axes

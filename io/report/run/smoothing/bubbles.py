@@ -1,0 +1,153 @@
+"""The bubbles' section of a smoothed run's report: sizes, velocities, drag, shape in time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from telerig.io.report import plot
+from telerig.io.report.page.figures import Curve, Picture, draw_curves, drawing
+from telerig.io.report.page.number_format import number, with_sd
+from telerig.io.report.page.page import Row
+from telerig.io.report.run.smoothing.results import SmoothingResults, column
+from telerig.io.report.run.tracking.results import median
+from telerig.io.report.run.tracking.scene import track_colour
+
+MOST_ROWS = 40
+_MOST_LINES = 12
+_NO_LIQUID = (
+    "For Reynolds, Weber and Eötvös numbers, drag and published laws, describe the liquid under "
+    "[fluid] in rig.toml and smooth again."
+)
+
+
+def size_picture(results: SmoothingResults) -> Picture | None:
+    """Distribution of the diameters by number and by volume."""
+    d = column(results.bubble_summary, "d_eq_mm")
+    if np.isfinite(d).sum() < 2:
+        return None
+    with drawing(2.6, legend="above") as sheet:
+        plot.sizes(results.bubble_summary, axes=sheet.axes)
+    d = d[np.isfinite(d)]
+    sauter = float((d**3).sum() / (d**2).sum())
+    caption = (
+        f"Every bubble once; blue by number, orange by volume. Mean {number(float(d.mean()), 3)} "
+        f"mm, Sauter mean {number(sauter, 3)} mm, {len(d)} bubbles."
+    )
+    return Picture("Sizes of the bubbles", sheet.source, caption)
+
+
+def velocity_picture(results: SmoothingResults) -> Picture | None:
+    """Mean velocity against diameter, beside published laws."""
+    d = column(results.bubble_summary, "d_eq_mm")
+    if not (np.isfinite(d) & np.isfinite(column(results.bubble_summary, "slip_mm_s"))).any():
+        return None
+    fluid = results.file.fluid or None
+    with drawing(3.4) as sheet:
+        plot.velocity(results.bubble_summary, fluid, axes=sheet.axes)
+        _legend_below(sheet)
+    caption = (
+        "Mean velocity relative to the liquid against the diameter of the sphere of equal volume. "
+        + ("Lines: published laws for single bubbles." if fluid else _NO_LIQUID)
+    )
+    return Picture("Velocity against size", sheet.source, caption)
+
+
+def drag_picture(results: SmoothingResults) -> Picture | None:
+    """Drag coefficient against Reynolds number."""
+    if not np.isfinite(column(results.bubble_summary, "drag")).any():
+        return None
+    with drawing(3.4) as sheet:
+        plot.drag(results.bubble_summary, results.file.fluid or None, axes=sheet.axes)
+        _legend_below(sheet)
+    caption = (
+        "Drag coefficient from the balance of buoyancy, added mass and acceleration; lines: "
+        "published laws for bubbles of these sizes that rise steadily."
+    )
+    return Picture("Drag against Reynolds number", sheet.source, caption)
+
+
+def aspect_picture(results: SmoothingResults) -> Picture | None:
+    """Aspect ratio of the longest tracks against time."""
+    frames, curves = results.bubble_frames, []
+    for particle in results.bubbles[:_MOST_LINES]:
+        mine = frames[frames["particle"] == particle]
+        aspect = column(mine, "aspect")
+        if np.isfinite(aspect).sum() > 1:
+            t, sd = mine["t_s"].to_numpy(float), column(mine, "s_aspect")
+            curves.append(Curve(t, aspect, track_colour(particle), sd=sd))
+    if not curves:
+        return None
+    with drawing(2.6, grid=True, xlabel="t / s", ylabel="aspect ratio") as sheet:
+        draw_curves(sheet, curves)
+    text = f"Equatorial over polar semi-axis of a spheroid; bands are ± 2 sd. {_shape(results)}"
+    return Picture("Aspect ratio in time", sheet.source, text)
+
+
+def _shape(results: SmoothingResults) -> str:
+    """What the two views tell of the spheroid as a model."""
+    known = results.file.bodies
+    if not known.get("pairs"):
+        return "Their outlines are too few to test the spheroid."
+    chi2 = median(column(results.bubble_frames, "spheroid_chi2"))
+    return (
+        f"The equatorial semi-axes differ by {number(200 * known.get('triaxial', 0.0), 2)} % "
+        f"(typically); a spheroid misses both outlines by a chi-square of {number(chi2, 2)} for 2 "
+        "degrees of freedom (median; 1.4 if nothing but noise)."
+    )
+
+
+BUBBLE_PICTURES = (size_picture, velocity_picture, drag_picture, aspect_picture)
+
+
+def _legend_below(sheet: Any) -> None:
+    """A legend of two columns below the axes, which give it room."""
+    handles, labels = sheet.axes.get_legend_handles_labels()
+    rows = -(-len(labels) // 2)
+    height = sheet.figure.get_figheight()
+    room = (0.18 * rows + 0.1) / height
+    box = sheet.axes.get_position()
+    sheet.axes.set_position((box.x0, box.y0 + room, box.width, box.height - room))
+    sheet.figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.08, 0.0), ncols=2,
+                        fontsize=7.5)  # fmt: skip
+
+
+HEADS = [
+    "bubble", "frames", "d, mm", "aspect", "rise, mm/s", "zigzag, Hz", "zigzag, mm", "Re", "Eo",
+    "drag",
+]  # fmt: skip
+_COLUMNS = (
+    "d_eq_mm", "aspect", "rise_mm_s", "zigzag_hz", "zigzag_mm", "reynolds", "eotvos", "drag",
+)  # fmt: skip
+
+
+def summary_rows(results: SmoothingResults) -> tuple[list[str], list[Row]]:
+    """Heads and rows of the longest tracks' means; columns that no bubble fills are left out."""
+    table = results.bubble_summary.sort_values("frames", ascending=False).head(MOST_ROWS)
+    used = [name for name in _COLUMNS if np.isfinite(column(table, name)).any()]
+    heads = HEADS[:2] + [HEADS[2 + _COLUMNS.index(name)] for name in used]
+    rows = []
+    for row in table.to_dict("records"):
+        cells = [number(row["particle"]), number(row["frames"])]
+        for name in used:
+            sd = row.get("sd_eq_mm" if name == "d_eq_mm" else f"s_{name}", np.nan)
+            value = row[name]
+            known = float(sd) if np.isfinite(sd) else None
+            cells.append(with_sd(float(value), known) if np.isfinite(value) else "-")
+        rows.append(Row(tuple(cells)))
+    return heads, rows
+
+
+def bubble_words(results: SmoothingResults) -> str:
+    """What the table holds and what it lacks."""
+    words = (
+        "Value ± one standard deviation, over the bubble's frames. All of this, frame by frame, is "
+        "in bubbles.csv, and per bubble in bubble_summary.csv."
+    )
+    more = len(results.bubble_summary) - MOST_ROWS
+    if more > 0:
+        words += f" The {MOST_ROWS} longest of {len(results.bubble_summary)} tracks are listed."
+    if not results.file.fluid:
+        words += " " + _NO_LIQUID
+    return words

@@ -275,7 +275,7 @@ def test_long_runs_stay_small(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "r", frames=2_500, bubbles=2)
     drawn = [draw() for _, draw in smoothing_drawings(read(folder))]
     assert sum(len(p.source) for p in drawn if p is not None) < 2e6
-    text = " ".join(p.caption for p in drawn)
+    text = " ".join(p.caption for p in drawn if p is not None)
     assert "Bubble 0, the longest track, 1\u202f000 frames of its middle." in text
     assert "1\u202f000 frames of the run's middle" in text
 

@@ -1,0 +1,148 @@
+"""`telerig.plot`: axes that show what the tables hold, and errors in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+
+import telerig
+from telerig.errors import InputError
+from telerig.io.results.bubbles import FRAME_COLUMNS, SUMMARY_COLUMNS
+from telerig.rig.bubble_physics import Liquid, mendelson_velocity
+
+WATER = {"density_kg_m3": 998.2, "viscosity_pa_s": 1e-3, "surface_tension_n_m": 0.0728}
+
+
+@pytest.fixture(autouse=True)
+def _closed() -> Iterator[None]:
+    import matplotlib.pyplot as plt
+
+    mpl.use("agg")
+    yield
+    plt.close("all")
+
+
+def summary(count: int = 5) -> pd.DataFrame:
+    d = np.linspace(2.0, 4.0, count)
+    table = pd.DataFrame({"particle": np.arange(count)}).reindex(columns=SUMMARY_COLUMNS)
+    speed = 1e3 * mendelson_velocity(1e-3 * d, Liquid(998.2, 1e-3, 0.0728))
+    re = 998.2 * d * 1e-3 * speed * 1e-3 / 1e-3
+    known = {"d_eq_mm": d, "sd_eq_mm": 0.05, "slip_mm_s": speed, "s_slip_mm_s": 3.0,
+             "reynolds": re, "s_reynolds": 9.0, "drag": 0.6, "s_drag": 0.02}  # fmt: skip
+    return table.assign(**known)
+
+
+def frames(count: int = 200) -> pd.DataFrame:
+    t = np.arange(count) / 500
+    table = pd.DataFrame({"frame": np.arange(count), "particle": 3}).reindex(columns=FRAME_COLUMNS)
+    swing = np.cos(2 * np.pi * 20 * t)
+    known = {"t_s": t, "x_mm": swing, "y_mm": -250 * t, "z_mm": 0.0, "vx_mm_s": 40 * swing,
+             "vy_mm_s": -250.0 + swing, "vz_mm_s": swing, "slip_mm_s": 250 + swing,
+             "reynolds": 700.0 + swing, "drag": 0.6, "d_eq_mm": 3.0}  # fmt: skip
+    return table.assign(**known)
+
+
+def test_a_path_rises_on_the_screen() -> None:
+    axes = telerig.plot.path(frames())
+    (line,) = axes.get_lines()
+    _, _, height = line.get_data_3d()
+    assert height[-1] > height[0] and np.allclose(height, -frames()["y_mm"])
+    assert axes.get_zlabel() == "height / mm"
+    down = telerig.plot.path(frames(), y_up=False)
+    assert np.allclose(down.get_lines()[0].get_data_3d()[2], frames()["y_mm"])
+    assert len(telerig.plot.path(frames(), particles=[9]).get_lines()) == 0
+    coloured = telerig.plot.path(frames(), colour_by="slip_mm_s")
+    assert coloured.figure.axes[-1].get_ylabel() == "slip_mm_s"
+
+
+def test_velocities_lie_on_the_law_that_made_them() -> None:
+    axes = telerig.plot.velocity(summary(), WATER)
+    law = next(line for line in axes.get_lines() if line.get_label() == "Mendelson 1967")
+    d, speed = law.get_data()
+    expected = np.interp(summary()["d_eq_mm"], d, speed)
+    assert np.allclose(expected, summary()["slip_mm_s"], rtol=1e-3)
+    names = axes.get_legend_handles_labels()[1]
+    assert {"bubbles, ± 1 sd", "Clift 1978, contaminated", "Moore 1965"} <= set(names)
+    assert telerig.plot.velocity(summary()).get_legend_handles_labels()[1] == ["bubbles, ± 1 sd"]
+
+
+def test_drag_of_bubbles_and_of_frames() -> None:
+    axes = telerig.plot.drag(summary(), WATER)
+    law = next(line for line in axes.get_lines() if line.get_label() == "Mendelson 1967")
+    re, drag = law.get_data()
+    at = np.nanargmin(np.abs(re - summary()["reynolds"][2]))
+    wave = 4 * 9.80665 * 3e-3 / (3 * (1e-3 * summary()["slip_mm_s"][2]) ** 2)
+    assert drag[at] == pytest.approx(wave, rel=0.02)
+    cloud = telerig.plot.drag(frames())
+    assert len(cloud.get_lines()[0].get_xdata()) == 200
+    with pytest.raises(InputError, match="nothing to draw"):
+        telerig.plot.drag(summary().assign(drag=np.nan))
+
+
+def test_sizes_by_number_and_volume() -> None:
+    axes = telerig.plot.sizes(summary(9), bins=5)
+    number, volume = (patch.get_data().values for patch in axes.patches)
+    assert number.sum() == pytest.approx(100) and volume.sum() == pytest.approx(100)
+    assert volume[-1] > number[-1] and volume[0] < number[0]
+    sauter = next(x for x in axes.get_lines() if x.get_label() == "Sauter mean").get_xdata()[0]
+    d = summary(9)["d_eq_mm"]
+    assert sauter == pytest.approx((d**3).sum() / (d**2).sum())
+    telerig.plot.sizes(summary(1))
+
+
+def test_spectra_peak_where_the_bubble_swings() -> None:
+    axes = telerig.plot.spectra(frames())
+    x, height, z = axes.get_lines()
+    assert [line.get_label() for line in (x, height, z)] == ["x", "height", "z"]
+    assert x.get_xdata()[np.argmax(x.get_ydata())] == pytest.approx(20, abs=4)
+    with pytest.raises(InputError, match="32 frames"):
+        telerig.plot.spectra(frames(20))
+
+
+def test_pictures_of_the_rig(tmp_path: object) -> None:
+    rng = np.random.default_rng(1)
+    dots = pd.DataFrame(rng.uniform(0, 500, (40, 2)), columns=["u_px", "v_px"])
+    dots[["du_px", "dv_px"]] = 0.01 * rng.standard_normal((40, 2))
+    dots = dots.assign(camera="left", weight=1.0)
+    dots.loc[0, "weight"] = 0.0
+    axes = telerig.plot.residuals(dots, "left")
+    assert axes.yaxis_inverted() and axes.collections[0].N == 39
+    covered = telerig.plot.coverage(dots, "left", (640, 480))
+    assert covered.get_xlim() == (-0.5, 639.5) and covered.get_ylim() == (479.5, -0.5)
+    for draw in (telerig.plot.residuals, telerig.plot.coverage):
+        with pytest.raises(InputError, match="no camera 'right'"):
+            draw(dots, "right")
+    grid = np.stack(np.meshgrid([-1.0, 0, 1], [0.0], [-1.0, 0, 1]), -1).reshape(-1, 3)
+    arrays = {
+        "points_mm": grid,
+        "calibration_mm2": (1 + grid[:, 0] ** 2)[:, None, None] * np.eye(3),
+    }
+    assert telerig.plot.uncertainty(arrays).get_xlabel() == "x / mm"
+    with pytest.raises(InputError, match="measurement_mm2"):
+        telerig.plot.uncertainty(arrays, "measurement")
+    with pytest.raises(InputError, match="cannot be read"):
+        telerig.plot.uncertainty("/nowhere/uncertainty.npz")
+
+
+def test_shake_has_one_sign() -> None:
+    table = pd.DataFrame({"t_s": [0.0, 0.1], "left_y_mm": [0.0, 0.02], "sleft_y_mm": 0.001})
+    assert telerig.plot.shake(table, "left").get_lines()[0].get_ydata()[1] == pytest.approx(-20)
+    down = telerig.plot.shake(table, "left", y_up=False)
+    assert down.get_lines()[0].get_ydata()[1] == pytest.approx(20)
+    with pytest.raises(InputError, match="left_z_mm"):
+        telerig.plot.shake(table, "left", "z")
+
+
+def test_given_axes_are_drawn_on() -> None:
+    from matplotlib.figure import Figure
+
+    axes = Figure().add_subplot()
+    assert telerig.plot.sizes(summary(), axes=axes) is axes
+    with pytest.raises(InputError, match="d_eq_mm"):
+        telerig.plot.sizes(summary().drop(columns="d_eq_mm"), axes=axes)
+    with pytest.raises(InputError, match="unknown key"):
+        telerig.plot.velocity(summary(), {**WATER, "sigma": 1.0}, axes=axes)

@@ -7,6 +7,7 @@ the nonlinear ones from equations of motion integrated here; pixels from the cam
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -155,9 +156,15 @@ def cameras(case: Case) -> tuple[Camera, Camera]:
 
 
 def simulate(
-    case: Case, rng: Generator, rig: tuple[tuple[Camera, Camera], Calibration] | None = None
+    case: Case,
+    rng: Generator,
+    rig: tuple[tuple[Camera, Camera], Calibration] | None = None,
+    bubbles: Callable[[Array], tuple[Array, Array]] | None = None,
 ) -> Run:
-    """One run. rig : true cameras and what the estimator is told, by default the truth."""
+    """One run. rig : true cameras and what the estimator is told, by default the truth.
+
+    bubbles : positions and velocities (5, N, 3) at times (N,), in place of those of the case.
+    """
     scenario = case.scenario
     true = cameras(case) if rig is None else rig[0]
     thin = round(SAMPLE_HZ / scenario.rate_hz)
@@ -168,7 +175,8 @@ def simulate(
     common, own = _shake(case, t - t[0], rng)
     offset = common.offset_mm + own.offset_mm
     seen_s = t[lead : lead + steps]
-    place, velocity = (moving[:, ::thin] for moving in _bubbles(case, seen_s, rng))
+    moving = _bubbles(case, seen_s, rng) if bubbles is None else bubbles(seen_s)
+    place, velocity = (each[:, ::thin] for each in moving)
     frames = slice(lead, lead + steps, thin)
     moved = carriage[frames, None] * UP + offset[:, frames]
     noise = scenario.noise_px * rng.standard_normal((2, 5, scenario.frames, 2))

@@ -2,7 +2,9 @@
 
 Over a run, the position along each axis is a path plus zigzags. The velocity of the path is a
 constant mean U plus an Ornstein-Uhlenbeck process; a zigzag is a stochastic oscillator. Smoothing
-and learning represent these processes by states (`bubble_processes`).
+and learning represent these processes by states (`bubble_processes`). White noise drives both, so
+that their acceleration has no finite variance. For the acceleration their sum passes a low-pass
+(`inertial_bubble_path`), whose time is learned (`INERTIA`).
 
 A tracker works from one frame to the next. It needs an acceleration to set its gates, and it has no
 run from which a mean velocity could be known. Along the direction of rise the acceleration is
@@ -13,13 +15,13 @@ Across the rise the velocity oscillates about a slow drift (`rise_motion`, `late
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.factors.state_space import Component, ou_velocity, resonance
+from telerig.factors.state_space import Component, inertial_path, ou_velocity, resonance
 
 Triple = tuple[float, float, float]
 
@@ -51,6 +53,8 @@ class BubbleModel:
     zigzags : oscillations that are added to the path.
     wander_px, wander_tau_s : RMS and correlation time of the centroid's error in each image; 0 px
         for none.
+    inertia_s : time of the low-pass through which the forces of path and zigzags move a bubble, for
+        its acceleration; None if it is learned from the run.
     """
 
     velocity_sigma_mm_s: float = 10.0
@@ -60,6 +64,7 @@ class BubbleModel:
     zigzags: tuple[Zigzag, ...] = ()
     wander_px: float = 0.0
     wander_tau_s: float = 0.1
+    inertia_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,24 @@ BUBBLE_PRIORS = {
 }
 """Priors of the hyper-parameters of `BubbleModel` that are learned from a run, by pattern of the
 name."""
+
+
+INERTIA = Prior(0.0005, 0.05, 0.002, 1.0, 0.7)
+"""Prior of `BubbleModel.inertia_s`. The median is short: it gives a bubble more acceleration than
+most have, where a run does not show how much."""
+
+FORCES = Prior(0.02, 10.0, 1.0, 1.0, 0.7)
+"""Prior of the intensity of all forces on a bubble, over that of the model."""
+
+
+def with_forces(model: BubbleModel, intensity: float) -> BubbleModel:
+    """Return the model with the intensity of its white noises changed by a factor.
+
+    A zigzag keeps its RMS: its damping changes by the factor.
+    """
+    zigzags = tuple(replace(z, damping=z.damping * intensity) for z in model.zigzags)
+    sigma = model.velocity_sigma_mm_s * float(np.sqrt(intensity))
+    return replace(model, velocity_sigma_mm_s=sigma, zigzags=zigzags)
 
 
 def learned_names(model: BubbleModel) -> list[str]:
@@ -176,6 +199,14 @@ def bubble_processes(
             line = (zigzag.frequency_hz, zigzag.damping, zigzag.force_hz)
             parts.append(line_process(f"bubble.zigzags.{i}", rms, *line))
     return parts
+
+
+def inertial_bubble_path(model: BubbleModel, direction: Array, inertia_s: float) -> Component:
+    """Return the sum of a bubble's processes along a direction (3,) after the low-pass of time
+    ``inertia_s``. Its first states are position, velocity and acceleration."""
+    zigzags = [process.component for process in bubble_processes(model, direction)[1:]]
+    sigma, tau = model.velocity_sigma_mm_s, model.velocity_tau_s
+    return inertial_path(sigma, tau, inertia_s, zigzags, start_sigma_mm=model.start_sigma_mm)
 
 
 def line_process(

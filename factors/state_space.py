@@ -131,6 +131,47 @@ def ou_velocity(sigma_mm_s: float, tau_s: float, *, start_sigma_mm: float = 100.
     )
 
 
+def inertial_path(
+    sigma_mm_s: float,
+    tau_s: float,
+    inertia_s: float,
+    oscillations: Sequence[Component] = (),
+    *,
+    start_sigma_mm: float = 100.0,
+) -> Component:
+    """Return the sum of an `ou_velocity` process and oscillations after a first-order low-pass.
+
+    The low-pass of time ``inertia_s`` adds a pole to the spectrum, so that the acceleration has a
+    finite variance (without oscillations: Sawford, Phys. Fluids A 3:1577, 1991). With the input u,
+    the velocity before the low-pass, the velocity w and the acceleration a obey w' = a and
+    a' = (u' - a) / inertia_s. The states are position, velocity, acceleration and then the states
+    of the oscillations before the low-pass; the mean velocity U is the input.
+
+    sigma_mm_s, tau_s : as for `ou_velocity`, before the low-pass.
+    oscillations : processes with a velocity and without inputs.
+    """
+    _positive(sigma_mm_s=sigma_mm_s, tau_s=tau_s, inertia_s=inertia_s)
+    _positive(start_sigma_mm=start_sigma_mm)
+    drift = block_diagonal([np.zeros((3, 3)), *(c.drift for c in oscillations)])
+    inner = block_diagonal([np.zeros((3, 1)), *(c.noise for c in oscillations)])
+    swing = np.concatenate([np.zeros(3), *(c.velocity for c in oscillations)])
+    # u' of the Ornstein-Uhlenbeck part is (U - v) / tau + noise with v = w + inertia a - swing
+    rate = swing / tau_s + swing @ drift
+    rate[1:3] -= 1 / tau_s, inertia_s / tau_s + 1
+    drift[0, 1] = drift[1, 2] = 1.0
+    drift[2] = rate / inertia_s
+    inner[2] = swing @ inner / inertia_s
+    inner[2, 0] = sigma_mm_s * np.sqrt(2 / tau_s) / inertia_s
+    start = np.zeros_like(drift)
+    start[0, 0] = start_sigma_mm**2
+    start[1:, 1:] = stationary_covariance(drift[1:, 1:], inner[1:])
+    mean = np.zeros((len(drift), 1))
+    still, pushed = mean.copy(), mean.copy()
+    still[1], pushed[2] = 1.0, 1 / (tau_s * inertia_s)
+    path = _component("inertial_path", drift, inner, start, acceleration=np.eye(len(drift))[2])
+    return replace(path, input=pushed, start_from_input=still)
+
+
 def forced_mass(
     acceleration_rms_mm_s2: float,
     *,

@@ -228,6 +228,19 @@ def summary_of(solution: Solution) -> dict[str, Any]:
         "travel": _travel(solution),
         "accelerometers": _sensors(solution),
         "bubble_means": _means(solution),
+        **_accelerations(solution),
+    }
+
+
+def _accelerations(solution: Solution) -> dict[str, Any]:
+    found = solution.accelerations
+    if found is None:
+        return {}
+    band = dict(zip(AXES, found.bandwidth_hz.tolist(), strict=True))
+    return {
+        "acceleration_bandwidth_hz": band,
+        "inertia_s": found.inertia_s,
+        "force_intensity": found.force_intensity,
     }
 
 
@@ -346,6 +359,10 @@ def states_of(solution: Solution) -> dict[str, Array]:
     }
     if found is not None:
         arrays |= {"shake_covariance": found.shake, "bubble_covariance": found.bubbles}
+    moved = solution.accelerations
+    if moved is not None:
+        arrays["bubble_acceleration"] = moved.value_mm_s2
+        arrays["bubble_acceleration_covariance"] = moved.covariance
     return arrays
 
 
@@ -433,8 +450,8 @@ def trajectories(
     tracks: pd.DataFrame | None,
     inflation: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> pd.DataFrame:
-    """Return the table of the bubbles' positions (mm) and velocities (mm/s) in the laboratory
-    frame.
+    """Return the table of the bubbles' positions (mm), velocities (mm/s) and accelerations (mm/s^2)
+    in the laboratory frame.
 
     The table has one row for every frame from a bubble's first to its last detection. The standard
     deviations include the uncertainty of the encoder's scale and of the travel axis; their columns
@@ -467,6 +484,10 @@ def trajectories(
     columns["observed"] = _observed(solution)
     if tracks is not None:
         columns |= _baselines(solution, tracks)
+    found = solution.accelerations
+    if found is not None:
+        columns |= _named(found.value_mm_s2, "a{}_mm_s2")
+        columns |= _named(found.sd_mm_s2 * inflation, "sa{}_mm_s2")
     return pd.DataFrame(columns)
 
 

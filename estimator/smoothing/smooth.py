@@ -15,7 +15,8 @@ from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
-from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
+from telerig.estimator.smoothing.graph.accelerations import accelerations_of
+from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
 from telerig.estimator.smoothing.learning.held_out import learning_record
@@ -166,6 +167,9 @@ def smooth(
             if chosen.learned:
                 step("uncertainty of what was learned", 0.9)
                 solution = with_hyperparameter_uncertainty(solution)
+    with phases.phase("accelerations", "estimating accelerations"):
+        if problem.bubbles and solution.covariances is not None:
+            solution = replace(solution, accelerations=accelerations_of(solution, drawn(solution)))
     with phases.phase("verdict", "judging the result"):
         from telerig.estimator.smoothing.verdict.contradiction import (
             sample_warnings,

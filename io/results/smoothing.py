@@ -13,8 +13,9 @@ from telerig.io.results.record import Name, Part, Record, Vector3
 from telerig.io.results.tracking import RigChange
 
 AXES = ("x", "y", "z")
-POSITION, VELOCITY = "{}_mm", "v{}_mm_s"
-"""Patterns of column names in trajectories.csv for one axis: position (mm) and velocity (mm/s).
+POSITION, VELOCITY, ACCELERATION = "{}_mm", "v{}_mm_s", "a{}_mm_s2"
+"""Patterns of column names in trajectories.csv for one axis: position (mm), velocity (mm/s) and
+acceleration (mm/s^2).
 
 A leading "s" marks the standard deviation, "naive_" and "rts_" two simpler estimates.
 """
@@ -66,6 +67,7 @@ class Quantity(StrEnum):
     ZIGZAG_AMPLITUDE = "zigzag amplitude"
     ZIGZAG_FREQUENCY = "zigzag frequency"
     VELOCITY = "velocity"
+    ACCELERATION = "acceleration"
 
 
 class Grade(StrEnum):
@@ -151,7 +153,8 @@ class Use(Part):
     axis : axis of the rig.  value : the median over the bubbles; None if there is none.
     sd : standard deviation of the quantity of a typical bubble; None if it is not known.
     unit : unit of both.
-    below_hz : the frequency up to which ``sd`` counts, for a path; None for other quantities.
+    below_hz : the frequency up to which ``sd`` counts, for a path, or up to which an acceleration
+        is followed; None for other quantities.
     assumes : records whose sign, unit or scale nothing in the run confirms, and on which the value
         rests.
     """
@@ -219,6 +222,10 @@ class SmoothingFile(Record):
     learning : from which part of a long run the modes were learned, and how they hold elsewhere.
     seconds : wall time by phase.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
+    acceleration_bandwidth_hz : by axis, the frequency up to which accelerations are followed by at
+        least half; {} without accelerations.
+    inertia_s, force_intensity : time of the low-pass through which forces move a bubble, and the
+        forces' intensity over that of the model; None without accelerations.
     """
 
     MISSING: ClassVar[str] = "this run is not smoothed"
@@ -265,6 +272,9 @@ class SmoothingFile(Record):
     travel: dict[str, Any] = Field(default_factory=dict)
     accelerometers: dict[str, Any] = Field(default_factory=dict)
     bubble_means: dict[str, Any] = Field(default_factory=dict)
+    acceleration_bandwidth_hz: dict[str, float] = Field(default_factory=dict)
+    inertia_s: float | None = None
+    force_intensity: float | None = None
     rig_change: RigChange | None = None
     learning: dict[str, Any] = Field(default_factory=dict)
     seconds: dict[str, float] = Field(default_factory=dict)
@@ -299,4 +309,5 @@ TRAJECTORIES = [
     Column("t_s"),
     *_optional([f"{kind}{name}" for kind in ("", "s", "naive_", "rts_") for name in STATE]),
     Column("observed", "whole", required=False),
+    *_optional([prefix + ACCELERATION.format(axis) for prefix in ("", "s") for axis in AXES]),
 ]

@@ -175,6 +175,7 @@ def consequence_words(file: SmoothingFile) -> str:
 QUANTITY_WORDS = {
     Quantity.MEAN_VELOCITY: "mean velocity",
     Quantity.VELOCITY: "velocity in a frame",
+    Quantity.ACCELERATION: "acceleration in a frame",
     Quantity.PATH: "path",
     Quantity.ZIGZAG_AMPLITUDE: "zigzag amplitude",
     Quantity.ZIGZAG_FREQUENCY: "zigzag frequency",

@@ -19,6 +19,7 @@ from telerig.factors.state_space import (
     driven_mode,
     forced_mass,
     independent,
+    inertial_path,
     oscillator,
     ou_velocity,
     slow_ou,
@@ -31,9 +32,11 @@ ALL = [
     driven_mode(0.14, 20.0, 0.03),
     broad_band(0.14),
     slow_ou(0.02, 0.3),
+    inertial_path(10.0, 0.3, 0.01),
+    inertial_path(10.0, 0.3, 0.3, [oscillator(0.5, 6.0, 0.03), driven_mode(0.2, 13.0, 0.03)]),
 ]
 STEEP = broad_band(0.3, low_hz=40.0, high_hz=80.0, floor=0.12, tail=3)
-SETTLING = [c for c in ALL if c.name not in ("ou_velocity", "forced_mass")]
+SETTLING = [c for c in ALL if c.start_from_input.shape[1] == 0 and c.name != "forced_mass"]
 
 
 def steps_of(component: Component, *lengths_s: float) -> Steps:
@@ -104,7 +107,7 @@ def test_rms_is_the_one_asked_for(component: Component, rms: float) -> None:
     assert np.sqrt(row @ component.start_covariance @ row) == pytest.approx(rms, rel=1e-9)
 
 
-@pytest.mark.parametrize("component", [ALL[1], *ALL[3:5], STEEP], ids=lambda c: c.name)
+@pytest.mark.parametrize("component", [ALL[1], *ALL[3:5], *ALL[6:], STEEP], ids=lambda c: c.name)
 def test_rows_are_derivatives_of_one_another(component: Component) -> None:
     """No white noise enters position or velocity, and each row's rate of change is the next."""
     for row, following in (
@@ -131,6 +134,30 @@ def test_mean_velocity_enters_as_the_input() -> None:
     steps = steps_of(ou_velocity(10.0, 0.3), 0.02)
     state = steps.transition[0, 0] @ [5.0, 280.0] + steps.input[0, 0] @ [280.0]
     np.testing.assert_allclose(state, [5.0 + 280 * 0.02, 280.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("inertia_s", [1e-5, 1e-3, 0.3 - 1e-12, 0.3, 5.0])
+def test_an_inertial_path_is_sawfords_process_at_all_times(inertia_s: float) -> None:
+    """Times that are equal, and one far shorter than the step (Sawford 1991, equations 9 to 12)."""
+    path = inertial_path(10.0, 0.3, inertia_s)
+    both = 0.3 + inertia_s
+    expected = np.diag([1e4, 100 * 0.3 / both, 100 / (inertia_s * both)])
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(path.start_covariance / scale / scale[:, None], np.eye(3), atol=1e-6)
+    steps = steps_of(path, 0.02)
+    phi, q = steps.transition[0, 0][1:, 1:], steps.covariance[0, 0][1:, 1:]
+    after = phi @ expected[1:, 1:] @ phi.T + q
+    np.testing.assert_allclose(after / scale[1:] / scale[1:, None], np.eye(2), atol=1e-6)
+    state = steps.transition[0, 0] @ [5.0, 280.0, 0.0] + steps.input[0, 0] @ [280.0]
+    np.testing.assert_allclose(state, [5.0 + 280 * 0.02, 280.0, 0.0], atol=1e-5)
+
+
+def test_a_short_inertia_leaves_the_path_and_its_oscillations() -> None:
+    """The position after a step from a known state has the variance of the processes themselves."""
+    swing, step = oscillator(2.0, 6.0, 0.03), 0.05
+    steps = steps_of(inertial_path(10.0, 0.3, 1e-5, [swing]), step)
+    apart = [steps_of(c, step).covariance[0, 0, 0, 0] for c in (ou_velocity(10.0, 0.3), swing)]
+    assert steps.covariance[0, 0, 0, 0] == pytest.approx(sum(apart), rel=1e-2)
 
 
 def test_irregular_steps_each_get_their_own(rng: np.random.Generator) -> None:
@@ -174,6 +201,8 @@ def test_refusals() -> None:
         oscillator(0.0, 12.0, 0.1)
     with pytest.raises(InputError, match="tau_s is nan"):
         ou_velocity(1.0, float("nan"))
+    with pytest.raises(InputError, match="inertia_s is 0"):
+        inertial_path(1.0, 0.3, 0.0)
 
 
 @pytest.fixture

@@ -47,7 +47,9 @@ class Draws:
         counts = graph.counts()
         first = sum(n * d for n, d in counts[:family])
         number, size = counts[family]
-        return self.errors[first : first + number * size].reshape(number, size, -1)
+        return self.errors[first : first + number * size].reshape(
+            number, size, self.errors.shape[1]
+        )
 
 
 def draws_of(

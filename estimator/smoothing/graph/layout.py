@@ -6,9 +6,9 @@ Which component sits where in a node's vector, when nodes are, the keys of all v
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,11 +17,13 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     BroadBand,
+    Bubble,
+    Observations,
     RigMode,
     ShakeModel,
     SmoothingProblem,
 )
-from telerig.factors.bubble_motion import BubbleModel, bubble_processes
+from telerig.factors.bubble_motion import BubbleModel, bubble_processes, inertial_bubble_path
 from telerig.factors.motion import Motion, motion
 from telerig.factors.state_space import (
     Component,
@@ -77,13 +79,15 @@ class ShakeLayout:
 class BubbleLayout:
     """The vector of a bubble at a frame.
 
-    position, velocity : (3, D) lab, rig axes.  wander : (C, 2, D) px.
+    position, velocity, acceleration : (3, D) lab, rig axes; 0 where there is no acceleration.
+    wander : (C, 2, D) px.
     path_position, path_velocity : (3,) columns of the Ornstein-Uhlenbeck path along each axis.
     """
 
     components: tuple[Component, ...]
     position: Array
     velocity: Array
+    acceleration: Array
     wander: Array
     path_position: Ints
     path_velocity: Ints
@@ -212,32 +216,40 @@ def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
     return out
 
 
-def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
-    """Return the layout, which is the same for all bubbles. Each axis begins with its path."""
-    processes = [
-        (process, axis, number == 0)
-        for axis, direction in enumerate(np.eye(3))
-        for number, process in enumerate(bubble_processes(model, direction))
-    ]
-    processes.sort(key=lambda one: one[0].stem)
-    parts = [(process.component, axis, is_path) for process, axis, is_path in processes]
+def bubble_layout(model: BubbleModel, cameras: int, inertia_s: float | None = None) -> BubbleLayout:
+    """Return the layout, which is the same for all bubbles. Each axis begins with its path.
+
+    inertia_s : time of the low-pass after which a bubble's acceleration is a state; None without.
+    """
+    if inertia_s is None:
+        processes = [
+            (process, axis, number == 0)
+            for axis, direction in enumerate(np.eye(3))
+            for number, process in enumerate(bubble_processes(model, direction))
+        ]
+        processes.sort(key=lambda one: one[0].stem)
+        parts = [(process.component, axis, is_path) for process, axis, is_path in processes]
+    else:
+        parts = [
+            (inertial_bubble_path(model, direction, inertia_s), axis, True)
+            for axis, direction in enumerate(np.eye(3))
+        ]
     motion = sum(c.size for c, *_ in parts)
     extra: list[Component] = []
     if model.wander_px > 0:
         extra = [slow_ou(model.wander_px, model.wander_tau_s)] * (2 * cameras)
     size = motion + len(extra)
-    position, velocity = np.zeros((3, size)), np.zeros((3, size))
+    rows = np.zeros((3, 3, size))
     at, path = 0, np.zeros(3, int)
     for part, axis, is_path in parts:
         path[axis] = at if is_path else path[axis]
-        position[axis, at : at + part.size] = part.position
-        velocity[axis, at : at + part.size] = part.velocity
+        rows[:, axis, at : at + part.size] = part.position, part.velocity, part.acceleration
         at += part.size
     shifts = np.zeros((cameras, 2, size))
     for i in range(len(extra)):
         shifts[i // 2, i % 2, motion + i] = 1.0
     components = tuple(c for c, *_ in parts) + tuple(extra)
-    return BubbleLayout(components, position, velocity, shifts, path, path + 1)
+    return BubbleLayout(components, rows[0], rows[1], rows[2], shifts, path, path + 1)
 
 
 def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[float]) -> Nodes:
@@ -499,23 +511,39 @@ def graph_layout(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) 
     nominal = np.zeros(len(nodes.t_s))
     if stage is not None:
         nominal = np.interp(nodes.t_s, stage.t_s, stage.position_mm)
+    shake = shake_layout(problem, model)
+    return GraphLayout(
+        problem, model, shake, nodes=nodes, delays_s=delays_s, clock_of=clocks_of(problem),
+        nominal_mm=nominal, shake_motion=motion(shake.components, np.diff(nodes.t_s)),
+        **_of_bubbles(problem, nodes, bubble_layout(model.bubble, len(problem.cameras))),
+    )  # fmt: skip
+
+
+def with_bubbles(
+    graph: GraphLayout, bubbles: Sequence[Bubble], observations: Observations, layout: BubbleLayout
+) -> GraphLayout:
+    """Return the graph of the same rig with other bubbles, of another layout."""
+    problem = replace(graph.problem, bubbles=tuple(bubbles), observations=observations)
+    return replace(graph, problem=problem, **_of_bubbles(problem, graph.nodes, layout))
+
+
+def _of_bubbles(problem: SmoothingProblem, nodes: Nodes, bubble: BubbleLayout) -> dict[str, Any]:
+    """The fields of `GraphLayout` that depend on the bubbles."""
     lengths = np.array([len(b) for b in problem.bubbles], np.int64)
     first_row = np.r_[0, np.cumsum(lengths)].astype(np.int64)
     frames = [np.arange(b.first, b.last + 1) for b in problem.bubbles]
     frame_of_row = np.concatenate([*frames, np.zeros(0, np.int64)]).astype(np.int64)
-    shake = shake_layout(problem, model)
-    bubble = bubble_layout(model.bubble, len(problem.cameras))
     moving = np.setdiff1d(np.arange(len(frame_of_row)), first_row[1:] - 1)
     t = problem.t_s[frame_of_row]
-    return GraphLayout(
-        problem, model, shake, bubble, nodes, delays_s, clocks_of(problem), nominal, first_row,
-        nodes.of_frame[frame_of_row],
-        np.repeat(np.arange(len(lengths)), lengths),
-        frame_of_row,
-        motion(shake.components, np.diff(nodes.t_s)),
-        motion(bubble.components, t[moving + 1] - t[moving]),
-        moving,
-    )  # fmt: skip
+    return {
+        "bubble": bubble,
+        "first_row": first_row,
+        "node_of_row": nodes.of_frame[frame_of_row],
+        "bubble_of_row": np.repeat(np.arange(len(lengths)), lengths),
+        "frame_of_row": frame_of_row,
+        "bubble_motion": motion(bubble.components, t[moving + 1] - t[moving]),
+        "moving_rows": moving,
+    }
 
 
 def clocks_of(problem: SmoothingProblem) -> Ints:

@@ -42,7 +42,7 @@ _SLOPE_S = 2e-3
 
 def priors_and_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
     """Everything but the measurements."""
-    out = _shake_motion(graph, state) + _bubble_motion(graph, state)
+    out = _shake_motion(graph, state) + bubble_priors(graph, state)
     return out + _constant_priors(graph, state)
 
 
@@ -71,7 +71,8 @@ def _shake_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
     ]
 
 
-def _bubble_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
+def bubble_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
+    """Motion of the bubbles and their mean velocities."""
     problem, layout = graph.problem, graph.bubble
     if not problem.bubbles:
         return []
@@ -87,8 +88,9 @@ def _bubble_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
         graph.bubble_basis(firsts),
         state.means,
     )
+    means = _priors(base.means, state.means, graph.model.bubble.mean_sigma_mm_s)
     if not len(rows):
-        return [begin]
+        return [begin, means]
     owner = graph.bubble_of_row[rows]
     between = graph.bubble_motion.factors(
         (base.bubbles + rows, base.bubbles + rows + 1, base.means + owner),
@@ -96,13 +98,13 @@ def _bubble_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
         state.means[owner],
         graph.row_basis[rows + 1],
     )
-    return [begin, between]
+    return [begin, between, means]
 
 
 def _constant_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
     model, problem, base = graph.model, graph.problem, graph.base()
     scale, delay = graph.sensor_flags
-    out = [_priors(base.means, state.means, model.bubble.mean_sigma_mm_s)]
+    out = list[LinearFactors]()
     if problem.accelerometers:
         extra = [model.accelerometer_scale_sigma] * scale
         sigma = np.array([[a.bias_sigma_mm_s2] * 3 + extra for a in problem.accelerometers])

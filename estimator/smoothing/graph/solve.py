@@ -97,6 +97,29 @@ class Covariances:
 
 
 @dataclass(frozen=True)
+class Accelerations:
+    """Hold the bubbles' accelerations in the laboratory frame (rig axes).
+
+    value_mm_s2 : (rows, 3).  covariance : (rows, 3, 3) in mm^2/s^4, rows as in the graph.
+    bandwidth_hz : (3,) along each axis the frequency up to which accelerations are followed by at
+        least half; 0 where the images say no more than the prior.
+    inertia_s : time of the low-pass through which forces move a bubble.
+    force_intensity : of these forces, over that of the model.
+    """
+
+    value_mm_s2: Array
+    covariance: Array
+    bandwidth_hz: Array
+    inertia_s: float
+    force_intensity: float
+
+    @property
+    def sd_mm_s2(self) -> Array:
+        """(rows, 3) standard deviations."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
+
+
+@dataclass(frozen=True)
 class Solution:
     """Hold the posterior of a smoothing problem.
 
@@ -110,6 +133,7 @@ class Solution:
     sample_weights, sample_residuals : weights (N,) of each accelerometer's samples, None where all
         are 1, and their whitened residuals (N, k) along the k directions of modelled motion.
     draws : None if they were not asked for.
+    accelerations : None where they were not asked for (`accelerations.accelerations_of`).
     """
 
     graph: GraphLayout
@@ -122,6 +146,7 @@ class Solution:
     sample_weights: SampleWeights = ()
     sample_residuals: tuple[Array, ...] = ()
     draws: Draws | None = None
+    accelerations: Accelerations | None = None
 
     @property
     def delays_s(self) -> Array:

@@ -65,6 +65,7 @@ class _Path:
         assert found is not None
         rows = np.arange(graph.first_row[bubble], graph.first_row[bubble + 1])
         states = solution.state.bubbles[rows]
+        self.rows, self.widen = rows, widen
         self.t_s = graph.problem.t_s[graph.frame_of_row[rows]]
         drawn = graph.bubble_basis(rows) @ errors[rows]
         both = []
@@ -116,6 +117,12 @@ def _of_axis(solution: Solution, paths: Sequence[_Path], axis: int) -> Iterator[
         [(_rms(p.values[1][:, axis]), _rms(p.sd[1][:, axis])) for p in paths], "mm/s",
     )  # fmt: skip
     below = float(np.median([_clear_hz(p, axis) for p in paths]))
+    moved = solution.accelerations
+    if moved is not None:
+        value, sd = moved.value_mm_s2[:, axis], moved.sd_mm_s2[:, axis]
+        each = [(_rms(value[p.rows]), _rms(sd[p.rows]) * p.widen[axis]) for p in paths]
+        acceleration = use(Quantity.ACCELERATION, each, "mm/s^2")
+        yield acceleration.model_copy(update={"below_hz": float(moved.bandwidth_hz[axis]) or None})
     path = use(Quantity.PATH, [_band_rms(p, axis, below) for p in paths], "mm")
     if not below:
         path = path.model_copy(update={"grade": Grade.NO})

@@ -1,0 +1,202 @@
+"""Accelerations of the bubbles: against dense algebra, against the joint graph, against truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_continuous_lyapunov
+from shake_learning_data import CAMERAS, UP, run, true_model
+
+from telerig.estimator.smoothing.graph import accelerations as module
+from telerig.estimator.smoothing.graph import layout
+from telerig.estimator.smoothing.graph.accelerations import accelerations_of
+from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
+from telerig.estimator.smoothing.problem.problem import (
+    Bubble,
+    Observations,
+    ShakeModel,
+    SmoothingProblem,
+)
+from telerig.estimator.smoothing.result import trajectories
+from telerig.estimator.smoothing.verdict.purposes import uses
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
+from telerig.io.results.smoothing import TRAJECTORIES, Quantity
+
+Array = NDArray[np.float64]
+SIGMA, TAU, RMS, HZ, DAMPING = 10.0, 0.3, 2.0, 6.0, 0.03
+PIXEL, SCALE = 0.3, 10.0
+PLAIN = Options(robust=False)
+
+
+def model_of(inertia_s: float | None) -> ShakeModel:
+    """A rig that stands still, and the bubbles of `axis_process`."""
+    zigzag = Zigzag(HZ, DAMPING, (RMS,) * 3)
+    return ShakeModel(BubbleModel(SIGMA, TAU, zigzags=(zigzag,), inertia_s=inertia_s), modes=())
+
+
+def axis_process(inertia_s: float) -> tuple[Array, Array, Array]:
+    """Drift, noise and stationary covariance (position left out) of one axis.
+
+    States: position, velocity, wander before the low-pass, swing and its velocity before it.
+    """
+    w = 2 * np.pi * HZ
+    drift, noise = np.zeros((5, 5)), np.zeros((5, 2))
+    drift[0, 1] = drift[3, 4] = 1.0
+    drift[1, 1:] = np.array([-1.0, 1.0, 0.0, 1.0]) / inertia_s
+    drift[2, 2], drift[4, 3:] = -1 / TAU, (-(w**2), -2 * DAMPING * w)
+    noise[2, 0], noise[4, 1] = SIGMA * np.sqrt(2 / TAU), 2 * RMS * np.sqrt(DAMPING * w**3)
+    start = np.zeros((5, 5))
+    start[1:, 1:] = solve_continuous_lyapunov(drift[1:, 1:], -noise[1:] @ noise[1:].T)
+    return drift, noise, start
+
+
+def stepped(drift: Array, noise: Array, step_s: float) -> tuple[Array, Array]:
+    """Transition and noise covariance of a step, by Gauss-Legendre over the impulse response."""
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    gains = [expm(drift * step_s * (x + 1) / 2) @ noise for x in nodes]
+    covariance = sum(g @ g.T * w * step_s / 2 for g, w in zip(gains, weights))
+    return np.asarray(expm(drift * step_s)), np.asarray(covariance)
+
+
+def drawn_bubbles(
+    rng: np.random.Generator, inertia_s: float, frames: int, bubbles: int, step_s: float
+) -> tuple[SmoothingProblem, Array]:
+    """A problem of a still rig, and the true accelerations (bubbles, F, 3)."""
+    drift, noise, start = axis_process(inertia_s)
+    phi, q = stepped(drift, noise, step_s)
+    roots = [np.linalg.cholesky(m + 1e-15 * np.eye(len(m))) for m in (start[1:, 1:], q)]
+    x = np.zeros((frames, bubbles, 3, 5))
+    x[0, ..., 1:] = rng.standard_normal((bubbles, 3, 4)) @ roots[0].T
+    for i in range(1, frames):
+        x[i] = x[i - 1] @ phi.T + rng.standard_normal((bubbles, 3, 5)) @ roots[1].T
+    t = step_s * np.arange(frames)
+    lab = x[..., 0].swapaxes(0, 1) + 100 * UP * t[:, None] + rng.uniform(-5, 5, (bubbles, 1, 3))
+    item, frame, camera = (
+        a.ravel() for a in np.meshgrid(np.arange(bubbles), np.arange(frames), [0, 1], indexing="ij")
+    )
+    uv = np.stack([c.project(lab) for c in CAMERAS], 2).reshape(-1, 2)
+    uv += PIXEL * rng.standard_normal(uv.shape)
+    seen = Observations(item, frame, camera, uv, np.tile(PIXEL**2 * np.eye(2), (len(uv), 1, 1)))
+    tracks = tuple(Bubble(k, 0, frames - 1, lab[k, 0], lab[k]) for k in range(bubbles))
+    return SmoothingProblem(CAMERAS, t, UP, UP, tracks, seen), (x @ drift[1]).transpose(1, 0, 2)
+
+
+def solved(problem: SmoothingProblem, model: ShakeModel) -> Solution:
+    solution = solve(problem, model, PLAIN)
+    return replace(solution, accelerations=accelerations_of(solution, drawn(solution)))
+
+
+@pytest.mark.parametrize("inertia_s", [0.002, 0.02])
+def test_dense_algebra_gives_the_same(inertia_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The posterior from the covariance of all frames' states, without states in time."""
+    monkeypatch.setattr(module, "_learned", lambda *_: [1.0, inertia_s])
+    frames, step = 40, 0.01
+    problem, _ = drawn_bubbles(np.random.default_rng(5), inertia_s, frames, 1, step)
+    found = solved(problem, model_of(inertia_s)).accelerations
+    assert found is not None
+    drift, noise, start = axis_process(inertia_s)
+    phi, q = stepped(drift, noise, step)
+    start[0, 0] = 100.0**2
+    whole = np.zeros((frames, 5, frames, 5))
+    now = start
+    for i in range(frames):
+        ahead = now
+        for j in range(i, frames):
+            whole[j, :, i], whole[i, :, j] = ahead, ahead.T
+            ahead = phi @ ahead
+        now = phi @ now @ phi.T + q
+    place, force = whole[:, 0, :, 0], np.einsum("a,iajb->ijb", drift[1], whole)
+    t = problem.t_s
+    height = place + 300.0**2 * np.multiply.outer(t, t)
+    for axis, sigma in ((0, PIXEL / SCALE), (1, PIXEL / SCALE / np.sqrt(2))):
+        gain = np.linalg.solve(height + sigma**2 * np.eye(frames), force[..., 0].T).T
+        variance = np.einsum("iaib,a,b->i", whole, drift[1], drift[1])
+        variance -= np.einsum("ij,ij->i", gain, force[..., 0])
+        np.testing.assert_allclose(found.sd_mm_s2[:, axis], np.sqrt(variance), rtol=1e-5)
+        centre = np.array([512.0, 512.0]) - 0.5
+        uv = problem.observations.uv_px.reshape(frames, 2, 2)
+        seen = (uv[:, 0, 0] - centre[0]) / SCALE
+        if axis == 1:
+            seen = ((uv[..., 1] - centre[1]) / SCALE).mean(1)
+        mean = gain @ (seen - problem.bubbles[0].start_mm[axis])
+        np.testing.assert_allclose(
+            found.value_mm_s2[:, axis], mean, atol=0.01 * variance.max() ** 0.5
+        )
+
+
+@pytest.mark.parametrize(
+    ("marks", "far", "wide"), [(3, 0.01, 1.001), (0, 0.1, 1.06)], ids=["marks", "images alone"]
+)
+def test_the_rigs_posterior_is_nearly_that_of_the_joint_graph(
+    marks: int, far: float, wide: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exact where marks tell the shake; with images alone standard deviations are a little wide."""
+    monkeypatch.setattr(module, "_learned", lambda *_: [1.0, 0.005])
+    problem, _, _ = run(np.random.default_rng(3), seconds=0.6, marks=marks)
+    solution = solve(problem, true_model(), PLAIN)
+    found = accelerations_of(solution, drawn(solution, 64))
+    assert found is not None
+    whole = layout.bubble_layout
+    monkeypatch.setattr(layout, "bubble_layout", lambda m, c: whole(m, c, 0.005))
+    joint = solve(problem, true_model(), PLAIN)
+    assert joint.covariances is not None
+    rows = joint.graph.bubble.acceleration
+    covariance = rows @ joint.covariances.bubbles @ rows.T
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    off = (found.value_mm_s2 - joint.state.bubbles @ rows.T) / sd
+    assert np.sqrt((off**2).mean(0)).max() < far
+    ratio = (found.sd_mm_s2 / sd).mean(0)
+    assert (ratio > 0.99).all() and (ratio < wide).all()
+
+
+def test_standard_deviations_are_true_where_the_low_pass_has_to_be_learned() -> None:
+    squares = []
+    for seed, inertia_s in enumerate((0.004, 0.01, 0.02)):
+        rng = np.random.default_rng(seed)
+        problem, truth = drawn_bubbles(rng, inertia_s, 200, 3, 0.005)
+        found = solved(problem, model_of(None)).accelerations
+        assert found is not None
+        assert 0.5 * inertia_s < found.inertia_s < 2 * inertia_s
+        assert 0.5 < found.force_intensity < 2
+        assert ((found.bandwidth_hz > HZ) & (found.bandwidth_hz < 100)).all()
+        squares.append(((found.value_mm_s2 - truth.reshape(-1, 3)) / found.sd_mm_s2) ** 2)
+    assert 0.8 < np.mean(squares) < 1.25
+
+
+def test_tables_and_uses_name_accelerations() -> None:
+    problem, _ = drawn_bubbles(np.random.default_rng(1), 0.01, 60, 2, 0.005)
+    solution = solved(problem, model_of(0.01))
+    found = solution.accelerations
+    assert found is not None and found.inertia_s == 0.01
+    names = [f"{kind}a{axis}_mm_s2" for kind in ("", "s") for axis in "xyz"]
+    table = trajectories(solution, None, (1.0, 2.0, 1.0))
+    assert list(table.columns[-6:]) == names
+    assert [c.name for c in TRAJECTORIES[-6:]] == names
+    np.testing.assert_allclose(table["say_mm_s2"], 2 * found.sd_mm_s2[:, 1])
+    used: Any = {u.axis: u for u in uses(solution, drawn(solution)) if u.quantity == "acceleration"}
+    assert set(used) == {"x", "y", "z"} and Quantity.ACCELERATION == "acceleration"
+    assert used["x"].unit == "mm/s^2"
+    assert used["x"].below_hz == pytest.approx(found.bandwidth_hz[0])
+    assert used["x"].sd == pytest.approx(np.sqrt((found.sd_mm_s2[:, 0] ** 2).mean()), rel=0.1)
+    bare = replace(solution, accelerations=None)
+    assert "ax_mm_s2" not in trajectories(bare, None)
+
+
+def test_bubbles_of_one_frame_and_without_pixels_have_wide_accelerations() -> None:
+    problem, _ = drawn_bubbles(np.random.default_rng(2), 0.01, 30, 2, 0.01)
+    seen = problem.observations
+    kept = seen.of((seen.item == 0) | ((seen.item == 1) & (seen.frame == 7)))
+    once = replace(problem.bubbles[1], first=7, last=7, guess_mm=problem.bubbles[1].guess_mm[7:8])
+    problem = replace(problem, bubbles=(problem.bubbles[0], once), observations=kept)
+    found = solved(problem, model_of(0.01)).accelerations
+    assert found is not None
+    assert np.isfinite(found.value_mm_s2).all() and np.isfinite(found.sd_mm_s2).all()
+    assert (found.sd_mm_s2[-1] > found.sd_mm_s2[15]).all()
+    still, _, _ = run(np.random.default_rng(0), seconds=0.2, marks=2)
+    seen = Observations.none()
+    empty = solve(replace(still, bubbles=(), observations=seen), true_model(), PLAIN)
+    assert accelerations_of(empty, drawn(empty)) is None

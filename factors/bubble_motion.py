@@ -4,7 +4,7 @@ Over a run, the position along each axis is a path plus zigzags. The velocity of
 constant mean U plus an Ornstein-Uhlenbeck process; a zigzag is a stochastic oscillator. Smoothing
 and learning represent these processes by states (`bubble_processes`). White noise drives both, so
 that their acceleration has no finite variance. For the acceleration their sum passes a low-pass
-(`inertial_bubble_path`), whose time is learned (`INERTIA`).
+(`inertial_bubble_path`), whose time is learned (`INERTIA_S`).
 
 A tracker works from one frame to the next. It needs an acceleration to set its gates, and it has no
 run from which a mean velocity could be known. Along the direction of rise the acceleration is
@@ -104,22 +104,24 @@ BUBBLE_PRIORS = {
 name."""
 
 
-INERTIA = Prior(0.0005, 0.05, 0.002, 1.0, 0.7)
+INERTIA_S = Prior(0.0005, 0.05, 0.002, 1.0, 0.7)
 """Prior of `BubbleModel.inertia_s`. The median is short: it gives a bubble more acceleration than
 most have, where a run does not show how much."""
 
 FORCES = Prior(0.02, 10.0, 1.0, 1.0, 0.7)
-"""Prior of the intensity of all forces on a bubble, over that of the model."""
+"""Prior of the intensity of the forces on a bubble, over that of the model."""
 
 
-def with_forces(model: BubbleModel, intensity: float) -> BubbleModel:
-    """Return the model with the intensity of its white noises changed by a factor.
+@dataclass(frozen=True)
+class Inertia:
+    """Describes the low-pass through which forces move a bubble.
 
-    A zigzag keeps its RMS: its damping changes by the factor.
+    time_s : its time.  forces : intensity of the forces along the rig's x, y and z axes, over that
+        of the model. The zigzags keep their RMS: their damping changes by the factor.
     """
-    zigzags = tuple(replace(z, damping=z.damping * intensity) for z in model.zigzags)
-    sigma = model.velocity_sigma_mm_s * float(np.sqrt(intensity))
-    return replace(model, velocity_sigma_mm_s=sigma, zigzags=zigzags)
+
+    time_s: float
+    forces: Triple = (1.0, 1.0, 1.0)
 
 
 def learned_names(model: BubbleModel) -> list[str]:
@@ -201,12 +203,19 @@ def bubble_processes(
     return parts
 
 
-def inertial_bubble_path(model: BubbleModel, direction: Array, inertia_s: float) -> Component:
-    """Return the sum of a bubble's processes along a direction (3,) after the low-pass of time
-    ``inertia_s``. Its first states are position, velocity and acceleration."""
-    zigzags = [process.component for process in bubble_processes(model, direction)[1:]]
-    sigma, tau = model.velocity_sigma_mm_s, model.velocity_tau_s
-    return inertial_path(sigma, tau, inertia_s, zigzags, start_sigma_mm=model.start_sigma_mm)
+def inertial_bubble_path(model: BubbleModel, direction: Array, inertia: Inertia) -> Component:
+    """Return the sum of a bubble's processes along a direction (3,) after the low-pass.
+
+    Its first states are position, velocity and acceleration.
+    """
+    intensity = float(np.square(direction) @ inertia.forces)
+    sigma = model.velocity_sigma_mm_s * float(np.sqrt(intensity))
+    zigzags = tuple(replace(z, damping=z.damping * intensity) for z in model.zigzags)
+    swings = bubble_processes(replace(model, zigzags=zigzags), direction)[1:]
+    return inertial_path(
+        sigma, model.velocity_tau_s, inertia.time_s, [p.component for p in swings],
+        start_sigma_mm=model.start_sigma_mm,
+    )  # fmt: skip
 
 
 def line_process(

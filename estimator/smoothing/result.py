@@ -239,8 +239,8 @@ def _accelerations(solution: Solution) -> dict[str, Any]:
     band = dict(zip(AXES, found.bandwidth_hz.tolist(), strict=True))
     return {
         "acceleration_bandwidth_hz": band,
-        "inertia_s": found.inertia_s,
-        "force_intensity": found.force_intensity,
+        "inertia_s": found.inertia.time_s,
+        "force_intensity": dict(zip(AXES, found.inertia.forces, strict=True)),
     }
 
 

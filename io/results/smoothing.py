@@ -225,7 +225,7 @@ class SmoothingFile(Record):
     acceleration_bandwidth_hz : by axis, the frequency up to which accelerations are followed by at
         least half; {} without accelerations.
     inertia_s, force_intensity : time of the low-pass through which forces move a bubble, and the
-        forces' intensity over that of the model; None without accelerations.
+        forces' intensity by axis, over that of the model; None and {} without accelerations.
     """
 
     MISSING: ClassVar[str] = "this run is not smoothed"
@@ -274,7 +274,7 @@ class SmoothingFile(Record):
     bubble_means: dict[str, Any] = Field(default_factory=dict)
     acceleration_bandwidth_hz: dict[str, float] = Field(default_factory=dict)
     inertia_s: float | None = None
-    force_intensity: float | None = None
+    force_intensity: dict[str, float] = Field(default_factory=dict)
     rig_change: RigChange | None = None
     learning: dict[str, Any] = Field(default_factory=dict)
     seconds: dict[str, float] = Field(default_factory=dict)

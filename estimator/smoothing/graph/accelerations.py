@@ -30,17 +30,16 @@ from telerig.estimator.smoothing.graph.solve import Accelerations, Solution
 from telerig.estimator.smoothing.problem.problem import Bubble
 from telerig.factors.bubble_motion import (
     FORCES,
-    INERTIA,
-    BubbleModel,
+    INERTIA_S,
+    Inertia,
     inertial_bubble_path,
-    with_forces,
 )
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 from telerig.factors.state_space import Component
 
 _ROWS_AT_ONCE = 20_000
-_PIECE_FRAMES, _PIECES, _PIECE_DRAWS = 150, 30, 4
-"""The low-pass and the forces are learned from so many pieces of tracks, of at most so many frames,
+_PIECE_FRAMES, _LEARNED_ROWS, _LEARNED_DRAWS = 150, 2400, 2
+"""The low-pass is learned from pieces of tracks of at most so many frames, so many together, and
 with so many draws of the rig."""
 _MOST_TRIALS = 40
 _POOLED_S = 0.1
@@ -59,8 +58,7 @@ def accelerations_of(solution: Solution, draws: Draws) -> Accelerations | None:
     if found is None or not graph.rows:
         return None
     rig = _rig_errors(solution, draws)
-    forces, inertia_s = _learned(solution, rig)
-    model = with_forces(graph.model.bubble, forces)
+    inertia = _learned(solution, rig)
     value, covariance = np.empty((graph.rows, 3)), np.empty((graph.rows, 3, 3))
     ends = graph.first_row[1:]
     portions = np.split(
@@ -69,13 +67,13 @@ def accelerations_of(solution: Solution, draws: Draws) -> Accelerations | None:
     for some in portions:
         pieces = [np.arange(graph.first_row[i], ends[i]) for i in some]
         rows = slice(int(pieces[0][0]), int(pieces[-1][-1]) + 1)
-        chains = _Chains(solution, rig, pieces, inertia_s, model)
+        chains = _Chains(solution, rig, pieces, inertia)
         value[rows], covariance[rows] = chains.accelerations()
-    processes = [inertial_bubble_path(model, axis, inertia_s) for axis in np.eye(3)]
+    processes = [inertial_bubble_path(graph.model.bubble, axis, inertia) for axis in np.eye(3)]
     variance = np.diagonal(covariance, axis1=1, axis2=2).mean(0)
-    highest = _ABOVE / (2 * np.pi * inertia_s)
+    highest = _ABOVE / (2 * np.pi * inertia.time_s)
     band = [_bandwidth_hz(p, v, highest) for p, v in zip(processes, variance.tolist(), strict=True)]
-    return Accelerations(value, covariance, np.array(band), inertia_s, forces)
+    return Accelerations(value, covariance, np.array(band), inertia)
 
 
 _RigErrors = tuple[Array, Array]
@@ -99,9 +97,8 @@ class _Chains:
     """Pieces of tracks under the smoother prior, solved for the rig's mean and for its draws."""
 
     def __init__(
-        self, solution: Solution, rig: _RigErrors, pieces: list[Ints], inertia_s: float,
-        model: BubbleModel,
-    ) -> None:  # fmt: skip
+        self, solution: Solution, rig: _RigErrors, pieces: list[Ints], inertia: Inertia
+    ) -> None:
         """pieces : of each the rows in the solution's graph."""
         whole, every = solution.graph, np.concatenate(pieces)
         problem, row_of = whole.problem, np.full(whole.rows, -1)
@@ -115,7 +112,7 @@ class _Chains:
             for i, (p, end) in enumerate(zip(pieces, ends, strict=True))
         ]
         seen = replace(problem.observations.of(piece >= 0), item=piece[piece >= 0])
-        layout = bubble_layout(model, len(problem.cameras), inertia_s)
+        layout = bubble_layout(whole.model.bubble, len(problem.cameras), inertia)
         self.graph = graph = with_bubbles(whole, bubbles, seen, layout)
         states = np.zeros((graph.rows, layout.size))
         states[:, layout.path_position], states[:, layout.path_velocity] = place, speed
@@ -128,14 +125,14 @@ class _Chains:
         self._solve(len(prior), rig)
 
     def _solve(self, priors: int, rig: _RigErrors) -> None:
-        """found : (D, 1 + K) increments.  left : what they leave of the factors' right sides."""
+        """found : (D, 1 + K) increments.  own : the chains' factors.  sides : their right sides."""
         graph, (shake, constants) = self.graph, rig
         first, size, draws = graph.base().bubbles, graph.bubble.size, shake.shape[-1]
         starts = np.r_[
             size * np.arange(graph.rows),
             size * graph.rows + 3 * np.arange(len(graph.problem.bubbles) + 1),
         ]
-        own, left = list[LinearFactors](), list[Array]()
+        own, sides = list[LinearFactors](), list[Array]()
         for number, linear in enumerate(self.factors):
             pushed = np.zeros((*linear.rhs.shape, draws))
             chain = [i for i in range(len(linear.keys)) if number < priors or i == 0]
@@ -144,10 +141,9 @@ class _Chains:
                 pushed -= linear.blocks[2] @ constants
             keys = tuple(np.asarray(linear.keys[i]) - first for i in chain)
             own.append(replace(linear, keys=keys, blocks=tuple(linear.blocks[i] for i in chain)))
-            left.append(np.concatenate([linear.rhs[..., None], pushed], -1))
-        self.found = self._solved(transposed_product(own, starts, left))
-        fitted = product(own, starts, self.found)
-        self.left = [np.subtract(a, b, out=b) for a, b in zip(left, fitted, strict=True)]
+            sides.append(np.concatenate([linear.rhs[..., None], pushed], -1))
+        self.found = self._solved(transposed_product(own, starts, sides))
+        self.own, self.starts, self.sides = own, starts, sides
 
     def _solved(self, side: Array) -> Array:
         graph, places = self.graph, self.chains.places
@@ -189,39 +185,45 @@ class _Chains:
         """Return its expectation over the draws of the rig, up to a constant."""
         basis = np.linalg.slogdet(self.graph.bubble_motion.basis)[1]
         norm = float(basis[self.graph.row_basis].sum()) + sum(f.log_norm() for f in self.factors)
-        squared = [(side**2).reshape(-1, side.shape[-1]).sum(0) for side in self.left]
-        total = np.sum(squared, axis=0)
+        fitted = product(self.own, self.starts, self.found)
+        left = [np.subtract(a, b, out=b) for a, b in zip(self.sides, fitted, strict=True)]
+        total = np.sum([(one**2).reshape(-1, one.shape[-1]).sum(0) for one in left], axis=0)
         spread = float(total[1:].mean()) if len(total) > 1 else 0.0
         return norm - self.chains.log_det - (float(total[0]) + spread) / 2
 
 
-def _learned(solution: Solution, rig: _RigErrors) -> list[float]:
-    """Return the most probable intensity of the forces and time of the low-pass.
+def _learned(solution: Solution, rig: _RigErrors) -> Inertia:
+    """Return the most probable low-pass, with forces along the rise and across it.
 
-    Both decide how much acceleration a bubble has that the images do not show.
+    It decides how much acceleration a bubble has that the images do not show.
     """
     from scipy.optimize import minimize
 
     graph = solution.graph
-    given = graph.model.bubble
+    given, rise = graph.model.bubble.inertia_s, np.square(graph.problem.up)
     cuts = [
         np.array_split(np.arange(a, b), -(-(b - a) // _PIECE_FRAMES))
         for a, b in pairwise(graph.first_row.tolist())
     ]
     pieces = [piece for cut in cuts for piece in cut]
-    chosen = np.unique(np.linspace(0, len(pieces) - 1, min(len(pieces), _PIECES)).astype(int))
+    count = min(len(pieces), -(-_LEARNED_ROWS * len(pieces) // graph.rows))
+    chosen = np.unique(np.linspace(0, len(pieces) - 1, count).astype(int))
     some = [pieces[i] for i in chosen]
-    few = (rig[0][..., :_PIECE_DRAWS], rig[1][..., :_PIECE_DRAWS])
-    priors = (FORCES, INERTIA) if given.inertia_s is None else (FORCES,)
+    few = (rig[0][..., :_LEARNED_DRAWS], rig[1][..., :_LEARNED_DRAWS])
+    priors = [FORCES, FORCES, INERTIA_S][: 3 if given is None else 2]
 
-    def values_at(place: Array) -> list[float]:
-        """Intensity and time, from logarithms over the priors' steps."""
-        found = [p.median * np.exp(p.step * x) for p, x in zip(priors, place, strict=True)]
-        return found if given.inertia_s is None else [*found, given.inertia_s]
+    def values_at(place: Array) -> Array:
+        """Intensities along and across the rise, and time, from logarithms over steps."""
+        return np.array([p.median * np.exp(p.step * x) for p, x in zip(priors, place, strict=True)])
+
+    def inertia_at(values: Array) -> Inertia:
+        along, across = values[:2]
+        x, y, z = (across + (along - across) * rise).tolist()
+        return Inertia(float(values[2]) if given is None else given, (x, y, z))
 
     def score(place: Array) -> float:
         values = values_at(place)
-        chains = _Chains(solution, few, some, values[1], with_forces(given, values[0]))
+        chains = _Chains(solution, few, some, inertia_at(values))
         return -chains.log_likelihood() - sum(p.log_density(v) for p, v in zip(priors, values))
 
     bounds = [np.log([p.low / p.median, p.high / p.median]) / p.step for p in priors]
@@ -229,7 +231,7 @@ def _learned(solution: Solution, rig: _RigErrors) -> list[float]:
     simplex = np.vstack([start, np.eye(len(priors))])
     options = {"initial_simplex": simplex, "xatol": 0.3, "fatol": 1.0, "maxfev": _MOST_TRIALS}
     best = minimize(score, start, method="Nelder-Mead", bounds=bounds, options=options)
-    return values_at(best.x)
+    return inertia_at(values_at(best.x))
 
 
 def _bandwidth_hz(process: Component, variance: float, highest_hz: float) -> float:

@@ -23,7 +23,12 @@ from telerig.estimator.smoothing.problem.problem import (
     ShakeModel,
     SmoothingProblem,
 )
-from telerig.factors.bubble_motion import BubbleModel, bubble_processes, inertial_bubble_path
+from telerig.factors.bubble_motion import (
+    BubbleModel,
+    Inertia,
+    bubble_processes,
+    inertial_bubble_path,
+)
 from telerig.factors.motion import Motion, motion
 from telerig.factors.state_space import (
     Component,
@@ -216,12 +221,12 @@ def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
     return out
 
 
-def bubble_layout(model: BubbleModel, cameras: int, inertia_s: float | None = None) -> BubbleLayout:
+def bubble_layout(model: BubbleModel, cameras: int, inertia: Inertia | None = None) -> BubbleLayout:
     """Return the layout, which is the same for all bubbles. Each axis begins with its path.
 
-    inertia_s : time of the low-pass after which a bubble's acceleration is a state; None without.
+    inertia : low-pass after which a bubble's acceleration is a state; None without.
     """
-    if inertia_s is None:
+    if inertia is None:
         processes = [
             (process, axis, number == 0)
             for axis, direction in enumerate(np.eye(3))
@@ -231,7 +236,7 @@ def bubble_layout(model: BubbleModel, cameras: int, inertia_s: float | None = No
         parts = [(process.component, axis, is_path) for process, axis, is_path in processes]
     else:
         parts = [
-            (inertial_bubble_path(model, direction, inertia_s), axis, True)
+            (inertial_bubble_path(model, direction, inertia), axis, True)
             for axis, direction in enumerate(np.eye(3))
         ]
     motion = sum(c.size for c, *_ in parts)
@@ -524,7 +529,9 @@ def with_bubbles(
 ) -> GraphLayout:
     """Return the graph of the same rig with other bubbles, of another layout."""
     problem = replace(graph.problem, bubbles=tuple(bubbles), observations=observations)
-    return replace(graph, problem=problem, **_of_bubbles(problem, graph.nodes, layout))
+    other = replace(graph, problem=problem, **_of_bubbles(problem, graph.nodes, layout))
+    vars(other)["to_frames"] = graph.to_frames  # of the rig alone, and worked out once
+    return other
 
 
 def _of_bubbles(problem: SmoothingProblem, nodes: Nodes, bubble: BubbleLayout) -> dict[str, Any]:

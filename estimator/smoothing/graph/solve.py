@@ -31,6 +31,7 @@ from telerig.estimator.smoothing.graph.linear import (
     sample_weights,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+from telerig.factors.bubble_motion import Inertia
 from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.robust_loss import truncation_weights
 from telerig.io.machine.parallel import give_back_freed_memory
@@ -103,15 +104,13 @@ class Accelerations:
     value_mm_s2 : (rows, 3).  covariance : (rows, 3, 3) in mm^2/s^4, rows as in the graph.
     bandwidth_hz : (3,) along each axis the frequency up to which accelerations are followed by at
         least half; 0 where the images say no more than the prior.
-    inertia_s : time of the low-pass through which forces move a bubble.
-    force_intensity : of these forces, over that of the model.
+    inertia : the low-pass that was used.
     """
 
     value_mm_s2: Array
     covariance: Array
     bandwidth_hz: Array
-    inertia_s: float
-    force_intensity: float
+    inertia: Inertia
 
     @property
     def sd_mm_s2(self) -> Array:

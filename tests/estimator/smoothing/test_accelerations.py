@@ -23,7 +23,7 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.estimator.smoothing.result import trajectories
 from telerig.estimator.smoothing.verdict.purposes import uses
-from telerig.factors.bubble_motion import BubbleModel, Zigzag
+from telerig.factors.bubble_motion import BubbleModel, Inertia, Zigzag
 from telerig.io.results.smoothing import TRAJECTORIES, Quantity
 
 Array = NDArray[np.float64]
@@ -93,7 +93,7 @@ def solved(problem: SmoothingProblem, model: ShakeModel) -> Solution:
 @pytest.mark.parametrize("inertia_s", [0.002, 0.02])
 def test_dense_algebra_gives_the_same(inertia_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The posterior from the covariance of all frames' states, without states in time."""
-    monkeypatch.setattr(module, "_learned", lambda *_: [1.0, inertia_s])
+    monkeypatch.setattr(module, "_learned", lambda *_: Inertia(inertia_s))
     frames, step = 40, 0.01
     problem, _ = drawn_bubbles(np.random.default_rng(5), inertia_s, frames, 1, step)
     found = solved(problem, model_of(inertia_s)).accelerations
@@ -135,13 +135,13 @@ def test_the_rigs_posterior_is_nearly_that_of_the_joint_graph(
     marks: int, far: float, wide: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Exact where marks tell the shake; with images alone standard deviations are a little wide."""
-    monkeypatch.setattr(module, "_learned", lambda *_: [1.0, 0.005])
+    monkeypatch.setattr(module, "_learned", lambda *_: Inertia(0.005))
     problem, _, _ = run(np.random.default_rng(3), seconds=0.6, marks=marks)
     solution = solve(problem, true_model(), PLAIN)
     found = accelerations_of(solution, drawn(solution, 64))
     assert found is not None
     whole = layout.bubble_layout
-    monkeypatch.setattr(layout, "bubble_layout", lambda m, c: whole(m, c, 0.005))
+    monkeypatch.setattr(layout, "bubble_layout", lambda m, c: whole(m, c, Inertia(0.005)))
     joint = solve(problem, true_model(), PLAIN)
     assert joint.covariances is not None
     rows = joint.graph.bubble.acceleration
@@ -160,8 +160,8 @@ def test_standard_deviations_are_true_where_the_low_pass_has_to_be_learned() -> 
         problem, truth = drawn_bubbles(rng, inertia_s, 200, 3, 0.005)
         found = solved(problem, model_of(None)).accelerations
         assert found is not None
-        assert 0.5 * inertia_s < found.inertia_s < 2 * inertia_s
-        assert 0.5 < found.force_intensity < 2
+        assert 0.5 * inertia_s < found.inertia.time_s < 2 * inertia_s
+        assert 0.4 < min(found.inertia.forces) <= max(found.inertia.forces) < 2.5
         assert ((found.bandwidth_hz > HZ) & (found.bandwidth_hz < 100)).all()
         squares.append(((found.value_mm_s2 - truth.reshape(-1, 3)) / found.sd_mm_s2) ** 2)
     assert 0.8 < np.mean(squares) < 1.25
@@ -171,7 +171,7 @@ def test_tables_and_uses_name_accelerations() -> None:
     problem, _ = drawn_bubbles(np.random.default_rng(1), 0.01, 60, 2, 0.005)
     solution = solved(problem, model_of(0.01))
     found = solution.accelerations
-    assert found is not None and found.inertia_s == 0.01
+    assert found is not None and found.inertia.time_s == 0.01
     names = [f"{kind}a{axis}_mm_s2" for kind in ("", "s") for axis in "xyz"]
     table = trajectories(solution, None, (1.0, 2.0, 1.0))
     assert list(table.columns[-6:]) == names

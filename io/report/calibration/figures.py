@@ -213,8 +213,8 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
     """What the folder has of these; a single camera has none."""
     found = []
     if results.uncertainty:
-        found.append(_map(results.uncertainty, "calibration_mm2", _CALIBRATION))
-        found.append(_map(results.uncertainty, "measurement_mm2", _MEASUREMENT))
+        maps = [_map(results.uncertainty, *what) for what in (_CALIBRATION, _MEASUREMENT)]
+        found += [picture for picture in maps if picture is not None]
     halves = results.file.diagnostics.halves
     if "points_mm" in halves:
         found.append(_halves(halves))
@@ -222,37 +222,60 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
 
 
 _CALIBRATION = (
+    "calibration_mm2",
     "Uncertainty: the calibration's share",
     "One standard deviation in µm (all three axes together) of a point's position in the rig "
     "frame, in the plane of the optical axes. Points of a run that lie near each other share this "
     "error: it cancels in their differences.",
 )
 _MEASUREMENT = (
+    "measurement_mm2",
     "Uncertainty: the pixels' share",
     "One standard deviation in µm of a point whose pixel noise is that of this calibration's "
     "dots ({sigma} px). It is independent from point to point and proportional to the noise.",
 )
 
 
-def _map(arrays: Mapping[str, Array], name: str, words: tuple[str, str]) -> Picture:
+def _plane(arrays: Mapping[str, Array], name: str) -> tuple[Array, Array, Array]:
+    """x and z (mm) of a grid in the plane of the optical axes, and standard deviations there."""
     points = arrays["points_mm"]
     sd_um = 1e3 * np.sqrt(np.trace(arrays[name], axis1=-2, axis2=-1))
     level = np.abs(points[:, 1])
     flat = level <= level.min() + 1e-6
     x, z = (np.unique(points[flat, i]) for i in (0, 2))
-    grid = sd_um[flat].reshape(len(x), len(z))
+    return x, z, sd_um[flat].reshape(len(x), len(z))
+
+
+def _is_flat(grid: Array) -> bool:
+    return bool(np.ptp(grid) <= 1e-3 * grid.max())
+
+
+def _map(arrays: Mapping[str, Array], name: str, title: str, caption: str) -> Picture | None:
+    """None where it is the same everywhere, which the page says in words (`same_everywhere`)."""
+    x, z, grid = _plane(arrays, name)
+    if _is_flat(grid):
+        return None
     limits: dict[str, Any] = {"xlim": (x[0], x[-1]), "ylim": (z[0], z[-1]), "aspect": "equal"}
     with drawing(3.6, xlabel="x / mm", ylabel="z / mm", **limits) as sheet:
-        if np.ptp(grid) > 1e-3 * grid.max():
-            filled = sheet.axes.contourf(x, z, grid.T, levels=_LEVELS, cmap="viridis")
-            sheet.figure.colorbar(filled, ax=sheet.axes, label="µm")
-        else:
-            everywhere = f"{number(grid.mean(), 3)} µm everywhere"
-            middle = {"ha": "center", "va": "center", "transform": sheet.axes.transAxes}
-            sheet.axes.text(0.5, 0.5, everywhere, **middle)
-    caption = words[1].format(sigma=number(float(arrays["sigma_px"]), 3))
+        filled = sheet.axes.contourf(x, z, grid.T, levels=_LEVELS, cmap="viridis")
+        sheet.figure.colorbar(filled, ax=sheet.axes, label="µm")
+    caption = caption.format(sigma=number(float(arrays["sigma_px"]), 3))
     caption += f" {number(grid.min(), 3)} to {number(grid.max(), 3)} µm."
-    return Picture(words[0], sheet.source, caption)
+    return Picture(title, sheet.source, caption)
+
+
+def same_everywhere(results: CalibrationResults) -> str:
+    """A sentence on the pixels' share where it has no picture; "" otherwise."""
+    arrays = results.uncertainty
+    grid = _plane(arrays, _MEASUREMENT[0])[2] if arrays else np.zeros(0)
+    if not grid.size or not _is_flat(grid):
+        return ""
+    sigma = number(float(arrays["sigma_px"]), 3)
+    return (
+        f"the pixels' share of a point's uncertainty is {number(float(grid.mean()), 3)} µm "
+        f"everywhere (1 sd, all axes together), for the noise of this calibration's dots ({sigma} "
+        "px)"
+    )
 
 
 def _halves(halves: Mapping[str, Any]) -> Picture:

@@ -14,6 +14,7 @@ from telerig.io.report.calibration.figures import (
     coverage,
     residual_field,
     residual_histogram,
+    same_everywhere,
     tilts,
     trust_pictures,
 )
@@ -74,6 +75,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
     halves, structure = results.file.diagnostics.halves, results.file.diagnostics.structure
     found = [str(halves["words"])] if "words" in halves else []
     found += [str(words) for words in structure.get("words") or []]
+    found.append(same_everywhere(results))
     return {
         "name": file.name or "calibration",
         "status": file.verdict.status,

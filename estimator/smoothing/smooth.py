@@ -17,7 +17,7 @@ from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
 from telerig.estimator.smoothing.graph.accelerations import accelerations_of
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
-from telerig.estimator.smoothing.graph.stage_travel import travel_of
+from telerig.estimator.smoothing.graph.stage_travel import carriage, travel_of
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
 from telerig.estimator.smoothing.learning.held_out import learning_record
 from telerig.estimator.smoothing.learning.learn import learn
@@ -187,16 +187,22 @@ def smooth(
         if change is not None:
             words = change_words(change, problem.cameras[0].name)
             summary["rig_change"] = {**change.as_dict(), "words": words}
+    described = rig or getattr(stage, "rig", None)
     with phases.phase("tables", "making the tables"):
         paths = trajectories(solution, None if tracked is None else tracked.table, inflation)
         offsets = shake_table(solution, inflation)
         bodies = None
         if tracked is not None:
             from telerig.estimator.physics.bodies import bodies_table
+            from telerig.estimator.physics.swarm import swarm_numbers
 
             bodies, deviations = bodies_table(tracks, problem.cameras, problem.up)
             summary["bodies"] = asdict(deviations)
-        fluid = getattr(rig or getattr(stage, "rig", None), "fluid", None)
+            if not getattr(described, "bubbles", None):  # else part of the images counts
+                summary["swarm"] = swarm_numbers(
+                    paths, bodies, carriage(solution)[0], problem.axis, problem.up, problem.cameras
+                )
+        fluid = getattr(described, "fluid", None)
         summary["fluid"] = {} if fluid is None else asdict(fluid)
     summary["learning"], summary["seconds"] = learned, phases.seconds
     return Smoothing(

@@ -9,7 +9,7 @@ import numpy as np
 from telerig.io.report import plot
 from telerig.io.report.page.figures import Curve, Picture, draw_curves, drawing
 from telerig.io.report.page.number_format import number, with_sd
-from telerig.io.report.page.page import Row
+from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.smoothing.results import SmoothingResults, column
 from telerig.io.report.run.tracking.results import median
 from telerig.io.report.run.tracking.scene import track_colour
@@ -32,8 +32,9 @@ def size_picture(results: SmoothingResults) -> Picture | None:
     d = d[np.isfinite(d)]
     sauter = float((d**3).sum() / (d**2).sum())
     caption = (
-        f"Every bubble once; blue by number, orange by volume. Mean {number(float(d.mean()), 3)} "
-        f"mm, Sauter mean {number(sauter, 3)} mm, {len(d)} bubbles."
+        "Every bubble once, also those that the border cuts; blue by number, orange by volume. "
+        f"Mean {number(float(d.mean()), 3)} mm, Sauter mean {number(sauter, 3)} mm, "
+        f"{len(d)} bubbles."
     )
     return Picture("Sizes of the bubbles", sheet.source, caption)
 
@@ -113,6 +114,26 @@ def _legend_below(sheet: Any) -> None:
                         fontsize=7.5)  # fmt: skip
 
 
+def swarm_figures(results: SmoothingResults) -> list[Figure]:
+    """Numbers per volume of liquid, corrected for bubbles that the border cuts."""
+    swarm = results.file.swarm
+
+    def value(name: str, factor: float = 1.0) -> str:
+        return with_sd(factor * swarm[name], factor * swarm[f"s_{name}"])
+
+    if "void_fraction" not in swarm:
+        return []
+    frames = number(results.file.frames)
+    where = f"{number(1e-3 * swarm['volume_mm3'], 3)} cm³, mean of {frames} frames"
+    return [
+        Figure("Void fraction", f"{value('void_fraction', 100)} %", f"gas per volume; {where}"),
+        Figure("Bubbles", f"{value('number_per_cm3')} per cm³", "number density"),
+        Figure("Sauter mean", f"{value('d32_mm')} mm",
+               f"volume over surface; mean diameter {value('d10_mm')} mm"),
+        Figure("Gas flux", f"{value('gas_flux_mm_s')} mm/s", "volume of gas upwards per area"),
+    ]  # fmt: skip
+
+
 HEADS = [
     "bubble", "frames", "d, mm", "aspect", "rise, mm/s", "zigzag, Hz", "zigzag, mm", "Re", "Eo",
     "drag",
@@ -148,6 +169,11 @@ def bubble_words(results: SmoothingResults) -> str:
     more = len(results.bubble_summary) - MOST_ROWS
     if more > 0:
         words += f" The {MOST_ROWS} longest of {len(results.bubble_summary)} tracks are listed."
+    if results.file.swarm:
+        words += (
+            " What is given per volume is corrected for bubbles that the border of an image cuts; "
+            "its standard deviation is that of a random number of independent bubbles."
+        )
     if not results.file.fluid:
         words += " " + _NO_LIQUID
     return words

@@ -19,7 +19,11 @@ from telerig.io.report.page.number_format import (
     with_sd,
 )
 from telerig.io.report.page.page import Figure, Row
-from telerig.io.report.run.smoothing.bubbles import bubble_words, summary_rows
+from telerig.io.report.run.smoothing.bubbles import (
+    bubble_words,
+    summary_rows,
+    swarm_figures,
+)
 from telerig.io.report.run.smoothing.results import (
     AXES,
     SPEED,
@@ -69,6 +73,7 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
         "means": mean_rows(results),
         "bubble_table": summary_rows(results),
         "bubble_words": bubble_words(results),
+        "swarm": swarm_figures(results),
         "model": model_rows(results),
         "model_words": model_words(results),
     }

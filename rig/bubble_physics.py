@@ -38,26 +38,26 @@ class Liquid:
         return lift * self.viscosity**4 / (self.density**2 * self.surface_tension**3)
 
     def reynolds(self, d: ArrayLike, speed: ArrayLike) -> Array:
-        """Reynolds number rho U d / mu."""
+        """Return the Reynolds number rho U d / mu."""
         return np.asarray(self.density * np.multiply(d, speed) / self.viscosity)
 
     def weber(self, d: ArrayLike, speed: ArrayLike) -> Array:
-        """Weber number rho U^2 d / sigma."""
+        """Return the Weber number rho U^2 d / sigma."""
         return np.asarray(self.density * np.multiply(d, np.square(speed)) / self.surface_tension)
 
     def eotvos(self, d: ArrayLike) -> Array:
-        """Eotvos number (rho - rho_gas) g d^2 / sigma."""
+        """Return the Eotvos number (rho - rho_gas) g d^2 / sigma."""
         lift = self.gravity * (self.density - self.gas_density)
         return np.asarray(lift * np.square(d) / self.surface_tension)
 
     def terminal_drag(self, d: ArrayLike, speed: ArrayLike) -> Array:
-        """Drag coefficient of a bubble that rises steadily and vertically: 4 g d / (3 U^2)."""
+        """Return the drag coefficient of a bubble that rises steadily: 4 g d / (3 U^2)."""
         lift = self.gravity * (1 - self.gas_density / self.density)
         return np.asarray(4 * lift * np.asarray(d) / (3 * np.square(speed)))
 
 
 def added_mass(aspect: ArrayLike) -> tuple[Array, Array]:
-    """Added-mass coefficients of a spheroid, along its pole and across it.
+    """Return the added-mass coefficients of a spheroid, along its pole and across it.
 
     They multiply the mass of the displaced liquid; 1/2 each for a sphere. Lamb, Hydrodynamics,
     sections 114 and 373: gamma / (2 - gamma) along the pole, where the integral gamma is
@@ -78,7 +78,7 @@ def drag_coefficient(
     mass_coefficient: ArrayLike,
     liquid: Liquid,
 ) -> Array:
-    """Drag coefficient (...) from the balance of forces along the slip velocity.
+    """Return the drag coefficient (...) from the balance of forces along the slip velocity.
 
     Buoyancy less weight and drag accelerate the bubble's own and its added mass; a lift force acts
     across the slip and does not enter. With s the slip and e its direction,
@@ -98,15 +98,18 @@ def drag_coefficient(
 
 
 def wellek_aspect(eotvos: ArrayLike) -> Array:
-    """Aspect ratio of contaminated bubbles and drops (Wellek, Agrawal, Skelland, AIChE J. 12:854,
-    1966)."""
+    """Return the aspect ratio of contaminated bubbles and drops.
+
+    It is from Wellek, Agrawal, Skelland, AIChE J. 12:854, 1966.
+    """
     return np.asarray(1 + 0.163 * np.asarray(eotvos, float) ** 0.757)
 
 
 def mendelson_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Rise velocity by the wave analogy (Mendelson, AIChE J. 13:250, 1967); for water above 1.3 mm.
+    """Return the rise velocity by the wave analogy, for water above 1.3 mm.
 
-    Smaller bubbles are slower: surface tension then keeps them round.
+    Smaller bubbles are slower: surface tension then keeps them round (Mendelson, AIChE J. 13:250,
+    1967).
     """
     d = np.asarray(d, float)
     wave = 2 * liquid.surface_tension / (liquid.density * d)
@@ -114,8 +117,10 @@ def mendelson_velocity(d: ArrayLike, liquid: Liquid) -> Array:
 
 
 def clift_clean_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Rise velocity in pure water above 1.3 mm (Clift, Grace, Weber, Bubbles, Drops and Particles,
-    1978, eq. 7-3)."""
+    """Return the rise velocity in pure water above 1.3 mm.
+
+    It is from Clift, Grace, Weber, Bubbles, Drops and Particles, 1978, eq. 7-3.
+    """
     d = np.asarray(d, float)
     wave = 2.14 * liquid.surface_tension / (liquid.density * d)
     return np.asarray(np.sqrt(wave + 0.505 * liquid.gravity * d))
@@ -125,10 +130,10 @@ _WATER_VISCOSITY_PA_S = 9e-4
 
 
 def clift_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Rise velocity of contaminated bubbles and drops (Clift, Grace, Weber, 1978, eqs 7-5 to 7-9).
+    """Return the rise velocity of contaminated bubbles and drops (Clift, Grace, Weber, 1978).
 
-    For Morton numbers below 1e-3 and Eotvos numbers below 40; NaN where its H is below 2, which
-    is where bubbles are round.
+    Eqs 7-5 to 7-9, for Morton numbers below 1e-3 and Eotvos numbers below 40; NaN where its H is
+    below 2, which is where bubbles are round.
     """
     d = np.asarray(d, float)
     ratio = (liquid.viscosity / _WATER_VISCOSITY_PA_S) ** -0.14
@@ -139,10 +144,10 @@ def clift_velocity(d: ArrayLike, liquid: Liquid) -> Array:
 
 
 def tomiyama_drag(reynolds: ArrayLike, eotvos: ArrayLike, contamination: str = "pure") -> Array:
-    """Drag coefficient of a bubble in a pure, slightly or fully contaminated liquid (Tomiyama,
-    Kataoka, Zun, Sakaguchi, JSME Int. J. B 41:472, 1998).
+    """Return the drag coefficient of a bubble in a pure, slightly or fully contaminated liquid.
 
-    contamination : "pure", "slight" or "full". Raises KeyError for another word.
+    It is from Tomiyama, Kataoka, Zun, Sakaguchi, JSME Int. J. B 41:472, 1998. contamination :
+    "pure", "slight" or "full". Raises KeyError for another word.
     """
     re, eo = np.asarray(reynolds, float), np.asarray(eotvos, float)
     factor, most = {"pure": (16, 48), "slight": (24, 72), "full": (24, np.inf)}[contamination]
@@ -151,7 +156,7 @@ def tomiyama_drag(reynolds: ArrayLike, eotvos: ArrayLike, contamination: str = "
 
 
 def tomiyama_velocity(d: ArrayLike, liquid: Liquid, contamination: str = "pure") -> Array:
-    """Rise velocity at which `tomiyama_drag` balances buoyancy."""
+    """Return the rise velocity at which `tomiyama_drag` balances buoyancy."""
     d = np.asarray(d, float)
 
     def excess(speed: Array) -> Array:
@@ -162,8 +167,10 @@ def tomiyama_velocity(d: ArrayLike, liquid: Liquid, contamination: str = "pure")
 
 
 def moore_aspect_weber(aspect: ArrayLike) -> Array:
-    """Weber number at which a clean bubble at high Reynolds number has this aspect ratio (Moore,
-    J. Fluid Mech. 23:749, 1965, eq. 2.1)."""
+    """Return the Weber number of a clean bubble of this aspect ratio at high Reynolds number.
+
+    It is from Moore, J. Fluid Mech. 23:749, 1965, eq. 2.1.
+    """
     x = np.asarray(aspect, float)
     root, angle = np.sqrt(x**2 - 1), np.arccos(1 / x)
     shape = (x**2 * angle - root) ** 2 / root**6
@@ -171,11 +178,10 @@ def moore_aspect_weber(aspect: ArrayLike) -> Array:
 
 
 def moore_drag(reynolds: ArrayLike, aspect: ArrayLike) -> Array:
-    """Drag coefficient of a clean oblate bubble at high Reynolds number (Moore, J. Fluid Mech.
-    23:749, 1965).
+    """Return the drag coefficient of a clean oblate bubble at high Reynolds number.
 
-    48 / Re G (1 + H / sqrt Re), where the polynomial for H is that of Loth (Int. J. Multiphase
-    Flow 34:523, 2008) through Moore's table.
+    It is 48 / Re G (1 + H / sqrt Re) (Moore, J. Fluid Mech. 23:749, 1965), where the polynomial for
+    H is that of Loth (Int. J. Multiphase Flow 34:523, 2008) through Moore's table.
     """
     x = np.maximum(np.asarray(aspect, float), 1 + 1e-4)
     root, angle = np.sqrt(x**2 - 1), np.arccos(1 / x)
@@ -186,7 +192,7 @@ def moore_drag(reynolds: ArrayLike, aspect: ArrayLike) -> Array:
 
 
 def moore_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Rise velocity of a clean bubble by `moore_drag` and `moore_aspect_weber`.
+    """Return the rise velocity of a clean bubble by `moore_drag` and `moore_aspect_weber`.
 
     NaN where the Reynolds number is below 50 or the aspect ratio above 2.2: Moore's theory does
     not hold there.
@@ -206,7 +212,7 @@ def moore_velocity(d: ArrayLike, liquid: Liquid) -> Array:
 
 
 def _terminal(excess: Callable[[Array], Array], d: Array) -> Array:
-    """Speeds at which drag over buoyancy, which increases with the speed, is 1: by bisection."""
+    """Return by bisection the speeds at which drag over buoyancy, which grows with them, is 1."""
     low, high = np.full(d.shape, np.log(1e-5)), np.full(d.shape, np.log(3.0))
     for _ in range(60):
         middle = (low + high) / 2

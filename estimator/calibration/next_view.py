@@ -266,7 +266,7 @@ def bases(axes: Array, facing: Array) -> tuple[Array, Array, Array]:
 
 
 def _normals(problem: Problem, state: State) -> tuple[Array, Array, Bools, Ints]:
-    """(T, 3) the plate's z in the rig, and `Candidates.facing`, ``sees`` and ``pair`` for it."""
+    """Return the plate's z in the rig (T, 3), and `Candidates.facing`, ``sees`` and ``pair``."""
     axes = optical_axes(state)
     seen = np.ones(len(axes)) if problem.target.two_sided else _sides_seen(problem, state)
     both = (1.0, -1.0) if problem.target.two_sided else (1.0,)
@@ -314,7 +314,7 @@ def _sides_seen(problem: Problem, state: State) -> Array:
 
 
 def _rotations(normal: Array, roll_rad: Array) -> Array:
-    """(K, 3, 3) with z the normal and, before the roll, x as near to the rig's x as can be."""
+    """Return (K, 3, 3) with z the normal and, before the roll, x as near to the rig's as can be."""
     start = np.where(np.abs(normal[:, :1]) < 0.95, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     x = start - normal * np.sum(start * normal, -1, keepdims=True)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
@@ -341,7 +341,7 @@ def predicted(
 
 
 def _plate_shift(problem: Problem, facing: Array) -> Array:
-    """(K, C) through the plate where the views so far say that this side is seen through it."""
+    """Return the shift (K, C) through the plate where views so far see this side through it."""
     shifts = problem.plate_shift[problem.plate_shift != 0]
     if not len(shifts):
         return np.zeros_like(facing)
@@ -460,7 +460,7 @@ class ViewGain:
         return self._um(np.sum(by_points * np.linalg.solve(both, by_points), axis=(-1, -2)))
 
     def _rows(self, poses: Candidates, dots: Ints) -> tuple[Array, Array]:
-        """Whitened derivatives of K views: (K, 2 C n, P + 3 n) by rig and dots, (K, 2 C n, 6)."""
+        """Return whitened derivatives of K views by rig and dots (K, 2 C n, P + 3 n) and pose."""
         count, problem, rig = len(self.problem.cameras), self.problem, len(self.root)
         stand_for = np.sqrt(len(problem.dot_ids) / len(dots))
         state, obs = predicted(problem, self.state, poses, dots, stand_for * self.whitener)
@@ -593,7 +593,7 @@ def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, 
 
 
 def _where(cells: Array) -> str:
-    """Empty parts that are filled, (columns, rows)."""
+    """Return words on the empty parts (columns, rows) that are filled."""
     near, far = slice(0, _CORNER_CELLS), slice(-_CORNER_CELLS, None)
     names = [
         f"{upper} {left}"

@@ -76,7 +76,7 @@ def _space_variance_um2(calibration: Calibration, points_mm: Array) -> float:
 def _with_priors(
     calibration: Calibration, cameras: Sequence[Camera], names: tuple[str, ...], matrix: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Names and covariance with each camera's window after its intrinsics."""
+    """Return the names and covariance with each camera's window after its intrinsics."""
     grown: list[str] = []
     added: dict[str, float] = {}
     at = 0

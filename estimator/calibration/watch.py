@@ -146,7 +146,7 @@ class WatchedFolder:
         return [self._found[p][1] for v in self.dataset.views for p in v.image_paths.values()]
 
     def complete(self) -> list[str]:
-        """Names of the views in which two cameras found the target, or the only one did."""
+        """Return names of the views in which two cameras found the target, or the only one did."""
         if self.dataset is None:
             return []
         good: dict[str, int] = {}
@@ -155,7 +155,7 @@ class WatchedFolder:
         return [name for name, count in good.items() if count >= _needed(self.dataset)]
 
     def version(self) -> frozenset[tuple[Path, Stamp]]:
-        """The images of complete views, as they are now."""
+        """Return the images of complete views, as they are now."""
         complete = set(self.complete())
         return frozenset((p, s) for p, (s, i) in self._found.items() if i.view in complete)
 
@@ -175,7 +175,7 @@ class WatchedFolder:
 
 
 def _needed(dataset: Dataset) -> int:
-    """Cameras that must see a view for it to be complete."""
+    """Return how many cameras must see a view for it to be complete."""
     return min(2, len(dataset.rig.cameras))
 
 
@@ -264,7 +264,7 @@ def _views(count: int) -> str:
 
 
 def _generic(dataset: Dataset, count: int) -> str:
-    """What to do first, before a calibration can say more."""
+    """Return what to do first, before a calibration can say more."""
     names = list(dataset.rig.cameras)
     if len(names) < 2:
         return "tilt the target by 20 to 50 degrees, about another axis than before"
@@ -283,7 +283,7 @@ def _generic(dataset: Dataset, count: int) -> str:
 def standing(
     calibration: Calibration, dataset: Dataset, count: int, until_um: float | None
 ) -> tuple[str, bool]:
-    """One line on a calibration in the making, and whether it is enough."""
+    """Return one line on a calibration in the making, and whether it is enough."""
     advice = calibration.diagnostics.get("next_view") or {}
     status = str(calibration.verdict["status"])
     words = _views(count) + (f", {status}" if status != "GOOD" else "")

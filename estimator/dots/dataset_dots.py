@@ -157,7 +157,7 @@ def dot_example(
 
 
 def _with_levels(patch: Array, covered: Array, du: Array, dv: Array) -> Array:
-    """Least-squares grey levels and gradients, background and contrast, at a known coverage."""
+    """Return the patch of best-fitting grey levels and gradients for a known coverage."""
     one = np.ones_like(du)
     terms = [one, du, dv, covered, covered * du, covered * dv]
     design = np.stack([t.ravel() for t in terms], -1)

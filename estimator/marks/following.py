@@ -38,7 +38,7 @@ class TankView:
 
     @staticmethod
     def of(camera: Camera, axis_rig: Array) -> TankView:
-        """Raises GeometryError for a camera that looks along the travel."""
+        """Return the view of a camera. Raises GeometryError for one that looks along the travel."""
         width, height = camera.image_size_px
         origin, ray = camera.unproject(np.array([(width - 1) / 2, (height - 1) / 2]))
         along = axis_rig - ray * (axis_rig @ ray)
@@ -82,7 +82,7 @@ class TankView:
     def in_image(
         self, lab_mm: Array, position_mm: float, margin_px: float = 0.0
     ) -> tuple[list[int], Array]:
-        """Which of (n, 2) lab places lie in the image or a margin outside it, and their pixels."""
+        """Return which of (n, 2) lab places are in the image or a margin round it, and pixels."""
         width, height = self.camera.image_size_px
         offset = lab_mm - self.basis @ self.axis_rig * position_mm
         reach = 0.6 * np.hypot(width, height) / self.px_per_mm
@@ -203,8 +203,10 @@ class Follower:
         ]
 
     def brief(self, kept: list[Mark]) -> list[Mark]:
-        """Dots in line with the kept marks that were seen too rarely to be kept, but never missed,
-        such as those at a run's ends."""
+        """Return dots in line with the kept marks, never missed but seen too rarely to be kept.
+
+        Such are those at a run's ends.
+        """
         if not kept:
             return []
         across = np.array([m.place_mm[1] for m in kept])
@@ -386,7 +388,7 @@ class StripInImages:
     def of(
         follower: Follower, look: DotLook, kept: list[Mark], position_mm: Array
     ) -> StripInImages:
-        """kept : at least one mark."""
+        """Return the strip of the kept marks, of which there must be at least one."""
         marks = [*kept, *follower.brief(kept)]
         across = [float(m.place_mm[1]) for m in kept]
         shift, starts = follower.shift_mm.copy(), [*follower.epoch_starts, len(position_mm)]
@@ -408,15 +410,17 @@ class StripInImages:
         )
 
     def centres_px(self, frame: int) -> Array:
-        """(n, 2) of the dots that reach into a frame."""
+        """Return the centres (n, 2) of the dots that reach into a frame."""
         epoch = int(np.searchsorted(self.epoch_starts, frame, side="right")) - 1
         places = self.places_mm[self.epochs == epoch] + self.shift_mm[frame]
         margin = self.look.a_px + 3 * self.look.blur_px
         return self.view.in_image(places, float(self.position_mm[frame]), margin)[1]
 
     def erased(self, image: NDArray[Any], frame: int) -> NDArray[Any]:
-        """A copy with the screen's level in place of the dots. Dots that something dark touches
-        stay."""
+        """Return a copy with the screen's level in place of the dots.
+
+        Dots that something dark touches stay.
+        """
         centres = self.centres_px(frame)
         if not len(centres):
             return image

@@ -98,7 +98,7 @@ def learn_look(
 
 
 def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
-    """The whole dots of one frame that look like the strip's."""
+    """Return the whole dots of one frame that look like the strip's."""
     parts = [np.zeros((0, len(_COLUMNS)))]
     for window in look.windows:
         found = _round_dots(image[window], look.polarity, look.diameter_px)
@@ -142,7 +142,7 @@ def _is_free(image: NDArray[Any], dot: Array, look: DotLook) -> bool:
 
 
 def _round_dots(image: NDArray[Any], polarity: Polarity, diameter_px: float) -> Array:
-    """(n, 11) _COLUMNS of the dots of about the right size."""
+    """Return (n, 11) _COLUMNS of the dots of about the right size."""
     low, high = (share * diameter_px for share in _FIRST_SIZE)
     if min(image.shape) < 8:
         return np.zeros((0, len(_COLUMNS)))
@@ -159,7 +159,7 @@ def _round_dots(image: NDArray[Any], polarity: Polarity, diameter_px: float) -> 
 
 
 def _bands(seen: Array, across: Array, diameter_px: float) -> list[Ints]:
-    """Rows of ``seen`` by strip: dots at one distance from the line of travel in several images."""
+    """Return rows of ``seen`` by strip: dots at one distance from the line of travel."""
     if not len(seen):
         return []
     place = seen[:, 1:3] @ across
@@ -189,7 +189,7 @@ def _window(place: Array, across: Array, diameter_px: float, shape: Sequence[int
 
 
 def _single(dots: Array, diameter_px: float) -> Array:
-    """The dots without those that are found twice because windows overlap."""
+    """Return the dots without those that are found twice because windows overlap."""
     kept: list[Array] = []
     for dot in dots:
         if all(np.hypot(*(dot[:2] - other[:2])) > diameter_px / 2 for other in kept):

@@ -54,7 +54,7 @@ class Grid:
         return np.concatenate([rising, rising[-2::-1]])
 
     def noise_gain(self, step_s: float) -> float:
-        """The sd of h'' * x per sd of x, in 1/s^2, for x with independent errors every step_s."""
+        """Return the sd of h'' * x per sd of x, in 1/s^2, for independent errors every step_s."""
         second = np.zeros(4 * self.knots - 1)
         for shift, factor in ((0, 1.0), (self.knots, -2.0), (2 * self.knots, 1.0)):
             second[shift : shift + 2 * self.knots - 1] += factor * self.triangle

@@ -346,7 +346,7 @@ class _Decoder:
         self._last = -(1 << 62)
 
     def frame(self, time: int) -> Any:
-        """The frame with this time stamp; None when the decoder never gives it."""
+        """Return the frame with this time stamp; None when the decoder never gives it."""
         if not self._last < time <= self._reach(time):
             self._container.seek(time, stream=self._stream, backward=True)
             self._frames = self._container.decode(self._stream)
@@ -358,13 +358,13 @@ class _Decoder:
         return None
 
     def _reach(self, time: int) -> int:
-        """How far ahead decoding on is no slower than a jump to the key frame before."""
+        """Return how far ahead decoding on is no slower than a jump to the key frame before."""
         step = 8 * max(1, round(1 / float(self._stream.average_rate * self._stream.time_base)))
         return time if self._last == -(1 << 62) else self._last + step
 
 
 def _frame_times(container: Any, path: Path) -> tuple[Ints, bool]:
-    """(N,) presentation times in order, from the packets alone; whether the file breaks off."""
+    """Return presentation times (N,) in order from the packets, and whether the file breaks off."""
     times: list[int] = []
     cut = False
     try:

@@ -32,7 +32,7 @@ def cell_coverage(polygon: Array, size: tuple[int, int]) -> Array:
 
 
 def _pieces(polygon: Array) -> tuple[Array, Array]:
-    """Ends (M, 2), (M, 2) of the edges cut at every whole x and y."""
+    """Return the ends (M, 2), (M, 2) of the edges cut at every whole x and y."""
     first = polygon
     step = np.roll(polygon, -1, 0) - first
     edges, cuts = [np.arange(len(first))], [np.zeros(len(first))]
@@ -52,7 +52,7 @@ def _pieces(polygon: Array) -> tuple[Array, Array]:
 
 
 def _crossings(start: Array, step: Array) -> tuple[Ints, Array]:
-    """Which edges cross a whole number, and at which share of their length."""
+    """Return which edges cross a whole number, and at which share of their length."""
     low = np.ceil(np.minimum(start, start + step)).astype(np.int64)
     high = np.floor(np.maximum(start, start + step)).astype(np.int64)
     count = np.where(step == 0, 0, np.maximum(high - low + 1, 0))

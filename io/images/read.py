@@ -78,7 +78,7 @@ def natural(name: str) -> tuple[Any, ...]:
 
 
 def _decoder(data: bytes, file: Path) -> Callable[[bytes, Path], NDArray[Any]]:
-    """By the first bytes, not by the extension."""
+    """Return the decoder for the file's first bytes, whatever its extension says."""
     if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _tiff
     for magic, decode in ((b"\x89PNG\r\n\x1a\n", _png), (b"BM", _bmp), (b"\xff\xd8", _jpeg)):
@@ -136,7 +136,7 @@ def _header(data: bytes, kind: str, file: Path) -> Any:
 
 
 def _png(data: bytes, file: Path) -> NDArray[Any]:
-    """Pillow compares the checksums of all chunks, which OpenCV does not."""
+    """Decode a PNG file by Pillow, which compares the checksums of all chunks; OpenCV does not."""
     with decoding(file):
         _header(data, "PNG", file).verify()
     return _opencv(data, file)
@@ -161,7 +161,7 @@ def _jpeg(data: bytes, file: Path) -> NDArray[Any]:
 
 
 def _tiff(data: bytes, file: Path) -> NDArray[Any]:
-    """What tifffile needs imagecodecs for (LZW, 12 packed bits), OpenCV reads as well."""
+    """Decode a TIFF file; OpenCV where tifffile needs imagecodecs (LZW, 12 packed bits)."""
     try:
         with decoding(file), tiff_reader().TiffFile(file) as tiff:
             if len(tiff.pages) == 0:
@@ -234,7 +234,7 @@ def _grey(pixels: NDArray[Any], file: Path) -> NDArray[Any]:
 
 
 def _native(pixels: NDArray[Any], file: Path) -> Image:
-    """uint8, uint16 or float32, contiguous; wider integers are narrowed when nothing is lost."""
+    """Return uint8, uint16 or float32, contiguous; wider integers only if nothing is lost."""
     if pixels.size == 0:
         raise damaged(file, "it has no pixels")
     if pixels.dtype in (np.uint8, np.uint16):

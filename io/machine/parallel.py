@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 
 
 def cores() -> int:
-    """Cores that this process may use: TELERIG_CORES, else all that the system lets it have."""
+    """Return how many cores this process may use: TELERIG_CORES, or all that the system allows."""
     asked = os.environ.get("TELERIG_CORES", "")
     if asked.isdecimal() and int(asked) > 0:
         return int(asked)
@@ -33,7 +33,7 @@ def cores() -> int:
 
 
 def can_fork() -> bool:
-    """Copies of this process start at once, but are safe only while it has a single thread."""
+    """Return whether copies of this process start at once; safe only with a single thread."""
     return sys.platform == "linux" and threading.active_count() == 1
 
 
@@ -64,7 +64,7 @@ def ordered_map(
 
 
 def quick_workers(tasks: int) -> int:
-    """How many processes pay for short work: one per core where they start at once, else 1."""
+    """Return how many processes pay for short work: one per core where they start at once."""
     return min(cores(), tasks) if can_fork() else 1
 
 
@@ -76,7 +76,7 @@ class Assistant:
         self._last: Answer | None = None
 
     def __call__(self, function: Callable[..., Result], *arguments: Any) -> Result:
-        """What a module's function returns; what it raises is raised here."""
+        """Return what a module's function returns, and raise what it raises."""
         return self.begin(function, *arguments)()
 
     def begin(self, function: Callable[..., Result], *arguments: Any) -> Callable[[], Result]:
@@ -149,7 +149,7 @@ def assistant(prepare: Callable[[], object]) -> Iterator[Assistant]:
 
 
 def _assist(other_end: Connection, end: Connection, prepare: Callable[[], object]) -> None:
-    """Until the other end is closed: then ``recv`` ends this copy by EOFError."""
+    """Answer until the other end is closed; then ``recv`` ends this copy by EOFError."""
     other_end.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # an exit within an import would be a traceback
@@ -217,8 +217,10 @@ def _forked(workers: int) -> Pool:
 
 @contextmanager
 def _copying() -> Iterator[None]:
-    """No warning of numerical libraries' own idle threads, which restart in the copy; and the
-    copy's garbage collector leaves alone what is here, whose memory it would copy by looking."""
+    """Silence the warning of numerical libraries' own idle threads, which restart in the copy.
+
+    The copy's garbage collector leaves alone what is here, whose memory it would copy by looking.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         gc.freeze()
@@ -229,7 +231,7 @@ def _copying() -> Iterator[None]:
 
 
 def _begin_work() -> None:
-    """An interrupt is this process's parent's to handle, which then ends it by SIGTERM.
+    """Leave an interrupt to this process's parent, which then ends it by SIGTERM.
 
     A handler of that signal that the parent has would keep the copy alive, and the parent waiting.
     """

@@ -183,7 +183,7 @@ def lower_line(x: Array, y: Array, at: float | None = None) -> tuple[float, floa
 
 
 def _lower_hull(x: Array, y: Array) -> list[int]:
-    """Indices of the lower convex hull, x increasing (Andrew's algorithm)."""
+    """Return the indices of the lower convex hull, x increasing (Andrew's algorithm)."""
     hull: list[int] = []
     for k in range(len(x)):
         while len(hull) > 1:
@@ -196,7 +196,7 @@ def _lower_hull(x: Array, y: Array) -> list[int]:
 
 
 def _plausible(host_s: Array, device_s: Array, wrap_s: float) -> Ints:
-    """Indices of the readings whose stamps are consistent with those of their neighbours."""
+    """Return indices of the readings whose stamps are consistent with those of their neighbours."""
     kept: Ints = np.arange(len(host_s))
     while kept.size:
         u = unwrap(host_s[kept], device_s[kept], wrap_s)
@@ -211,7 +211,7 @@ def _plausible(host_s: Array, device_s: Array, wrap_s: float) -> Ints:
 
 
 def _breaks(host_s: Array, u: Array) -> Bools:
-    """(N,) where a count begins: its stamp follows neither the one before nor the host time."""
+    """Return (N,) where a count begins: the stamp follows neither the last nor the host time."""
     step = np.diff(u)
     apart = np.abs(step - np.diff(host_s)) > RESTART_S
     follows = (step > 0) & (step < RESTART_S)
@@ -219,7 +219,7 @@ def _breaks(host_s: Array, u: Array) -> Bools:
 
 
 def _in_order(u: Array, part: Ints) -> Bools:
-    """False for a stamp that jumps ahead of its successor, falls back, or repeats."""
+    """Return (N,) False for a stamp that jumps ahead of its successor, falls back, or repeats."""
     good = np.ones(len(u), bool)
     if len(u) < 2:
         return good
@@ -288,7 +288,7 @@ def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) ->
 
 
 def _lower_line_of_many(x: Array, late: Array) -> tuple[float, float]:
-    """`lower_line` at x = 0, computed from the few points that can touch it."""
+    """Return `lower_line` at x = 0, computed from the few points that can touch it."""
     edge, least = _least_delays(x, late, parts=4 * _WINDOWS)
     _, slope = lower_line(x[edge], least)
     height = late - slope * x
@@ -334,7 +334,7 @@ def _highest_curve_below(x_s: Array, least_s: Array, knots: Array) -> Array:
 
 
 def _sd_slope(x: Array, late: Array) -> float:
-    """Jackknife over `_BLOCKS` parts of the record, of the line below their least delays."""
+    """Return the slope's sd by a jackknife over `_BLOCKS` parts of the line below the delays."""
     edge, least = _least_delays(x, late)
     block = np.arange(len(edge)) * _BLOCKS // len(edge)
     kept = [block != k for k in range(_BLOCKS)]
@@ -347,7 +347,7 @@ def _parts(count: int) -> int:
 
 
 def _least_delays(x: Array, late: Array, parts: int | None = None) -> tuple[Ints, Array]:
-    """Index and value of the least ``late`` in each of the parts of the record."""
+    """Return the index and value of the least ``late`` in each of the parts of the record."""
     bounds = np.array_split(np.arange(len(x)), min(parts or _parts(len(x)), len(x)))
     edge = np.array([p[0] + int(np.argmin(late[p])) for p in bounds if p.size])
     return edge, late[edge]

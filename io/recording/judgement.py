@@ -159,7 +159,7 @@ def _predicted(t_s: Array, value: Array, distances: Sequence[int]) -> Array:
 
 
 def _scale(size: Array) -> Array:
-    """(N,) a high quantile of the sizes in the block of each and the two beside it."""
+    """Return (N,) a high quantile of the sizes in the block of each and the two beside it."""
     count = -(-len(size) // _BLOCK)
     blocks = np.pad(size, (0, count * _BLOCK - len(size)), mode="reflect").reshape(count, _BLOCK)
     place = int(_QUANTILE * _BLOCK)
@@ -170,7 +170,7 @@ def _scale(size: Array) -> Array:
 
 
 def _few_in_a_row(far: Bools) -> Bools:
-    """Without the far readings that stand `_MOTION` or more in a row."""
+    """Return the far readings without those that stand `_MOTION` or more in a row."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(np.int8), [0]])))
     out = far.copy()
     for begin, end in edges.reshape(-1, 2).tolist():
@@ -180,7 +180,7 @@ def _few_in_a_row(far: Bools) -> Bools:
 
 
 def _off_quartic(t_s: Array, value: Array, plain: Bools, i: int) -> tuple[float, float]:
-    """Value i minus that of a quartic through its plain neighbours; their largest residual."""
+    """Return value i minus a quartic through its plain neighbours, and their largest residual."""
     window = np.arange(max(i - 2 * _NEIGHBOURS, 0), min(i + 2 * _NEIGHBOURS + 1, len(t_s)))
     near = window[plain[window] & (window != i)]
     near = near[np.argsort(np.abs(t_s[near] - t_s[i]), kind="stable")[: 2 * _NEIGHBOURS]]

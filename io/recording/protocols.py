@@ -79,28 +79,28 @@ class Parser(Interface):
     """Keeps an incomplete reading until the rest of it arrives."""
 
     def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
-        """The readings whose last byte is in these (arrival_ns, bytes)."""
+        """Return the readings whose last byte is in these (arrival_ns, bytes)."""
 
     def cut(self) -> int:
         """Drop the incomplete reading, as at the start of a connection; number of bytes dropped."""
 
 
 def parser(device: DeviceDescription) -> Parser:
-    """The parser of a device, at the start of a connection."""
+    """Return the parser of a device, at the start of a connection."""
     if device.protocol == "packets":
         return PacketParser(PACKETS[device.kind])
     return LineParser(device)
 
 
 def poll_command(device: DeviceDescription) -> bytes | None:
-    """The bytes that poll the device for one reading; None for a stream."""
+    """Return the bytes that poll the device for one reading; None for a stream."""
     known = {"zaber": b"/1 get pos\n", "grbl": b"?"}
     own = device.poll.encode() if device.poll else None
     return known.get(device.protocol, own)
 
 
 def line_pattern(device: DeviceDescription) -> str:
-    """The regular expression of a known protocol, which a whole line without its end matches."""
+    """Return the regular expression of a known protocol's whole lines without their ends."""
     if device.protocol == "zaber":
         return _ZABER
     if device.protocol == "grbl":
@@ -110,7 +110,7 @@ def line_pattern(device: DeviceDescription) -> str:
 
 
 def xor_checksum(line: bytes) -> bytes:
-    """`*hh`, the exclusive or of all bytes of a line in hexadecimal (NMEA 0183)."""
+    """Return `*hh`, the exclusive or of all bytes of a line in hexadecimal (NMEA 0183)."""
     total = 0
     for byte in line:
         total ^= byte
@@ -126,7 +126,7 @@ class _Joined:
         self._begun = False
 
     def _join(self, chunks: Sequence[tuple[int, bytes]]) -> tuple[bytes, Ints, Ints]:
-        """The bytes to parse; where each piece ends in them, and when it arrived (ns)."""
+        """Return the bytes to parse, where each piece ends in them, and when it arrived (ns)."""
         data = self._tail + b"".join(piece for _, piece in chunks)
         ends = np.cumsum([len(self._tail), *(len(piece) for _, piece in chunks)])[1:]
         return data, ends, np.array([stamp for stamp, _ in chunks], np.int64)
@@ -208,7 +208,7 @@ def _cells(
 
 
 def _numbers(cells: Sequence[bytes | None]) -> Array:
-    """(N,) numbers; NaN for an empty group, and for text that a user's own expression matches."""
+    """Return (N,) numbers; NaN for an empty group, and for text in a user's expression."""
     try:
         return np.array(list(map(float, cells)))  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -254,7 +254,7 @@ class PacketParser(_Joined):
         )
 
     def _packets(self, data: bytes) -> Ints:
-        """Where valid packets start; of overlapping ones the first."""
+        """Return where valid packets start; of overlapping ones the first."""
         size, raw = self._type.itemsize, np.frombuffer(data, np.uint8)
         if len(raw) < size:
             return np.zeros(0, np.int64)
@@ -272,7 +272,7 @@ class PacketParser(_Joined):
 
 
 def _between(starts: Ints, size: int, done: int) -> Ints:
-    """(gaps, 2) begin and length of the bytes before ``done`` that belong to no packet."""
+    """Return (gaps, 2) begin and length of the bytes before ``done`` that belong to no packet."""
     begin, end = np.append(0, starts + size), np.append(starts, done)
     return np.column_stack([begin, end - begin])[end > begin].astype(np.int64)
 

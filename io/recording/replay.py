@@ -182,7 +182,7 @@ def _place(device: DeviceDescription) -> str:
 
 
 def _record(line: _Line, start_ns: int) -> DeviceRecord:
-    """The record of one device, whatever is wrong with it."""
+    """Return the record of one device, whatever is wrong with it."""
     if line.error is not None:
         return _without_readings(line, line.error)
     line.cut()
@@ -229,7 +229,7 @@ class _Timed:
 
 
 def _times(line: _Line, arrived_s: Array, t: Array | None, slot: Ints, start_ns: int) -> _Timed:
-    """Times of a device's readings from its stamps ``t``, its polls, or the arrivals."""
+    """Return the times of a device's readings from its stamps ``t``, its polls, or the arrivals."""
     device = line.device
     if t is not None:
         wrap_s = 2.0**device.time_bits * device.time_unit_s if device.time_bits else 0.0
@@ -247,7 +247,7 @@ def _times(line: _Line, arrived_s: Array, t: Array | None, slot: Ints, start_ns:
 
 
 def _arrival_times(line: _Line, arrived_s: Array, _: Array | None, slot: Ints, __: int) -> _Timed:
-    """Times of a device's readings from their arrivals alone."""
+    """Return the times of a device's readings from their arrivals alone."""
     spread = spread_arrivals(arrived_s, slot)
     how = REGULAR_CLOCK if spread.regular else "arrival, spread evenly"
     return _Timed(spread.t_s - line.device.latency_s, how, sd_s=spread.sd_s)
@@ -316,7 +316,7 @@ def _judged(line: _Line, start_ns: int, times: Callable[..., _Timed]) -> DeviceR
 def _refused(
     found: Readings, reason: NDArray[np.object_], t_s: Array, arrived: Array, malformed: Array
 ) -> Refused:
-    """The refused readings and the malformed lines, in the order of their bytes."""
+    """Return the refused readings and the malformed lines, in the order of their bytes."""
     out = np.flatnonzero(reason != None)  # noqa: E711
     spans = np.concatenate([found.spans[out], found.malformed_spans])
     order = np.argsort(spans[:, 0], kind="stable")
@@ -333,7 +333,7 @@ def _seconds(time_ns: NDArray[np.generic], start_ns: int) -> Array:
 
 
 def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
-    """(N,) mid-time of question and answer, NaN where they cannot be paired; median half width."""
+    """Return mid-times (N,) of question and answer, NaN for unpaired ones; median half width."""
     asked = np.searchsorted(sent, arrived, "right") - 1
     answers = np.bincount(np.maximum(asked, 0), minlength=len(sent))
     clear = (asked >= 0) & (answers[asked] == 1) & ((asked < 1) | (answers[asked - 1] > 0))

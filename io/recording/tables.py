@@ -140,7 +140,7 @@ def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
 
 
 def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
-    """Rows of an existing table whose sensors are not in this recording."""
+    """Return the rows of an existing table whose sensors are not in this recording."""
     if not file.is_file():
         return
     with file.open(encoding="utf-8") as stream:
@@ -161,7 +161,7 @@ def _frames(frames: FrameTimes) -> Iterator[str]:
 
 
 def _refused(records: Sequence[DeviceRecord]) -> Iterator[str]:
-    """The lines that are in no table; bytes that are no text are written as in Python, \\x00."""
+    """Return the lines that are in no table; other bytes than text are written as \\x00."""
     yield "device,t_s,arrived_s,reason,line\n"
     for record in records:
         name, refused = record.device.name, record.refused
@@ -176,7 +176,7 @@ _TABLES = {"encoder": "stage.csv", "accelerometer": "accelerometer.csv", "frames
 
 
 def position_mm(record: DeviceRecord) -> Array:
-    """(N,) the encoder's readings in mm."""
+    """Return the encoder's readings (N,) in mm."""
     if "position_mm" in record.values:
         return record.values["position_mm"]
     return record.values["counts"] / (record.device.counts_per_mm or 1.0)
@@ -230,7 +230,7 @@ def _device_summary(record: DeviceRecord, error: InputError | None) -> dict[str,
 
 
 def gaps_of(record: DeviceRecord) -> Iterator[dict[str, Any]]:
-    """Where readings are missing: from_s, to_s, the number lost, and the reason."""
+    """Return where readings are missing: from_s, to_s, the number lost, and the reason."""
     step = np.diff(record.t_s)
     if record.device.kind == "frames" or step.size < 8:
         return
@@ -324,7 +324,7 @@ def frame_numbers(t_s: Array, counter: Array | None) -> Ints:
 
 
 def _aligned(records: list[DeviceRecord]) -> list[Ints]:
-    """Frame numbers of several lines, shifted so that equal numbers are equal times."""
+    """Return the frame numbers of several lines, shifted so that equal numbers are equal times."""
     numbers = [frame_numbers(r.t_s, r.values.get("frame")) for r in records]
     first, base = records[0], numbers[0]
     if len(records) == 1:

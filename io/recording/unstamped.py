@@ -55,7 +55,7 @@ def spread_arrivals(arrived_s: Array, slot: Ints) -> Spread:
 
 
 def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
-    """The times of a device that samples regularly; None where the arrivals do not say so."""
+    """Return times of a device that samples regularly; None where arrivals do not show that."""
     if len(slot) < _FEWEST or np.ptp(arrived_s) < _SHORTEST_S:
         return None
     period_s = _period_s(arrived_s, slot)
@@ -76,7 +76,7 @@ def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
 
 
 def _period_s(arrived_s: Array, slot: Ints) -> float:
-    """Time from one line to the next, from the least delays in parts of the record."""
+    """Return the time from one line to the next, from the least delays in parts of the record."""
     lag = max(len(slot) // 3, 1)
     rate = (arrived_s[lag:] - arrived_s[:-lag]) / (slot[lag:] - slot[:-lag])
     period_s = float(np.median(rate))
@@ -146,14 +146,14 @@ def _begins(arrived_s: Array, slot: Ints, period_s: float) -> Ints:
 
 
 def _usual_wait_s(arrived_s: Array) -> float:
-    """Longest wait that is usual, from the time between arrivals during most of the record."""
+    """Return the longest usual wait, from the time between arrivals during most of the record."""
     silence = np.sort(np.diff(arrived_s))
     half = silence[np.searchsorted(np.cumsum(silence), silence.sum() / 2)]
     return float(np.clip(1.5 * half, ADAPTER_S, _LONGEST_WAIT_S))
 
 
 def _evenly(arrived_s: Array) -> Spread:
-    """Readings of one arrival spread over the time since the arrival before.
+    """Return the readings of one arrival spread over the time since the arrival before.
 
     They are spread over at most 16 ms, or as long as so many readings take on average.
     """
@@ -169,6 +169,6 @@ def _evenly(arrived_s: Array) -> Spread:
 
 
 def _increasing(t_s: Array) -> Array:
-    """The times, each at least a microsecond after the one before."""
+    """Return the times, each at least a microsecond after the one before."""
     ramp = 1e-6 * np.arange(len(t_s))
     return np.asarray(np.maximum.accumulate(t_s - ramp) + ramp)

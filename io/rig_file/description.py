@@ -282,7 +282,7 @@ class RigDescription:
         return {name: wall.wall() for name, wall in self.walls.items()}
 
     def camera_name(self, camera: str | int) -> str:
-        """The camera's name from its name or its index. Raises InputError for an unknown one."""
+        """Return the camera's name from name or index. Raises InputError for an unknown one."""
         return camera_named(camera, list(self.cameras), where="rig.toml")
 
 

@@ -83,7 +83,7 @@ _PROTOCOLS = {
 
 
 def devices_from_tables(raw: Any, cameras: list[str], problems: Problems) -> Devices:
-    """The devices by name; what is wrong with them is added to ``problems``.
+    """Return the devices by name; what is wrong with them is added to ``problems``.
 
     raw : the whole file.
     """
@@ -134,7 +134,7 @@ def _groups(pattern: str | None) -> set[str]:
 
 
 def pattern_problems(place: str, kind: str, pattern: str | None) -> Iterator[Problem]:
-    """What is wrong with the regular expression of a device of this kind."""
+    """Return what is wrong with the regular expression of a device of this kind."""
     needed = _VALUES[kind]
     words = " or ".join(", ".join(f"(?P<{g}>...)" for g in sorted(group)) for group in needed)
     if pattern is None:

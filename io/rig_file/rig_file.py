@@ -108,7 +108,7 @@ def description_from_toml(text: str, *, where: str, name: str = "rig") -> RigDes
 
 
 def _check_schema(raw: dict[str, Any], where: str) -> None:
-    """A file of another schema is refused before its keys are looked at."""
+    """Refuse a file of another schema before its keys are looked at."""
     schema, place = raw.get("schema"), f"{where} schema"
     if schema is None:
         raise InputError("is missing", where=place, todo=f"begin the file with schema = {SCHEMA}")
@@ -184,7 +184,7 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
 
 
 def _cameras(raw: dict[str, Any], problems: Problems) -> dict[str, CameraDescription | None]:
-    """Every camera named in the file, in its order; None where its table is faulty."""
+    """Return every camera named in the file, in its order; None where its table is faulty."""
     tables = subtables(raw, "cameras", problems)
     _check_camera_names(list(tables), problems)
     cameras: dict[str, CameraDescription | None] = {}
@@ -226,7 +226,7 @@ def _target(raw: dict[str, Any], problems: Problems) -> Target | None:
 
 
 def _rotvecs_deg(raw: dict[str, Any], names: list[str], problems: Problems) -> dict[str, Vector]:
-    """The nominal rotation of every camera but the first, of those that the file gives."""
+    """Return the nominal rotation of every camera but the first, of those that the file gives."""
     if "stereo" not in raw or not names:
         return {}
     if len(names) == 1:
@@ -247,7 +247,7 @@ def _rotvecs_deg(raw: dict[str, Any], names: list[str], problems: Problems) -> d
 
 
 def _tracking(raw: dict[str, Any], names: list[str], problems: Problems) -> tuple[str, str] | None:
-    """The two cameras of `[tracking]`, in the order of the rig."""
+    """Return the two cameras of `[tracking]`, in the order of the rig."""
     if "tracking" not in raw or not names:
         return None
     if len(names) == 1:
@@ -330,7 +330,7 @@ def _fluid(raw: dict[str, Any], problems: Problems) -> FluidDescription | None:
 def _bubbles(
     raw: dict[str, Any], names: list[str], problems: Problems
 ) -> dict[str, FieldDescription]:
-    """`[bubbles]` holds for every camera, `[bubbles.<camera>]` for one."""
+    """Return each camera's field; `[bubbles]` is for all, `[bubbles.<camera>]` for one of them."""
     content = raw.get("bubbles", {})
     if not isinstance(content, dict):
         problems.add("", "bubbles", f"is {content!r:.80}, must be a table", "write [bubbles]")
@@ -393,7 +393,7 @@ def _check_wall(
 
 
 def _unit(vector: Vector, table: str, key: str, problems: Problems) -> Vector:
-    """The direction of ``vector``; vectors that are unit to 1e-12 keep their digits."""
+    """Return the direction of ``vector``; vectors that are unit to 1e-12 keep their digits."""
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         problems.add(table, key, "has length zero", "give a direction")

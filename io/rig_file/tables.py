@@ -58,7 +58,7 @@ def read_table(
     keys: Mapping[str, str] | None = None,
     **fixed: Any,
 ) -> AnyTable | None:
-    """The object that a table of the file describes; its faults are added to ``problems``.
+    """Return the object that a table of the file describes; its faults are added to ``problems``.
 
     kind : a dataclass whose annotated fields are the table's keys. fixed : fields that the file
     does not hold. keys : what fields are called in the file, where that differs. homes : in which
@@ -97,7 +97,7 @@ def read_table(
 
 
 def subtables(raw: dict[str, Any], table: str, problems: Problems) -> dict[str, Any]:
-    """The tables [table.<name>] of the file ``raw`` by name."""
+    """Return the tables [table.<name>] of the file ``raw`` by name."""
     content = raw.get(table, {})
     if not isinstance(content, dict):
         todo = f"write a table [{table}.<name>] for each"
@@ -116,13 +116,13 @@ def subtables(raw: dict[str, Any], table: str, problems: Problems) -> dict[str, 
 
 @cache
 def field_types(kind: Any) -> dict[str, Any]:
-    """The type of each field of a table, with its annotations."""
+    """Return the type of each field of a table, with its annotations."""
     hints = get_type_hints(kind, include_extras=True)
     return {name: hints[name] for name in (field.name for field in fields(kind))}
 
 
 def _words(hint: Any) -> str:
-    """What a value must be: the description of its type, or of what that is made of."""
+    """Return what a value must be: the description of its type, or of what that is made of."""
     for extra in reversed(getattr(hint, "__metadata__", ())):
         if isinstance(extra, FieldInfo) and extra.description:
             return extra.description
@@ -138,7 +138,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def _validated(kind: Any, content: Any) -> tuple[Any, list[Any]]:
-    """As JSON, since in that mode lists may become tuples although types are strict."""
+    """Validate as JSON, since in that mode lists may become tuples although types are strict."""
     try:
         return _adapter(kind).validate_json(json.dumps(content, default=str)), []
     except ValidationError as error:

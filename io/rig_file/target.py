@@ -56,7 +56,7 @@ class TargetTable(Table):
     plate_index: Index | None = None
 
     def target(self) -> Target:
-        """The target of a table without problems; what the file leaves out has `Target`'s value."""
+        """Return the target of a table without problems; `Target`'s values are for missing keys."""
         stated = {name: value for name, value in vars(self).items() if value is not None}
         stated.setdefault("flatness_sigma_mm", self.print_sigma_mm)
         if self.pitch_mm is not None and not isinstance(self.pitch_mm, tuple):
@@ -67,7 +67,7 @@ class TargetTable(Table):
 
 
 def target_problems(table: TargetTable, faulty: Set[str] = frozenset()) -> list[Problem]:
-    """Every fault that shows only when the keys are taken together.
+    """Return every fault that shows only when the keys are taken together.
 
     What depends on a ``faulty`` key, or on one found faulty here, would only repeat that fault
     and is left out.
@@ -190,7 +190,7 @@ def _scale_problems(t: TargetTable) -> Iterator[Problem]:
 
 
 def _as_written(value: Any) -> str:
-    """A TOML list in place of Python's tuple."""
+    """Return a TOML list in place of Python's tuple."""
     return str(value).replace("(", "[").replace(")", "]")
 
 
@@ -203,7 +203,7 @@ def _scale_range(t: TargetTable) -> str:
 
 
 def _scale_cells(t: TargetTable) -> list[Cell] | None:
-    """(row, column) of both scale dots; None where the numbers cannot be read."""
+    """Return (row, column) of both scale dots; None where the numbers cannot be read."""
     cells: list[Cell] = []
     for dot in t.scale_dots or ():
         if isinstance(dot, int) and t.layout == "points":

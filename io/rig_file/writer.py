@@ -39,7 +39,7 @@ _NAMES = ("name", "camera")
 
 
 def rig_toml(rig: RigDescription) -> str:
-    """The text of the rig file; keys whose value is None are left out."""
+    """Return the text of the rig file; keys whose value is None are left out."""
     blocks = [_lines([("schema", SCHEMA, ""), ("name", rig.name, "")])]
     blocks += [_block(f"cameras.{toml_key(c.name)}", _all_fields(c)) for c in rig.cameras.values()]
     if rig.rotvec_from_first_deg:
@@ -75,13 +75,13 @@ def rig_toml(rig: RigDescription) -> str:
 
 
 def _all_fields(table: Table) -> list[Line]:
-    """A line for each field of a description; None values are left out when they are written."""
+    """Return a line for each field of a description; None values are left out on writing."""
     values = {name: value for name, value in vars(table).items() if name not in _NAMES}
     return [(name, value, _COMMENTS.get(name, "")) for name, value in values.items()]
 
 
 def _changed_fields(table: Any) -> list[Line]:
-    """A line for each field that differs from its default."""
+    """Return a line for each field that differs from its default."""
     usual = {field.name: field.default for field in fields(table)}
     return [line for line in _all_fields(table) if line[1] != usual[line[0]]]
 
@@ -137,7 +137,7 @@ def toml_key(key: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """A TOML value: text, a truth value, a number with every digit, or a list of them."""
+    """Return a TOML value: text, a truth value, a number with every digit, or a list of them."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool | np.bool_):

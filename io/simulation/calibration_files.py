@@ -86,7 +86,7 @@ def write_calibration(
 
 
 def rig_description(config: SimulationConfig, target: TrueTarget) -> RigDescription:
-    """What is known before calibration: nominal values, not the true ones."""
+    """Return the rig as it is known before calibration: with nominal values, not the true ones."""
     cameras = {
         c.name: CameraDescription(
             c.name, c.image_size_px, c.nominal_scale_px_per_mm, c.nominal_telecentricity_per_mm
@@ -215,7 +215,7 @@ def _pose_truth(pose: Pose) -> dict[str, Any]:
 
 
 def seed_of(rng: np.random.Generator) -> dict[str, Any]:
-    """What it takes to make the same generator again."""
+    """Return what it takes to make the same generator again."""
     sequence = rng.bit_generator.seed_seq
     entropy = getattr(sequence, "entropy", None)
     key = getattr(sequence, "spawn_key", ())

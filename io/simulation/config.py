@@ -334,7 +334,7 @@ class RunConfig:
     fluid: FluidConfig | None = None
 
     def __post_init__(self) -> None:
-        """Raises InputError for values that no run can have."""
+        """Raise InputError for values that no run can have."""
         lone = self.motion.pairs and self.bubbles % 2
         faults = {
             "frames": (self.frames < 1, "at least 1"),

@@ -24,17 +24,17 @@ Config = TypeVar("Config", bound=SimulationConfig | RunConfig)
 
 
 def preset(name: str, **changes: Any) -> SimulationConfig:
-    """A named calibration with fields replaced: ``preset("paper", angle_deg=40.0, views=8)``."""
+    """Return a named calibration with fields replaced: ``preset("paper", angle_deg=40.0)``."""
     return _chosen(PRESETS, name, changes)
 
 
 def run_preset(name: str, **changes: Any) -> RunConfig:
-    """A named run with some fields replaced: ``run_preset("swarm", frames=20, bubbles=40)``."""
+    """Return a named run with fields replaced: ``run_preset("swarm", frames=20, bubbles=40)``."""
     return _chosen(RUN_PRESETS, name, changes)
 
 
 def any_preset(name: str) -> SimulationConfig | RunConfig:
-    """A named calibration or run. Raises InputError for an unknown name."""
+    """Return a named calibration or run. Raises InputError for an unknown name."""
     both: dict[str, SimulationConfig | RunConfig] = {**PRESETS, **RUN_PRESETS}
     return _chosen(both, name, {})
 
@@ -53,7 +53,7 @@ def _chosen(presets: Mapping[str, Config], name: str, changes: Mapping[str, Any]
 
 
 def _small_target(scale: float = 1.0, **changes: Any) -> Target:
-    """3 x 5 dots; scale : of all lengths, 1 for dots of 2.4 mm, 7 mm apart."""
+    """Return a target of 3 x 5 dots; scale : of all lengths, 1 for dots of 2.4 mm, 7 mm apart."""
     target = Target(
         rows=3,
         columns=5,
@@ -72,7 +72,7 @@ def _pair(
     size_px: tuple[int, int] = (512, 512),
     scale_px_per_mm: float = 10.0,
 ) -> tuple[CameraConfig, CameraConfig]:
-    """Two cameras whose true scales and centres differ a little from the nominal ones."""
+    """Return two cameras whose true scales and centres differ a little from the nominal ones."""
     nominal, ratio = scale_px_per_mm, scale_px_per_mm / 10
     left, right = left or {"k1": 2e-3}, right or {"k1": -1.5e-3}
     return (
@@ -84,7 +84,7 @@ def _pair(
 def _like_paper(
     name: str, size_px: tuple[int, int], scale_px_per_mm: float, target_scale: float
 ) -> SimulationConfig:
-    """The calibration `paper` for cameras of another size and scale."""
+    """Return the calibration `paper` for cameras of another size and scale."""
     cameras = _pair(size_px=size_px, scale_px_per_mm=scale_px_per_mm)
     reach = 15.0 * target_scale
     target = _small_target(target_scale)
@@ -198,7 +198,7 @@ _CALIBRATIONS = (
 def _scenario(
     name: str, frame_rate_hz: float, shake_hz: float, shake_mm: float, sigma_px: float
 ) -> RunConfig:
-    """A benchmark of the smoother: 0.1 mm/px, 1.5 s (S0: 59 frames), everything measured."""
+    """Return a benchmark of the smoother: 0.1 mm/px, 1.5 s (S0: 59 frames), everything measured."""
     return RunConfig(
         name,
         _like_paper(name, (1024, 1024), 10.0, 1.0),

@@ -167,7 +167,7 @@ class _Renderer:
         ]
 
     def image(self, frame: int, index: int, view: CameraView) -> NDArray[Any]:
-        """(height, width) what camera ``index`` records."""
+        """Return (height, width) what camera ``index`` records."""
         image = self.scene.config.image
         lab_shift = self.lab_shift[index, frame]
         grey = render_bubbles(
@@ -200,7 +200,7 @@ class _Renderer:
 
 
 def _lab_shift_px(scene: RunScene, index: int) -> Array:
-    """(F, 2) how far what stands still in the lab has moved in the image since position 0."""
+    """Return (F, 2) how far what is at rest in the lab has moved in the image since position 0."""
     _, slope = linear_projection(list(scene.cameras.values())[index])
     frames = range(scene.config.frames)
     return np.stack([scene.rig_from_lab_mm(index, frame) for frame in frames]) @ slope.T
@@ -214,7 +214,7 @@ def _lens_dirt(image: ImageConfig, size: tuple[int, int], rng: Generator) -> Spe
 def _window_dirt(
     image: ImageConfig, size: tuple[int, int], shift_px: Array, rng: Generator
 ) -> Specks:
-    """Specks over all that the camera ever sees of the window."""
+    """Return the specks over all that the camera ever sees of the window."""
     low = -shift_px.max(0)
     high = np.array(size) - 1.0 - shift_px.min(0)
     share = float(np.prod(high - low) / np.prod(size))
@@ -224,7 +224,7 @@ def _window_dirt(
 
 @contextmanager
 def _image_files(run: Path, image: ImageConfig, cameras: list[str]) -> Iterator[Writer]:
-    """A function (camera, frame, pixels) that writes single files, or pages of one per camera."""
+    """Return a function (camera, frame, pixels) that writes single files, or pages of one file."""
     import tifffile
 
     for name in cameras:
@@ -255,7 +255,7 @@ def _detected(
     size_px: tuple[int, int],
     rng: Generator,
 ) -> dict[str, Any]:
-    """Rows of `detections.csv` of one image, in random order: whole bubbles and false ones."""
+    """Return rows of `detections.csv` of an image in random order: whole bubbles and false ones."""
     table = config.table
     found = np.flatnonzero(view.whole & (rng.random(len(view.particle)) >= table.missed))
     false = int(rng.poisson(table.false_per_image))
@@ -289,7 +289,7 @@ def _detected(
 def _noisy_axes(
     a: Array, b: Array, angle: Array, sigma_px: float, rng: Generator
 ) -> tuple[Array, Array, Array]:
-    """Ellipses whose outlines have been displaced by white noise.
+    """Return the ellipses whose outlines have been displaced by white noise.
 
     On the unit circle cos and sin of 2 phi have the variance of those of phi, which move the
     centre, and the mean radius half of it.
@@ -406,7 +406,7 @@ def _views(
     target: TrueTarget,
     rng: np.random.Generator,
 ) -> tuple[list[View], Array]:
-    """A pose that both cameras see at every stop, and the stops in mm."""
+    """Return a pose that both cameras see at every stop, and the stops in mm."""
     upright = replace(
         config.calibration, views=1, roll_deg=0.0, single_camera_views=0, shift_mm=(1.0, 1.0, 1.0)
     )

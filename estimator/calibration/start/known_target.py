@@ -57,7 +57,7 @@ def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageM
 
 
 def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
-    """Affine map, or the homography where it fits better by far more than its two parameters."""
+    """Return an affine map, or the homography where that has less than half the squared misfit."""
     middle = xy_mm.mean(0)
     size = np.sqrt(((xy_mm - middle) ** 2).sum(1).mean())
     design = np.c_[(xy_mm - middle) / size, np.ones(len(xy_mm))]
@@ -249,7 +249,7 @@ def _signs(
 
 
 def mono_state(problem: Problem, dots_mm: Array) -> State:
-    """The starting state of a single camera: the sign of each view's tilt is arbitrary."""
+    """Return the starting state of a single camera: the sign of each view's tilt is arbitrary."""
     maps = image_maps(problem, dots_mm)
     chosen = {v: rotation_from_jacobian(m.jacobian)[0] for (v, _), m in maps.items()}
     return _assemble(problem, dots_mm, maps, chosen, None)
@@ -359,7 +359,7 @@ def _place_views(views: Array, shifts: dict[tuple[int, int], Array], cameras: Ar
 def _place_views_of_two(
     views: Array, shifts: dict[tuple[int, int], Array], second_from_first: Array
 ) -> Array:
-    """`_place_views` for two cameras: the offset is the median disagreement."""
+    """Do the work of `_place_views` for two cameras: the offset is the median disagreement."""
     along = second_from_first[:2, 2]
     length = np.linalg.norm(along)
     along = along / length

@@ -50,7 +50,7 @@ def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[
 
 
 def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, list[str]]:
-    """The known distance, less certain where a turn puts other dots in the place of its two."""
+    """Return the known distance, less certain where a turn puts other dots in place of its two."""
     if problem.scale is None:
         return problem, []
     pair, distance, sigma = problem.scale
@@ -99,7 +99,7 @@ def _numbered_alike_in_cameras(
 
 
 def _cameras_of(images: set[tuple[int, int]]) -> dict[int, list[int]]:
-    """By view, the cameras that see it."""
+    """Return the cameras that see each view, by view."""
     out: dict[int, list[int]] = {}
     for v, c in images:
         out.setdefault(v, []).append(c)
@@ -107,7 +107,7 @@ def _cameras_of(images: set[tuple[int, int]]) -> dict[int, list[int]]:
 
 
 def _nominal_of_pair(nominal_rotvec_deg: Nominal, a: int, b: int) -> Array | None:
-    """(3, 3) nominal rotation b_from_a, where both are known."""
+    """Return (3, 3) nominal rotation b_from_a, where both are known."""
     known = {0: np.zeros(3), **nominal_rotvec_deg}
     if not {a, b} <= set(known):
         return None
@@ -163,7 +163,7 @@ def _spin(k: int, order: int) -> Array:
 
 
 def _pairs(first: Array, second: Array) -> Array:
-    """(4, 3, 3) second_from_first for the signs of both tilts."""
+    """Return (4, 3, 3) second_from_first for the signs of both tilts."""
     plain, crossed = second @ first.T, known_target.mirrored(second) @ first.T
     return np.array([plain, crossed, known_target.mirrored(plain), known_target.mirrored(crossed)])
 
@@ -205,7 +205,7 @@ def _numbered_alike_in_views(problem: Problem, labels: list[Ints]) -> tuple[Prob
 
 
 def _most_alike_turns(turned: Array) -> Ints:
-    """(V,) turns that make the views' print errors most alike: to one view, then to the mean."""
+    """Return turns (V,) that make views' print errors most alike: to one view, then to the mean."""
     views = np.arange(turned.shape[1])
     starts = [_misfits(turned, turned[0, v][None]).argmin(0) for v in views]
     choice = min(starts, key=lambda c: _scatter(turned[c, views]))
@@ -219,7 +219,7 @@ def _most_alike_turns(turned: Array) -> Ints:
 
 
 def _misfits(turned: Array, others: Array) -> Array:
-    """(T, V) mean square difference of each turn of each view from (V or 1, N, 2) print errors."""
+    """Return mean square differences (T, V) of views' turns from print errors (V or 1, N, 2)."""
     return np.asarray(np.nanmean((turned - others) ** 2, (2, 3)))
 
 
@@ -250,7 +250,7 @@ def _turned(marks: Array, label: Ints, k: int, order: int) -> Array:
 
 
 def _contrast(turned: Array, choice: Ints) -> float:
-    """How many standard deviations the chosen turn beats the next, in the least certain view."""
+    """Return by how many sd the chosen turn beats the next, in the least certain view."""
     chosen = turned[choice, np.arange(len(choice))]
     worst = np.inf
     for v in range(len(choice)):

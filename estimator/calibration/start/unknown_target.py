@@ -41,7 +41,7 @@ def dots_from_images(problem: Problem) -> Array:
 
 
 def _factorise(problem: Problem) -> tuple[dict[tuple[int, int], Array], Array]:
-    """Maps (2, 2) per image and plane coordinates (N, 2): alternating least squares over gaps."""
+    """Return maps (2, 2) per image and places (N, 2), by alternating least squares over gaps."""
     images = {}
     for v in range(len(problem.views)):
         for c in range(len(problem.cameras)):
@@ -89,7 +89,7 @@ def _plane_points(
 
 
 def _metric(maps: list[Array]) -> Array:
-    """(2, 2) C = Q Q^T from the maps of one camera, the first where it has views enough."""
+    """Return (2, 2) C = Q Q^T from the maps of one camera, the first where it has views enough."""
     if len(maps) < LEAST_VIEWS:
         raise CalibrationError(
             f"no camera has more than {len(maps)} usable views; a target whose dot positions are "

@@ -22,7 +22,7 @@ _DEEP_SIGMA = 6.0
 
 
 def shape_from_axes(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> Array:
-    """(..., 3) numbers (m11, m12, m22) of M from semi-axes and the angle of a from +u to +v."""
+    """Return (m11, m12, m22) (..., 3) of M from semi-axes and the angle of a from +u to +v."""
     a, b, angle = (np.asarray(x, dtype=np.float64) for x in (a_px, b_px, angle_rad))
     mean, half = 0.5 * (a + b), 0.5 * (a - b)
     c, s = half * np.cos(2.0 * angle), half * np.sin(2.0 * angle)
@@ -30,19 +30,19 @@ def shape_from_axes(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> A
 
 
 def axes_from_shape(shape_px: ArrayLike) -> Array:
-    """(..., 3) semi-axes a >= b and angle in (-pi/2, pi/2] from (..., 3) shape numbers."""
+    """Return (..., 3) semi-axes a >= b and angle in (-pi/2, pi/2] from (..., 3) shape numbers."""
     shape = np.asarray(shape_px, dtype=np.float64)
     angle = 0.5 * np.arctan2(shape[..., 1], 0.5 * (shape[..., 0] - shape[..., 2]))
     return np.stack([*semi_axes(shape), angle], axis=-1)
 
 
 def extent_px(shape_px: Array) -> Array:
-    """(..., 2) half width and half height of the ellipse's upright bounding box."""
+    """Return (..., 2) half width and half height of the ellipse's upright bounding box."""
     return np.hypot(shape_px[..., :2], shape_px[..., 1:])
 
 
 def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Array:
-    """Signed distance to ellipses (..., 3) to first order, positive outside, at (..., P)."""
+    """Return signed distance to ellipses (..., 3) to first order, positive outside, at (..., P)."""
     m11, m12, m22 = _columns(shape_px)
     determinant = m11 * m22 - m12 * m12
     x, y = (m22 * du_px - m12 * dv_px) / determinant, (m11 * dv_px - m12 * du_px) / determinant
@@ -53,12 +53,12 @@ def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Arra
 
 
 def _columns(shape_px: Array) -> tuple[Array, Array, Array]:
-    """Three (..., 1) shape numbers that broadcast with (..., P) pixels."""
+    """Return three (..., 1) shape numbers that broadcast with (..., P) pixels."""
     return shape_px[..., :1], shape_px[..., 1:2], shape_px[..., 2:]
 
 
 def _column_kernel(z: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    """One-dimensional point spread at ``sigma z``: its integral, itself, its derivative."""
+    """Return one-dimensional point spread at ``sigma z``: its integral, itself, its derivative."""
     k = _FOURTH / sigma**4
     z2 = z * z
     g = np.exp(-0.5 * z2) * (1.0 / (_ROOT_2PI * sigma))
@@ -68,7 +68,7 @@ def _column_kernel(z: Array, sigma: Array) -> tuple[Array, Array, Array]:
 
 
 def _row_kernel(z: Array, sigma: Array) -> tuple[Array, Array]:
-    """One-dimensional point spread at ``sigma z`` and its second derivative."""
+    """Return the one-dimensional point spread at ``sigma z`` and its second derivative."""
     k = _FOURTH / sigma**4
     z2 = z * z
     g = np.exp(-0.5 * z2) * (1.0 / (_ROOT_2PI * sigma))
@@ -84,7 +84,7 @@ def quadrature_nodes(a_sigma: float) -> int:
 def coverage_on_grid(
     u_px: Array, v_px: Array, centre_px: ArrayLike, shape_px: ArrayLike, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
-    """Exact coverage of the pixels at columns ``u_px`` (..., U) and rows ``v_px`` (..., V).
+    """Return exact coverage of the pixels at columns ``u_px`` (..., U) and rows ``v_px`` (..., V).
 
     Returns ``F`` (..., V, U) and its derivatives (..., 6, V, U) by centre (2), shape (3), sigma.
     By Gauss's theorem with the field (P(x - u) p(y - v), 0), p the one-dimensional point spread and
@@ -127,10 +127,11 @@ def coverage_on_grid(
 def foot_points(
     shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 2
 ) -> tuple[Array, Array]:
-    """Nearest points M (cos t, sin t) of ellipses (..., 3), as (cos t, sin t), to offsets (..., P).
+    """Return (cos t, sin t) of the nearest points M (cos t, sin t) of ellipses to offsets.
 
-    Newton on (p - x(t)) . x'(t) = 0 from the radial start, for points nearer than the smallest
-    radius of curvature. Steps turn the unit vector, which saves the trigonometry.
+    Ellipses (..., 3), offsets (..., P). Newton on (p - x(t)) . x'(t) = 0 from the radial start, for
+    points nearer than the smallest radius of curvature. Steps turn the unit vector, which saves the
+    trigonometry.
     """
     m11, m12, m22 = _columns(shape_px)
     c, s = m22 * du_px - m12 * dv_px, m11 * dv_px - m12 * du_px
@@ -210,7 +211,7 @@ def coverage_near_edge(
 def _bend(
     m11: Array, m12: Array, m22: Array, c: Array, s: Array, shrink: Array, sigma: Array
 ) -> tuple[Array, Array]:
-    """Curvature times sigma, and its second derivative by arc length times sigma^3, at feet."""
+    """Return curvature times sigma, and its second derivative by arc length times sigma^3."""
     g11, g12, g22 = m11 * m11 + m12 * m12, m12 * (m11 + m22), m12 * m12 + m22 * m22
     cs2, cos2 = 2.0 * c * s, 2.0 * c * c - 1.0
     slope = (g11 - g22) * cs2 - 2.0 * g12 * cos2
@@ -223,13 +224,13 @@ def _bend(
 
 
 def semi_axes(shape_px: Array) -> tuple[Array, Array]:
-    """Semi-axes a >= b [px], each (...), of (..., 3) shape numbers."""
+    """Return the semi-axes a >= b [px], each (...), of (..., 3) shape numbers."""
     m11, m12, m22 = shape_px[..., 0], shape_px[..., 1], shape_px[..., 2]
     mean, half = 0.5 * (m11 + m22), np.hypot(0.5 * (m11 - m22), m12)
     return mean + half, mean - half
 
 
 def largest_curvature(shape_px: Array) -> Array:
-    """Largest curvature a / b^2 [1/px], (...), of (..., 3) shape numbers."""
+    """Return the largest curvature a / b^2 [1/px], (...), of (..., 3) shape numbers."""
     a, b = semi_axes(shape_px)
     return a / (b * b)

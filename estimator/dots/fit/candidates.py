@@ -64,7 +64,7 @@ class Candidates:
         return tuple(blob for blob in self.blobs if not blob.reason)
 
     def up_to(self, diameter_px: float) -> Candidates:
-        """The same, with a reason against those that are larger."""
+        """Return the same, with a reason against those that are larger."""
         if np.isinf(diameter_px):
             return self
         most = np.pi / 4 * diameter_px**2
@@ -85,7 +85,7 @@ class EdgeMap:
 
 
 def edge_map(image: Float32, sigma: float) -> EdgeMap:
-    """Threshold surface of ``image`` (rows, columns) whose noise is about ``sigma`` grey levels."""
+    """Return the threshold surface of ``image`` (rows, columns), whose noise is about ``sigma``."""
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     rows, columns = image.shape
     missing = (-rows % _BLOCK, -columns % _BLOCK)
@@ -108,7 +108,7 @@ def edge_map(image: Float32, sigma: float) -> EdgeMap:
 
 
 def _away_from(bright: Bools) -> Bools:
-    """Pixels far from any crossing of the threshold, chosen by place alone to avoid a bias."""
+    """Return pixels far from any crossing of the threshold, chosen by place alone against bias."""
     grey = bright.astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
@@ -123,7 +123,7 @@ def _away_from(bright: Bools) -> Bools:
 
 
 def _spread(values: Float32, weight: Float32) -> Float32:
-    """Values weighted and interpolated to where there is no weight, from coarser scales."""
+    """Return values weighted, and interpolated from coarser scales where there is no weight."""
     rows, columns = values.shape
     if min(rows, columns) <= 2:
         total = float(np.sum(weight))
@@ -144,7 +144,7 @@ def _spread(values: Float32, weight: Float32) -> Float32:
 
 
 def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) -> Candidates:
-    """Every blob of one polarity, with the reason why it cannot be a dot if there is one."""
+    """Return every blob of one polarity, with the reason why it cannot be a dot if there is one."""
     sign = 1.0 if polarity == "white_on_black" else -1.0
     labels = np.zeros(edges.smooth.shape, np.int32)
     if not edges.has_edges:
@@ -168,7 +168,7 @@ _Look = tuple[NDArray[np.int32], Candidate | None]
 
 
 def _with_pieces(shown: list[_Look], above: Float32, min_diameter_px: float) -> list[_Look]:
-    """The outlines, where those of merged small dots are replaced by their pieces (`_pieces`)."""
+    """Return the outlines, those of merged small dots replaced by their pieces (`_pieces`)."""
     good = [look.area_px2 for _, look in shown if look is not None and not look.reason]
     large = _LARGE_PIECE * float(np.median(good)) if good else 0.0
     result: list[_Look] = []
@@ -199,7 +199,7 @@ def fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) 
 def _outlines(
     inside: Bools,
 ) -> list[tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]]:
-    """Outer outline (N, 2) of each connected region, with the outlines of its holes."""
+    """Return the outer outline (N, 2) of each connected region, with the outlines of its holes."""
     found, tree = cv2.findContours(inside.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if not found:
         return []
@@ -212,7 +212,7 @@ def _outlines(
 
 
 def _pieces(above: Float32, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
-    """Outlines of small dots whose blurs overlap, separated by a higher threshold.
+    """Return the outlines of small dots whose blurs overlap, separated by a higher threshold.
 
     Only blobs nowhere thicker than the blur are separated: larger dots touch in the world.
     """
@@ -254,7 +254,7 @@ def _first_look(
     image_shape: tuple[int, ...],
     min_diameter_px: float,
 ) -> Candidate | None:
-    """The candidate of one outline; None for specks below half the smallest dot."""
+    """Return the candidate of one outline; None for specks below half the smallest dot."""
     low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
     if size.max() < 0.5 * min_diameter_px:
         return None
@@ -270,7 +270,7 @@ def _first_look(
 
 
 def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
-    """Area, centre (2,) and ellipse of equal second moments (3,) of a filled outline's pixels."""
+    """Return area, centre (2,) and ellipse of equal moments (3,) of a filled outline's pixels."""
     low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
     filled = np.zeros((int(size[1]), int(size[0])), np.uint8)
     fill(filled, 1, outline - low)
@@ -282,7 +282,7 @@ def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
 
 
 def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
-    """Shape numbers of the uniform ellipse with these second moments (uu, uv, vv)."""
+    """Return the shape numbers of the uniform ellipse with these second moments (uu, uv, vv)."""
     uu, uv, vv = variance
     mean, half = 0.5 * (uu + vv), hypot(0.5 * (uu - vv), uv)
     a, b = 2.0 * sqrt(mean + half), 2.0 * sqrt(max(mean - half, 0.05))
@@ -315,7 +315,7 @@ _LARGEST_RATIO = 2.5
 
 
 def reference_radius_px(found: Candidates) -> float:
-    """Radius of the blob at the median of the promising blobs' area; 0 where there are none."""
+    """Return the radius of a blob of the promising blobs' median area; 0 where there are none."""
     areas = np.sort([blob.area_px2 for blob in found.promising])
     if areas.size == 0:
         return 0.0
@@ -330,8 +330,10 @@ def is_ring(blob: Candidate) -> bool:
 
 
 def saturation_level(grey: Float32) -> float:
-    """Grey level at which the sensor saturates: the top level if more pixels have it than the
-    levels next below it, else infinity."""
+    """Return the grey level at which the sensor saturates.
+
+    That is the top level if more pixels have it than the levels next below it, else infinity.
+    """
     top = float(grey.max())
     at_top, lower = grey == top, grey[grey < top]
     if np.count_nonzero(at_top) < 20 or not lower.size:
@@ -342,14 +344,14 @@ def saturation_level(grey: Float32) -> float:
 
 
 def clipping_levels(grey: Float32) -> tuple[float, float]:
-    """Grey levels (black, white) at which the image is clipped; infinite where it is not."""
+    """Return grey levels (black, white) at which the image is clipped; infinite where it is not."""
     return -saturation_level(-grey), saturation_level(grey)
 
 
 def _one_sided_saturation(
     grey: Float32, centre: Array, shape: Array, margin: float, level: float
 ) -> float:
-    """Length of the mean direction towards saturated pixels; 0 where they are all round."""
+    """Return length of the mean direction towards saturated pixels; 0 where they are all round."""
     if not np.isfinite(level):
         return 0.0
     half = extent_px(shape) + margin
@@ -369,7 +371,7 @@ def _one_sided_saturation(
 def reason_against_blob(
     blob: Candidate, grey: Float32, reference_px: float, saturation: float
 ) -> Reason | None:
-    """Reason to leave a blob out before any fit; None for a blob that may be a dot."""
+    """Return the reason to leave a blob out before any fit; None for a blob that may be a dot."""
     if blob.reason == Reason.TOUCHES_BORDER:
         return Reason.TOUCHES_BORDER
     if np.sqrt(blob.area_px2 / np.pi) < _MIN_RELATIVE_RADIUS * reference_px:
@@ -397,7 +399,7 @@ def reason_against_fit(
     usual_contrast: float,
     saturation: float,
 ) -> Reason | None:
-    """Reason to leave a dot out that was fitted to a blob; None for a good one."""
+    """Return the reason to leave a dot out that was fitted to a blob; None for a good one."""
     if fit.pixels <= PARAMETERS:
         return Reason.HIDDEN
     if not np.all(np.isfinite(fit.covariance_px2)) or semi_axes(fit.shape_px)[1] <= 0.0:

@@ -133,7 +133,7 @@ class DotFit:
         return self.covariance_px2 * (self.chi2_dof if significant else 1.0)
 
     def under_noise(self, factor: float) -> DotFit:
-        """The same fit for a noise variance ``factor`` times as large."""
+        """Return the same fit for a noise variance ``factor`` times as large."""
         return replace(
             self,
             covariance_px2=self.covariance_px2 * factor,
@@ -188,7 +188,7 @@ class Pixels:
     prior: NDArray[np.void]
 
     def of(self, dots: Ints) -> Pixels:
-        """The pixels of some of the dots."""
+        """Return the pixels of some of the dots."""
         if len(dots) == len(self.x):
             return self
         arrays = {name: value[dots] for name, value in vars(self).items() if name != "noise"}
@@ -198,7 +198,7 @@ class Pixels:
 def gather(
     windows: Sequence[Window], starts: Sequence[Start], noise: NoiseModel, priors: Sequence[Prior]
 ) -> Pixels:
-    """The pixels that each window's mask shows, padded to the largest number."""
+    """Return the pixels that each window's mask shows, padded to the largest number."""
     counts = np.array([np.count_nonzero(w.mask) for w in windows])
     sizes = np.array([w.mask.shape for w in windows])
     height, width = sizes.max(axis=0)
@@ -223,7 +223,7 @@ def gather(
 
 
 def _coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
-    """(D, P) and its derivatives (D, 6, P) by theta (D, 6)."""
+    """Return the coverage (D, P) and its derivatives (D, 6, P) by theta (D, 6)."""
     curved = largest_curvature(theta[:, 2:5]) * theta[:, 5] >= EDGE_EXPANSION_LIMIT
     if np.all(curved):
         return _exact_coverage(pixels, theta)
@@ -284,7 +284,7 @@ def _first_levels(pixels: Pixels, jacobian: Array) -> Array:
 
 
 def prior_rows(pixels: Pixels, parameters: Array) -> tuple[Array, Array]:
-    """Three whitened prior rows: Jacobian (D, 3, 12) by the parameters, and residual (D, 3)."""
+    """Return three whitened prior rows: Jacobian (D, 3, 12) by the parameters, residual (D, 3)."""
     prior, radius, levels = pixels.prior, pixels.radius, parameters[:, 6:]
     tied = prior["tie_to_background"]
     weight = 1.0 / (prior["sigma_per_px"] * radius * np.maximum(np.abs(levels[:, 3]), 1e-12))
@@ -311,7 +311,7 @@ _PIXELS_AT_ONCE = 16_000
 
 
 def _admissible(theta: Array, radius: Array) -> Bools:
-    """(D,) whether theta is near the start of the fit: no fit may run away over the image."""
+    """Return (D,) whether theta is near the start; no fit may run away over the image."""
     a, b = semi_axes(theta[:, 2:5])
     sigma = theta[:, 5]
     near = np.max(np.abs(theta[:, :2]), axis=1) < radius + 2.0
@@ -338,7 +338,7 @@ class _State:
 
 
 def _state(pixels: Pixels, theta: Array, levels: Array, weight: Array | None = None) -> _State:
-    """weight : (D, P); None takes the inverse noise variance at the model's grey levels."""
+    """Return the state; weight (D, P): None takes the inverse noise variance at the model."""
     model, jacobian, levels = grey_levels(pixels, theta, levels)
     if weight is None:
         weight = pixels.there / pixels.noise.variance(model)
@@ -356,7 +356,7 @@ def _chi2(pixels: Pixels, parameters: Array, residual: Array, weight: Array) -> 
 
 
 def _normal_equations(pixels: Pixels, state: _State, dots: Ints) -> tuple[Array, Array]:
-    """Information (N, 12, 12) and gradient (N, 12) of some dots; ``pixels`` holds only those."""
+    """Return information (N, 12, 12) and gradient (N, 12) of the dots that ``pixels`` holds."""
     rows, gap = prior_rows(pixels, state.parameters[dots])
     jacobian = state.jacobian if len(dots) == len(state.chi2) else state.jacobian[dots]
     weighted = jacobian * state.weight[dots, None]
@@ -366,7 +366,7 @@ def _normal_equations(pixels: Pixels, state: _State, dots: Ints) -> tuple[Array,
 
 
 def _equilibrated(information: Array) -> tuple[Array, Array]:
-    """Information with a unit diagonal, and the square roots (D, 12) of its own diagonal."""
+    """Return information with a unit diagonal, and the square roots (D, 12) of its own diagonal."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     scale: Array = np.sqrt(np.maximum(diagonal, 1e-300))
     return information / (scale[:, :, None] * scale[:, None]), scale
@@ -453,7 +453,7 @@ def fit_dots(
 
 
 def _chunks(windows: Sequence[Window]) -> Iterator[list[int]]:
-    """Positions of windows of similar size, as many as stay in the cache together."""
+    """Return the positions of windows of similar size, as many as stay in the cache together."""
     counts = [int(np.count_nonzero(w.mask)) for w in windows]
     chunk: list[int] = []
     for i in sorted(range(len(windows)), key=counts.__getitem__):
@@ -468,7 +468,7 @@ def _chunks(windows: Sequence[Window]) -> Iterator[list[int]]:
 
 
 def _first(pixels: Pixels, starts: Sequence[Start]) -> tuple[Array, Array]:
-    """theta (D, 6) and levels (D, 6), NaN where there are none yet."""
+    """Return theta (D, 6) and levels (D, 6), NaN where there are none yet."""
     theta = [[*(s.centre_px - o), *s.shape_px, s.sigma_px] for s, o in zip(starts, pixels.origin)]
     before = (s.previous for s in starts)
     levels = [np.full(6, np.nan) if fit is None else fit.levels for fit in before]
@@ -503,7 +503,7 @@ def _fit(
 
 
 def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> Bools:
-    """(N, P) which pixels of some dots are outliers."""
+    """Return (N, P) which pixels of some dots are outliers."""
     whitened = np.abs(residual[dots]) / np.sqrt(variance[dots])
     limit = np.empty((len(dots), 1))
     for k, count in enumerate(np.maximum(pixels.counts[dots], 1)):
@@ -563,7 +563,7 @@ def _results(pixels: Pixels, state: _State, converged: Bools) -> list[DotFit]:
 
 
 def _mean_where(values: Array, where: Bools, otherwise: float) -> Array:
-    """(D,) means over the chosen pixels of (D, P); ``otherwise`` where none is chosen."""
+    """Return (D,) means over the chosen pixels of (D, P); ``otherwise`` where none is chosen."""
     count = np.count_nonzero(where, axis=1)
     total = np.sum(np.where(where, values, 0.0), axis=1)
     return np.where(count > 0, total / np.maximum(count, 1), otherwise)

@@ -92,7 +92,7 @@ def _distance_to_others(
     high: NDArray[np.int_],
     reach: int,
 ) -> Array | None:
-    """Distance to blobs whose label is not in ``own``, in a crop; None where none is near."""
+    """Return the distance to blobs with labels not in ``own``, in a crop; None if none is near."""
     first = np.maximum(low - reach, 0)
     wide = labels[first[1] : high[1] + reach, first[0] : high[0] + reach]
     others = wide != 0
@@ -107,7 +107,7 @@ def _distance_to_others(
 
 
 def close_neighbours(fits: list[DotFit]) -> list[list[int]]:
-    """For each dot, the positions of the dots whose blur overlaps its own."""
+    """Return for each dot the positions of the dots whose blur overlaps its own."""
     from scipy.spatial import cKDTree
 
     if not fits:
@@ -136,7 +136,7 @@ def _radius_of(shape: Array, du: float, dv: float) -> float:
 
 
 def without_neighbours(window: Window, neighbours: list[DotFit]) -> Window:
-    """The window with the neighbours' fitted light subtracted."""
+    """Return the window with the neighbours' fitted light subtracted."""
     if not neighbours:
         return window
     rows, columns = window.grey.shape
@@ -159,7 +159,7 @@ _BLUR_SPREAD = 0.1
 
 
 def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
-    """The relative contrast gradient expected at each fitted dot.
+    """Return the relative contrast gradient expected at each fitted dot.
 
     A quadratic is fitted robustly to log |contrast|, with a prior (light changes by about exp(0.4)
     over 1000 px). Below 6 dots a bright background tells more: see `background_tie`.
@@ -177,7 +177,7 @@ def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list
 
 
 def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
-    """The priors with the median edge sigma, for dots no larger than the blur."""
+    """Return the priors with the median edge sigma, for dots no larger than the blur."""
     if len(fits) < _ENOUGH_DOTS:
         return priors
     sigmas = np.array([fit.sigma_px for fit in fits])
@@ -187,14 +187,14 @@ def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
 
 
 def background_tie(fit: DotFit) -> Prior:
-    """Prior for a single dot: the background's relative gradient if the background is bright."""
+    """Return a single dot's prior: the background's relative gradient if that is bright."""
     if fit.levels[0] > 0.5 * abs(fit.levels[3]):
         return Prior(sigma_per_px=1e-4, tie_to_background=True)
     return Prior(sigma_per_px=PRIOR_GRADIENT_PER_PX)
 
 
 def _quadratic(position: Array, value: Array, own: Array, slope: float) -> tuple[Array, Array]:
-    """Coefficients (6,) and covariance (6, 6) by reweighted least squares with a prior."""
+    """Return coefficients (6,) and covariance (6, 6) by reweighted least squares with a prior."""
     x, y = position.T
     design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     prior = np.diag([1e-6, *[1.0 / slope**2] * 5])

@@ -115,7 +115,7 @@ def _signature(sides: Array) -> Array:
 
 
 def _proposals(flat: Array, wanted: Array) -> list[tuple[Array, int]]:
-    """(affine map flat_from_mm, a point in its middle) of the maps that explain most dots near."""
+    """Return maps flat_from_mm, each with a point in its middle, that explain most dots near."""
     ours, theirs = _triangles(flat), _triangles(wanted)
     ours = ours[:: max(1, len(ours) // _TRIANGLES)]
     if not len(ours) or not len(theirs):

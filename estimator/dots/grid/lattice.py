@@ -32,7 +32,7 @@ _HOLD = 0.05
 def fit_neighbours(
     at: Ints, values: Array, places: Ints, basis: Array, *, itself: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Weighted affine fit of the values at the occupied places round each of (C, 2) places.
+    """Return weighted affine fit of the values at the occupied places round each of (C, 2) places.
 
     at : dot at each place or -1. values : (N, 2). basis : (N, 2, 2) pitch vectors, towards which
     the fit is pulled weakly. itself : use the place's own dot too. Returns value (C, 2), pitch
@@ -57,8 +57,10 @@ def fit_neighbours(
 
 
 def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
-    """(C,) distance of each place's residual from its prediction by the neighbours' residuals, in
-    units of a dot's standard deviation if that is 1."""
+    """Return (C,) distances of the places' residuals from their predictions by the neighbours.
+
+    The unit is a dot's standard deviation if that is 1.
+    """
     flat = np.zeros((len(residuals), 2, 2))
     expected, _, spread = fit_neighbours(at, residuals, places, flat)
     own = residuals[at[tuple(places.T)]]

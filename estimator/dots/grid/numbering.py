@@ -55,14 +55,14 @@ class MarkEvidence:
     seen: Ints
 
     def at(self, places: Ints) -> Array:
-        """(...,) log-likelihood ratio at (..., 2) places; marks outside the lattice are unseen."""
+        """Return the log-likelihood ratio (...,) at (..., 2) places; unseen outside the lattice."""
         shifted = places + 1
         inside = np.all((shifted >= 0) & (shifted < self.gain.shape), axis=-1)
         clipped = np.clip(shifted, 0, np.array(self.gain.shape) - 1)
         return np.where(inside, self.gain[clipped[..., 0], clipped[..., 1]], LOG_UNSEEN_MARK)
 
     def is_seen(self, places: Ints) -> Bools:
-        """(...,) whether each of the (..., 2) places looks like a mark."""
+        """Return (...,) whether each of the (..., 2) places looks like a mark."""
         if not len(self.seen):
             return np.zeros(places.shape[:-1], bool)
         return np.asarray(np.any(np.all(places[..., None, :] == self.seen, axis=-1), axis=-1))
@@ -115,7 +115,7 @@ def mark_gain(likeness: Array) -> Array:
 
 
 def gaps(occupied: Bools, bounded: bool) -> Bools:
-    """Empty places among dots; the border of a bounded grid needs dots on its inner side only."""
+    """Return empty places among dots; at the border of a bounded grid fewer dots are enough."""
     around = _count_around(occupied)
     if not bounded:
         return np.asarray(~occupied & (around >= 6))
@@ -229,12 +229,12 @@ class Placements:
     score: Array
 
     def columns_rows(self, places: Ints) -> Ints:
-        """(K, n, 2) column and row on the target of places (n, 2), for each of the K placements."""
+        """Return column and row (K, n, 2) on the target of places (n, 2) by each placement."""
         turned = np.einsum("kab,nb->kna", self.turn, places)
         return np.asarray(turned - self.shift[:, None])
 
     def places(self, columns_rows: Ints) -> Ints:
-        """(K, m, 2) places of (m, 2) columns and rows: the inverse of `columns_rows`."""
+        """Return the places (K, m, 2) of (m, 2) columns and rows: the inverse of `columns_rows`."""
         shifted = columns_rows + self.shift[:, None]
         return np.asarray(np.einsum("kab,knb->kna", inverse_of(self.turn), shifted))
 

@@ -40,7 +40,7 @@ DEFAULT_FLOOR = 0.12
 
 
 def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
-    """With marks or arm sensors a broad prior of the shake; else a guess at its modes."""
+    """Return a broad prior of the shake with marks or arm sensors; else a guess at its modes."""
     bands: tuple[BroadBand, ...] = ()
     modes: tuple[RigMode, ...] = ()
     cameras = range(len(problem.cameras))
@@ -64,7 +64,7 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
 
 
 def _scale_sigma(problem: SmoothingProblem) -> float:
-    """The encoder's scale is estimated where there are marks, and held without."""
+    """Return the prior sd of the encoder's scale, which is held (0) without marks."""
     marked = len(problem.references) > 0 and problem.stage is not None
     return default_scale_sigma(problem.travel) if marked else 0.0
 
@@ -102,7 +102,7 @@ def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeMode
 
 
 def default_bubble(problem: SmoothingProblem) -> BubbleModel:
-    """Zigzag at the frequency that the tracks show, with its second harmonic upwards."""
+    """Return the zigzag at the frequency that the tracks show, with its second harmonic upwards."""
     frequency, rms = zigzag(problem) or (_ZIGZAG_GUESS_HZ, _ZIGZAG_RMS_MM)
     across, up = 1 - np.abs(problem.up), np.abs(problem.up)
     return BubbleModel(
@@ -119,7 +119,7 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Frequency (Hz) and RMS (mm) of the bubbles' swing (Lomb-Scargle), None without tracks."""
+    """Return frequency (Hz) and RMS (mm) of the bubbles' swing (Lomb-Scargle), if there are any."""
     from scipy.signal import lombscargle
 
     trials = np.arange(_ZIGZAG_HZ[0], _ZIGZAG_HZ[1], 0.25)
@@ -143,7 +143,7 @@ def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
 
 
 def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> CarriageModel:
-    """Readings as they are; with sensors or a slow encoder a model of the motion in between."""
+    """Return the carriage's model: readings as they are, or with sensors its motion in between."""
     stage = problem.stage
     if stage is None:
         return CarriageModel()
@@ -164,7 +164,7 @@ def _dense(stage: Stage, t_s: Array, sigma_mm: float) -> bool:
 
 
 def acceleration_rms(stage: Stage) -> float:
-    """mm/s^2, of parabolas through windows of about 20 ms."""
+    """Return the RMS acceleration in mm/s^2, of parabolas through windows of about 20 ms."""
     step = float(np.median(np.diff(stage.t_s)))
     window = int(np.clip(round(0.02 / step) // 2 * 2 + 1, 5, len(stage.t_s) // 2 * 2 - 1))
     if window < 5:
@@ -254,7 +254,7 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
 
 
 def _periodogram(series: Array, step_s: float) -> Array:
-    """One-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
+    """Return one-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
     from scipy.signal import detrend, periodogram
 
     taper: Any = np.hanning(len(series))
@@ -262,13 +262,13 @@ def _periodogram(series: Array, step_s: float) -> Array:
 
 
 def _offsets(solution: Solution) -> Array:
-    """(F, C, 3) of each camera, mm."""
+    """Return the offsets (F, C, 3) of each camera in mm."""
     states = solution.graph.shake_at_frames(solution.state.shake)
     return np.asarray(np.einsum("cid,fd->fci", solution.graph.shake.offset[:-1], states))
 
 
 def _offset_rms(solution: Solution) -> Array:
-    """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
+    """Return the RMS (C, 3) of cameras' offsets and their uncertainty; the mean where unseen."""
     rows, found = solution.graph.shake.offset[:-1], solution.covariances
     square = _offsets(solution) ** 2
     if found is not None:
@@ -280,7 +280,7 @@ def _offset_rms(solution: Solution) -> Array:
 
 
 def _dominant_hz(solution: Solution) -> float:
-    """RMS of the offsets' velocity over that of the offsets."""
+    """Return the RMS of the offsets' velocity over that of the offsets."""
     graph, place = solution.graph, _offsets(solution)
     states = graph.shake_at_frames(solution.state.shake)
     speed = np.einsum("cid,fd->fci", graph.shake.offset_velocity[:-1], states)
@@ -312,7 +312,7 @@ def _noise_factor(solution: Solution) -> float:
 
 
 def leverages(solution: Solution) -> list[tuple[Ints, Array]]:
-    """By camera: some of the bubbles' pixels (m,), var(prediction) / var(noise) of each (m, 2)."""
+    """Return by camera var(prediction) / var(noise) (m, 2) of some bubbles' pixels (m,)."""
     graph, found = solution.graph, solution.covariances
     observed = graph.problem.observations
     if found is None or not len(observed):

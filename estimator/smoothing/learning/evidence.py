@@ -190,7 +190,7 @@ def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
 
 
 def _ends_of_alike(own: Array, following: Array) -> list[int]:
-    """For each frame the end of the stretch of frames whose blocks are like its own."""
+    """Return for each frame the end of the stretch of frames whose blocks are like its own."""
     root = np.sqrt(np.abs(np.diagonal(own, axis1=-2, axis2=-1)).max(0))
     scale = 1e-13 * root[:, None] * root
     same = [(np.abs(a[1:] - a[:-1]) <= scale).all((1, 2)) for a in (own, following)]
@@ -275,7 +275,7 @@ def _system(signal: Signal, model: ShakeModel) -> _System:
 
 
 def _constants(signal: Signal, model: ShakeModel) -> tuple[Array, Array]:
-    """(F, P, I): a moving item's travel at 1 mm/s, a fixed item's place; priors (I,)."""
+    """Return (F, P, I): a moving item's travel at 1 mm/s, a fixed item's place; priors (I,)."""
     t = signal.t_s
     columns = np.zeros((len(t), len(signal.item), len(signal.moving)))
     for p, item in enumerate(signal.item):
@@ -318,7 +318,7 @@ class Factor:
         self._fix_constants(data.reshape(-1, wide).T @ weighted.reshape(-1, wide))
 
     def _fix_constants(self, square: Array) -> None:
-        """square : (R + c, R + c) of measurements and columns."""
+        """Eliminate the constants; square : (R + c, R + c) of measurements and columns."""
         from scipy.linalg import cho_factor, cho_solve
 
         count, prior = self.count, 1 / self.system.prior_sigma**2
@@ -492,7 +492,7 @@ class _Places:
     width: int
 
     def moments(self, found: _Moments, which: Ints) -> tuple[Array, Array]:
-        """(m, U, 2 n, 2 n) and (m, n, n): those of processes of n states, their copies' summed."""
+        """Return (m, U, 2 n, 2 n) and (m, n, n) of processes of n states, their copies' summed."""
         size, count = len(found.start), self.copies[which]
         states = np.arange(self.begin[which[0] + 1] - self.begin[which[0]])
         step, start = np.zeros(()), np.zeros(())
@@ -513,7 +513,7 @@ def _expected(
     bubble: list[Process],
     changes: list[_Change],
 ) -> Array:
-    """(changes,) posterior mean of the states' log density, were a process like the change's."""
+    """Return the posterior mean (changes,) of the states' log density under each process."""
     dt_s, index = distinct_steps(np.diff(factor.signal.t_s))
     counts = np.bincount(index, minlength=len(dt_s))
     own = [p.component for p in (*shake, *bubble)]
@@ -539,7 +539,7 @@ def _expected(
 
 
 def _noise_rows(stack: Steps, old: Ints, new: Ints) -> Array:
-    """(m, U, n, 2 n) whitened noise under new processes, from that under old ones and the state."""
+    """Return whitened noise (m, U, n, 2 n) of new processes, from the old noise and the state."""
     one, two = (np.swapaxes(stack.whitener[at], -1, -2) for at in (old, new))
     same = np.swapaxes(np.linalg.solve(one, two), -1, -2)
     moved = stack.whitener[new] @ (stack.transition[old] - stack.transition[new])
@@ -574,7 +574,7 @@ def _moments(factor: Factor) -> _Moments:
 
 
 def _residual(factor: Factor, states: Array, constants: Array, own: Array) -> float:
-    """Posterior mean of the measurements' chi-square.  constants : (c, K)."""
+    """Return the posterior mean of the measurements' chi-square.  constants : (c, K)."""
     weight, count, total = factor.weight, factor.count, 0.0
     values = -factor.system.columns @ constants
     values[..., :count] += factor.rest

@@ -58,7 +58,7 @@ def held_out(problem: SmoothingProblem, model: ShakeModel) -> list[HeldOut]:
 
 
 def _used(problem: SmoothingProblem) -> Window:
-    """The frames from the first to the last that a model is learned from."""
+    """Return the frames from the first to the last that a model is learned from."""
     parts = learning_parts(problem)
     if len(parts) == 1:
         return parts[0]

@@ -166,7 +166,7 @@ def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeMo
 
 
 def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
-    """Names of the RMS of modes across that others began, and what those expect of it."""
+    """Return names of the RMS of modes across that others began, and what those expect of it."""
     return {
         f"modes.{i}.rms_mm": max(mode.rms_mm)
         for i, mode in enumerate(model.modes)
@@ -193,7 +193,7 @@ def _is_kept(label: Attribution, model: ShakeModel, options: Learning) -> bool:
 
 
 def _highest(group: Group, model: ShakeModel) -> float:
-    """The highest frequency at which something stands out."""
+    """Return the highest frequency at which something stands out."""
     lines = [
         line
         for signal in group.signals
@@ -206,7 +206,7 @@ def _highest(group: Group, model: ShakeModel) -> float:
 
 
 def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = False) -> ShakeModel:
-    """The RMS of lines as they are in means over ``factor`` frames, or back."""
+    """Return the model with the RMS of lines in means over ``factor`` frames, or back."""
     if factor < 2:
         return model
     lines = [n for n in names_of(model) if n.endswith("rms_mm") and not n.startswith("broad")]
@@ -226,7 +226,7 @@ class Step:
 
 
 def with_one_more_mode(group: Group, step: Step, options: Learning, first: bool) -> Step | None:
-    """The model with the line added that helps most; None when none is worth its parameters."""
+    """Return the model with the line added that helps most; None if none is worth it."""
     tried = []
     for where in group.owners:
         if step.found.count(where) < options.most_modes:
@@ -267,7 +267,7 @@ def try_low_pass_force(group: Group, step: Step, options: Learning, first: bool)
 
 
 def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
-    """The forces white again, unless the information criterion prefers the low-pass filter."""
+    """Return the fit with white forces, unless the information criterion prefers the low-pass."""
     names = free_names(fit.model, group, options, True)
     if FORCE not in names:
         return fit
@@ -278,7 +278,7 @@ def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
 
 
 def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeModel:
-    """After an arm's first mode, add the same for the other arms, which are built alike."""
+    """Add an arm's first mode to the other arms as well, which are built alike."""
     cameras = group.signals[0].cameras
     have = {m.camera for m in model.modes[:-1] if m.camera != CARRIAGE}
     if where not in cameras or have:
@@ -303,7 +303,7 @@ def _bic_penalty(group: Group, model: ShakeModel) -> float:
 def _distinct(
     trials: Sequence[tuple[float, Owner, ShakeModel]],
 ) -> list[tuple[float, Owner, ShakeModel]]:
-    """The best trial of each kind, of the three best kinds."""
+    """Return the best trial of each kind, of the three best kinds."""
     out: dict[Owner, tuple[float, Owner, ShakeModel]] = {}
     for trial in trials:
         out.setdefault(trial[1], trial)
@@ -443,7 +443,7 @@ class Group:
 
 
 def groups_of(signals: Sequence[Signal], options: Learning, up: Array) -> list[Group]:
-    """The shared coordinate, and the coordinates across it, taken together; up : (3,)."""
+    """Return the shared coordinate, and the coordinates across it, taken together; up : (3,)."""
     if not signals:
         return []
     bubble: tuple[Owner, ...] = () if options.target else (BUBBLE,)
@@ -464,7 +464,7 @@ def _pattern(square: Array) -> Triple:
 
 
 def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) -> list[str]:
-    """Names of what this group determines and nobody holds."""
+    """Return the names of what this group determines and nobody holds."""
     names = []
     for name in names_of(model):
         if is_held(name, model, options):

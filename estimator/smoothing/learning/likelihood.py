@@ -199,7 +199,7 @@ def _spread(signal: Signal, model: ShakeModel) -> _Triple:
 
 
 def _there(signal: Signal) -> Bools:
-    """(B, F) whether each moving item has been seen and will be seen again."""
+    """Return (B, F) whether each moving item has been seen and will be seen again."""
     seen = np.array(
         [(signal.weight[:, signal.item == i] > 0).any(1) for i in np.flatnonzero(signal.moving)]
     )
@@ -228,7 +228,7 @@ def _still(signal: Signal) -> _Triple:
 
 
 def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
-    """Of each bubble, where the signal is split into their mean and their differences."""
+    """Return the signals of each bubble, where they are split into mean and differences."""
     if len(moved) == 1:
         return moved[0]
     (position, velocity, offset), apart = moved
@@ -245,7 +245,7 @@ def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
 
 
 def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
-    """(rows,) of the bubbles' states, from (B, F) of the signal's bubbles, or (1, 1) of all."""
+    """Return (rows,) of the bubbles' states, from (B, F) of the signal's bubbles, or (1, 1)."""
     graph = solution.graph
     if variance.size == 1:
         return np.full(graph.rows, variance.item())
@@ -263,7 +263,7 @@ def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
 
 
 def _mean(variance: Array) -> Array:
-    """(1, 1) of all that are known."""
+    """Return the mean (1, 1) of all that are known."""
     return np.asarray(np.mean(variance[np.isfinite(variance)])).reshape(1, 1)
 
 

@@ -70,7 +70,7 @@ class Signal:
 
 
 def sight_directions(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, ...]]]:
-    """Directions (3,) with the cameras that see them; the shared one first, if there is one."""
+    """Return directions (3,) with the cameras that see them; the shared one first, if any."""
     depths = np.array([c.camera_from_rig.rotation[2] for c in problem.cameras])
     cross = np.cross(depths[0], depths[-1])
     length = float(np.linalg.norm(cross))
@@ -87,7 +87,7 @@ def sight_directions(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, 
 
 
 def _signed(direction: Array) -> Array:
-    """The same line, its largest component positive."""
+    """Return the same line, its largest component positive."""
     return np.asarray(direction * np.sign(direction[np.abs(direction).argmax()]))
 
 
@@ -150,7 +150,7 @@ def _along(
     problem: SmoothingProblem, obs: Observations, points: Array, position: Array, direction: Array,
     cameras: tuple[int, ...],
 ) -> _Rows:  # fmt: skip
-    """Pixels turned into lab coordinates along the direction, linearised at ``points``."""
+    """Return pixels turned into lab coordinates along the direction, linearised at ``points``."""
     parts: list[_Rows] = []
     for index, c in enumerate(cameras):
         mine = np.flatnonzero(obs.camera == c)
@@ -242,13 +242,13 @@ def stacked(pieces: Sequence[Signal]) -> Signal:
 
 
 def contrasts(count: int) -> Array:
-    """(count - 1, count) orthonormal rows that are blind to the mean (Helmert)."""
+    """Return (count - 1, count) orthonormal rows that are blind to the mean (Helmert)."""
     full = np.linalg.qr(np.c_[np.ones(count), np.eye(count)[:, : count - 1]])[0]
     return np.asarray(full[:, 1:].T)
 
 
 def _bridged(t_s: Array, value: Array, weight: Array) -> tuple[Array, Array]:
-    """Values (F, P) with their gaps closed; weights (F, P), the same at all frames."""
+    """Return the values (F, P) with their gaps closed; weights (F, P), the same at all frames."""
     out = value.copy()
     for column in range(value.shape[1]):
         good = weight[:, column] > 0

@@ -94,7 +94,7 @@ def _all_see(problem: SmoothingProblem) -> bool:
 
 
 def _with_fewer(piece: Window, count: int) -> Window:
-    """The piece with so many bubbles only."""
+    """Return the piece with so many bubbles only."""
     fewer = cut_out(piece.problem, 0, len(piece.problem.t_s), most_bubbles=count)
     return Window(fewer.problem, piece.first, piece.bubbles[fewer.bubbles])
 

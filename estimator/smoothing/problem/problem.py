@@ -326,7 +326,7 @@ class SmoothingProblem:
         return len(self.references) > 0 or len(self.arms_with_sensor) == len(self.cameras)
 
     def __post_init__(self) -> None:
-        """Raises InputError for times that do not increase or a run of fewer than two frames."""
+        """Raise InputError for times that do not increase or a run of fewer than two frames."""
         if len(self.t_s) < 2:
             raise InputError(
                 f"a run of {len(self.t_s)} frame(s) has no motion to smooth",

@@ -607,7 +607,7 @@ def _mountings(
         }  # fmt: skip
 
     def lead_of_images(name: str, judged: dict[str, Mounting]) -> float:
-        """By how much images and encoder alone prefer the axes that were found."""
+        """Return by how much images and encoder alone prefer the axes that were found."""
         sensor = next(s for s in sensors if s.name == name)
         felt = _felt(problem, images, sensor, axes, {})
         return lead_of_axes(sensor.axes, judged[name].axes, *read[name], felt)

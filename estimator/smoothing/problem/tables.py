@@ -169,7 +169,7 @@ def _check_references(table: Any, cameras: Sequence[Camera]) -> None:
 def _marks(
     seen: Observations, cameras: Sequence[Camera], positions_mm: Array, axis: Array, count: int
 ) -> Array:
-    """(count, 3) lab points nearest to all rays, and to the rig's origin where depth is unseen."""
+    """Return lab points (count, 3) nearest to all rays, and to the origin in unseen depth."""
     normal, right = np.tile(1e-6 * np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     for c, camera in enumerate(cameras):
         mine = seen.camera == c
@@ -322,7 +322,7 @@ def _times(table: pd.DataFrame, frame_times_s: Array | None) -> Array:
 def _paired(
     table: pd.DataFrame, index: int, camera: str, number: dict[int, int]
 ) -> tuple[Any, ...]:
-    """The bubbles that both cameras saw, corrected towards the centre of volume where known."""
+    """Return bubbles that both cameras saw, corrected towards the centre of volume where known."""
     columns = [f"{camera}_{c}" for c in _PIXELS]
     values = table[columns].to_numpy(float)
     shift = [f"{camera}_du_px", f"{camera}_dv_px"]
@@ -337,7 +337,7 @@ def _paired(
 def _single(
     table: pd.DataFrame, detections: pd.DataFrame, index: int, camera: str, number: dict[int, int]
 ) -> tuple[Any, ...]:
-    """Detections of a track in frames in which the other camera did not see it."""
+    """Return the detections of a track in frames in which the other camera did not see it."""
     rows = detections[(detections["camera"] == camera) & detections["particle"].notna()]
     ids = rows["particle"].to_numpy(float).astype(np.int64)
     paired = set(zip(table["frame"].tolist(), table["particle"].tolist()))
@@ -371,7 +371,7 @@ def _covariance(values: Array) -> Array:
 
 
 def bubbles_of(tracked: Tracked, positions_mm: Array, axis: Array) -> tuple[Bubble, ...]:
-    """Every bubble with its lab positions from triangulation, straight lines over its gaps."""
+    """Return every bubble with its triangulated lab positions and straight lines over its gaps."""
     out = []
     for particle in tracked.particles:
         rows = tracked.table[tracked.table["particle"] == particle].sort_values("frame")

@@ -69,7 +69,7 @@ def _of_one(solution: Solution, draws: Draws) -> Iterator[Contradiction]:
 
 
 def _outliers(solution: Solution) -> Iterator[Contradiction]:
-    """Sources of which so many pixels are left out that these cannot be outliers."""
+    """Return the sources of which so many pixels are left out that these cannot be outliers."""
     problem = solution.graph.problem
     for source, obs, weights in (
         (BUBBLES, problem.observations, solution.weights[0]),
@@ -85,7 +85,7 @@ def _outliers(solution: Solution) -> Iterator[Contradiction]:
 
 
 def _constants(solution: Solution) -> Iterator[Contradiction]:
-    """Biases and delays that their priors do not allow."""
+    """Return the biases and delays that their priors do not allow."""
     graph = solution.graph
     delays = solution.delays_s
     for i, sensor in enumerate(graph.problem.accelerometers):
@@ -107,7 +107,7 @@ def _constants(solution: Solution) -> Iterator[Contradiction]:
 
 
 def _speeds(solution: Solution) -> Iterator[Contradiction]:
-    """A mean speed of the bubbles that no bubble has."""
+    """Return a mean speed of the bubbles that no bubble has."""
     problem = solution.graph.problem
     if not problem.bubbles:
         return
@@ -192,7 +192,7 @@ def residual_contradictions(solution: Solution, draws: Draws) -> Iterator[Contra
 
 
 def _when(solution: Solution, group: Group) -> tuple[float, float]:
-    """First and last time of the windows in which the residuals are too large."""
+    """Return the first and last time of the windows in which the residuals are too large."""
     t = solution.graph.problem.t_s
     width = max(_WINDOW_S, _LEAST_FRAMES * float(np.median(np.diff(t))))
     window = ((group.t_s - t[0]) / width).astype(np.int64).clip(0)
@@ -269,14 +269,14 @@ def _blamed(
 
 
 def _named(one: Contradiction, blamed: tuple[str, ...]) -> Contradiction:
-    """The contradiction with the other side of it."""
+    """Return the contradiction with the other side of it."""
     if one.source not in blamed:
         return one.model_copy(update={"against": blamed})
     return one
 
 
 def _spread(solution: Solution, other: Solution) -> tuple[float, float, float]:
-    """Factor by which the sd have to grow so that they hold the other result with its own sd."""
+    """Return the factor by which the sd have to grow to hold the other result with its own sd."""
     ours, theirs = solution.graph, other.graph
     assert solution.covariances is not None and other.covariances is not None
     if not ours.rows:

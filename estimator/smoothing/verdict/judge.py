@@ -84,7 +84,7 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
 
 
 def _widened(axis: AxisVerdict, factor: float) -> AxisVerdict:
-    """The verdict along an axis where measurements disagree by a factor of standard deviations."""
+    """Return the verdict along an axis where measurements disagree by a factor of sd."""
     wide = replace(axis, q=axis.q * factor, sigma_mm=axis.sigma_mm * factor)
     if factor <= RESOLVED_Q:
         return wide
@@ -93,7 +93,7 @@ def _widened(axis: AxisVerdict, factor: float) -> AxisVerdict:
 
 
 def _flags(found: dict[str, AxisVerdict]) -> list[Flag]:
-    """Ambiguous if any axis is; below noise only if all are."""
+    """Return the flags of the run: ambiguous if any axis is, below noise only if all are."""
     flags = []
     if any(Flag.LABEL_AMBIGUOUS in axis.flags for axis in found.values()):
         flags.append(Flag.LABEL_AMBIGUOUS)

@@ -125,7 +125,7 @@ class _Line:
 def _owned(
     spectra: _Spectra, line: _Line, seen: Bools, shared: Bools, names: Sequence[str]
 ) -> list[ShakeMode]:
-    """The line as common, or as the arms'."""
+    """Return the line as common, or as the arms'."""
     own, cross = line.power(spectra.own), line.power(spectra.cross)
     among = cross[:, :, shared].sum(-1)
     sd = np.sqrt(np.clip(np.diagonal(among), 0, None))
@@ -144,7 +144,7 @@ def _same_line(line: _Line, row: ShakeMode) -> bool:
 
 
 def _spectra(t_s: Array, series: Array) -> _Spectra | None:
-    """Of (C, n, 3) at times (n,); None for a short record or one without motion."""
+    """Return spectra of (C, n, 3) at times (n,); None for a short record or no motion."""
     step = float(np.median(np.diff(t_s)))
     if len(t_s) < _LEAST_SAMPLES or not np.any(series):
         return None
@@ -160,7 +160,7 @@ def _spectra(t_s: Array, series: Array) -> _Spectra | None:
 
 
 def _lines(spectra: _Spectra, total: Array, noise_mm2: float) -> list[_Line]:
-    """Peaks of a density (F,) that hold a good share of its variance and rise above its noise."""
+    """Return peaks of a density (F,) above its noise that hold a good share of its variance."""
     frequency = spectra.frequency_hz
     width = float(frequency[1])
     variance = float(total.sum() * width)
@@ -184,7 +184,7 @@ def _lines(spectra: _Spectra, total: Array, noise_mm2: float) -> list[_Line]:
 
 
 def _half_width(total: Array, peak: int) -> int:
-    """Bins from a peak to where it has half of its height."""
+    """Return the number of bins from a peak to where it has half of its height."""
     below = np.flatnonzero(total[peak:] < total[peak] / 2)
     above = np.flatnonzero(total[peak::-1] < total[peak] / 2)
     sides = [side[0] for side in (below, above) if len(side)]
@@ -192,7 +192,7 @@ def _half_width(total: Array, peak: int) -> int:
 
 
 def _from_carriage(solution: Solution) -> list[ShakeMode]:
-    """Following errors: lines of the encoder's record after a smooth travel is taken off."""
+    """Return following errors: lines of the encoder's record after a smooth travel is taken off."""
     problem, noise = solution.graph.problem, solution.graph.model.encoder_sigma_mm
     if problem.stage is None:
         return []

@@ -60,7 +60,7 @@ class _Path:
     """One bubble: times (n,), positions and velocities (n, 3), and K draws of their errors."""
 
     def __init__(self, solution: Solution, errors: Array, bubble: int, widen: Array) -> None:
-        """errors : (rows, d, K) draws of all bubbles' increments."""
+        """Prepare the path; errors : (rows, d, K) draws of all bubbles' increments."""
         graph, found = solution.graph, solution.covariances
         assert found is not None
         rows = np.arange(graph.first_row[bubble], graph.first_row[bubble + 1])
@@ -88,7 +88,7 @@ class _Path:
         return float(self.t_s[-1] - self.t_s[0])
 
     def spectrum(self, values: Array) -> tuple[Array, Array]:
-        """Frequencies (F,) and power (F, ...) of values (n, ...) at even times, lines removed."""
+        """Return frequencies (F,) and power (F, ...) of values (n, ...) less their lines."""
         from scipy.signal import detrend
 
         step = float(np.median(np.diff(self.t_s)))
@@ -149,7 +149,7 @@ def _rms(values: Array) -> float:
 
 
 def _mean_velocity(path: _Path, axis: int) -> tuple[float, float]:
-    """Displacement from the first to the last frame over the time, mm/s."""
+    """Return the displacement from the first to the last frame over the time, mm/s."""
     place, error = path.values[0][:, axis], path.errors[0][:, axis]
     variance = np.mean(((error[-1] - error[0]) / path.span_s) ** 2)
     sd = np.sqrt(variance + path.mean_speed_variance[axis])
@@ -157,7 +157,7 @@ def _mean_velocity(path: _Path, axis: int) -> tuple[float, float]:
 
 
 def _clear_hz(path: _Path, axis: int) -> float:
-    """Frequency up to which the path's power is above that of its errors; 0 if nowhere."""
+    """Return frequency up to which the path's power is above that of its errors; 0 if nowhere."""
     frequency, power = path.spectrum(path.values[0][:, axis])
     noise = path.spectrum(path.errors[0][:, axis])[1].mean(-1)
     three = np.ones(3) / 3
@@ -168,7 +168,7 @@ def _clear_hz(path: _Path, axis: int) -> float:
 
 
 def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
-    """RMS of the path about its line and of its errors up to a frequency, mm."""
+    """Return the RMS of the path about its line and of its errors up to a frequency, mm."""
     frequency, power = path.spectrum(path.values[0][:, axis])
     noise = path.spectrum(path.errors[0][:, axis])[1].mean(-1)
     band = frequency <= (below_hz or np.inf)
@@ -176,7 +176,7 @@ def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
 
 
 def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Frequency (Hz) and amplitude (mm) of the swing, each with its sd; None if there is none."""
+    """Return frequency (Hz) and amplitude (mm) of the swing, each with its sd; None without one."""
     if path.span_s * _ZIGZAG_HZ[0] < _LEAST_PERIODS:
         return None
     place, error = path.values[0][:, axis], path.errors[0][:, axis]
@@ -195,7 +195,7 @@ def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, f
 
 
 def _swing(frequency: Array, band: Bools) -> Callable[[Array], Array]:
-    """The mean frequency and the amplitude of what a spectrum has in a band."""
+    """Return the mean frequency and the amplitude of what a spectrum has in a band."""
 
     def measure(power: Array) -> Array:
         total = power[band].sum()

@@ -65,7 +65,7 @@ def pixel_whiteness(solution: Solution) -> dict[str, Any]:
 
 
 def _compared(seen: Array, model: Array) -> dict[str, Any]:
-    """Mean products so many frames apart, (LAGS + 1,) of the residuals, (draws, ...) of drawn."""
+    """Return mean products by lag: (LAGS + 1,) of the residuals, (draws, ...) of the drawn ones."""
     from scipy.stats import f as fisher
 
     rho, drawn = seen[1:] / seen[0], model[:, 1:] / model[:, :1]
@@ -87,7 +87,7 @@ def _compared(seen: Array, model: Array) -> dict[str, Any]:
 
 
 def _lagged(residuals: Array, item: Ints, frame: Ints) -> Array | None:
-    """(K, LAGS + 1) mean products of residuals (m, 2, K) so many frames apart; None of too few."""
+    """Return mean products (K, LAGS + 1) of residuals (m, 2, K) by lag; None for too few."""
     if not len(item):
         return None
     items, row = np.unique(item, return_inverse=True)
@@ -132,7 +132,7 @@ def accelerometer_spectra(solution: Solution) -> dict[str, Any]:
 
 
 def _density(values: Array, rate_hz: float) -> tuple[Array, Array]:
-    """Welch's estimate, columns summed, averaged into bands where there are many bins."""
+    """Return Welch's estimate, columns summed, averaged into bands where there are many bins."""
     from scipy.signal import welch
 
     length = min(len(values), _LONGEST_SEGMENT)
@@ -158,7 +158,7 @@ class Stretch:
     inner: tuple[int, int]
 
     def columns(self, linear: LinearFactors) -> Ints:
-        """(M, keys) first column of each block of the factors, -1 where it is held."""
+        """Return (M, keys) first column of each block of the factors, -1 where it is held."""
         count = len(linear.rhs)
         moving = len(self.column)
         out = np.full((count, len(linear.keys)), -1)
@@ -170,7 +170,7 @@ class Stretch:
 
 
 def stretch_of(graph: GraphLayout, middle: int) -> Stretch | None:
-    """About a frame, 200 frames or, where much moves, down to 40; None if that is too much, too."""
+    """Return 200 frames about a frame, down to 40 where much moves; None if those are too many."""
     (nodes, shake), (_, bubble) = graph.counts()[:2]
     when = np.r_[np.arange(nodes), graph.node_of_row]
     sizes = np.repeat([shake, bubble], [nodes, graph.rows])
@@ -253,7 +253,7 @@ class _Part:
 
 
 def _fitted(stretch: Stretch, parts: Sequence[_Part], noise: Sequence[Array]) -> Array:
-    """(columns, draws) least-squares solutions of the stretch for each draw of the noise."""
+    """Return (columns, draws) least-squares solutions of the stretch for each draw of the noise."""
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
     places, values = [np.zeros(0, np.int64)], [np.zeros(0)]

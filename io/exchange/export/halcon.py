@@ -161,14 +161,14 @@ def _halcon_camera(camera: Camera, points: Array) -> HalconCamera:
 
 
 def _linear_map(camera: Camera) -> Array:
-    """(2, 2) px per mm, from distorted telecentric coordinates to pixels."""
+    """Return the map (2, 2) in px per mm, from distorted telecentric coordinates to pixels."""
     affine = camera["scale_px_per_mm"] * np.array([[1, camera["skew"]], [0, camera["aspect"]]])
     q = np.array([camera["tilt_x"], camera["tilt_y"]])
     return np.asarray(affine @ (np.eye(2) + np.outer(q, q) / (1 + np.sqrt(1 + q @ q))))
 
 
 def _sensor(camera: Camera, stretch: Array) -> dict[str, float]:
-    """tilt and rot where the sensor is tilted; sx, sy, cx, cy and the image's size."""
+    """Return tilt and rot where the sensor is tilted; sx, sy, cx, cy and the image's size."""
     width, height = camera.image_size_px
     values: dict[str, float] = {}
     px_per_mm = np.diag(stretch)
@@ -189,7 +189,7 @@ def _sensor(camera: Camera, stretch: Array) -> dict[str, float]:
 
 
 def _fitted_distortion(camera: Camera, stretch: Array, rotation: Array) -> dict[str, float]:
-    """Least squares over the image, in HALCON's direction, in which the model is linear."""
+    """Return the distortion, fitted over the image in HALCON's direction, where it is linear."""
     width, height = camera.image_size_px
     edges = [np.linspace(0, size - 1, _PIXELS_PER_EDGE) for size in (width, height)]
     uv = np.stack(np.meshgrid(*edges), -1).reshape(-1, 2)
@@ -225,7 +225,7 @@ def _pixel_from_camera(points_m: Array, values: dict[str, float]) -> Array:
 
 
 def _distorted(undistorted_m: Array, values: dict[str, float]) -> Array:
-    """The inverse of HALCON's distortion. Raises GeometryError where there is none."""
+    """Return the inverse of HALCON's distortion. Raises GeometryError where there is none."""
     if "kappa" in values:
         return undistorted_m
     coefficients = np.zeros(len(COEFFICIENTS))

@@ -87,7 +87,7 @@ def undistorted_matrix(camera: Camera) -> Array:
 
 
 def _pixel_matrix(camera: Camera, scale: float) -> Array:
-    """(3, 3) scale, aspect and image centre, without skew."""
+    """Return (3, 3) scale, aspect and image centre, without skew."""
     return np.array(
         [
             [scale, 0, camera["centre_u_px"]],
@@ -98,7 +98,7 @@ def _pixel_matrix(camera: Camera, scale: float) -> Array:
 
 
 def _telecentric_matrix(camera: Camera) -> Array:
-    """(3, 4) telecentric coordinates of a camera point.
+    """Return (3, 4) telecentric coordinates of a camera point.
 
     Behind a refractive window it is linearised about the ray through the origin; the rays then
     diverge n_air / n_water times as fast.

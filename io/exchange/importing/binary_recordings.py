@@ -36,7 +36,7 @@ def _reading(path: Path, kind: str) -> Iterator[list[warnings.WarningMessage]]:
 
 
 def read_wav(path: Path) -> Recording:
-    """Channels and rate of a WAV file; whole numbers are scaled so that ±1 is full scale."""
+    """Read channels and rate of a WAV file; whole numbers are scaled so that ±1 is full scale."""
     from scipy.io import wavfile
 
     with _reading(path, "WAV") as warned:
@@ -109,7 +109,7 @@ def loaded_hdf5(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_tdms(path: Path, group: str | None = None) -> Recording:
-    """Channels of one group, with their units and rate."""
+    """Read the channels of one group, with their units and rate."""
     try:
         nptdms = import_module("nptdms")
     except ModuleNotFoundError as error:

@@ -76,7 +76,7 @@ def read_opencv_cameras(
 
 
 def _content(file: Path) -> dict[str, Array]:
-    """Every matrix and number at the root of the file."""
+    """Return every matrix and number at the root of the file."""
     if not file.is_file():
         raise InputError("there is no such file", where=str(file), todo="check the path")
     try:

@@ -158,7 +158,7 @@ def _numbers(path: Path, least: int) -> Array:
 
 
 def _pixel_from_metric(file: _Orientation, sensor: Sensor) -> Array:
-    """(3, 3) from distorted sensor coordinates in mm, y down, to telerig's pixels."""
+    """Return (3, 3) from distorted sensor coordinates in mm, y down, to telerig's pixels."""
     scx, she = file.added[5:]
     (width, height), (pixel_x, pixel_y) = sensor.image_size_px, sensor.pixel_size_mm
     return np.array(
@@ -190,7 +190,7 @@ def _pinhole(file: _Orientation, sensor: Sensor) -> Pinhole:
 
 
 def _fitted(file: _Orientation, camera: Camera, sensor: Sensor) -> tuple[Camera, str]:
-    """The camera with its distortion fitted over the image, with a turn about its axis."""
+    """Return the camera with its distortion fitted over the image, with a turn about its axis."""
     from scipy.optimize import least_squares
 
     width, height = sensor.image_size_px
@@ -227,7 +227,7 @@ def _fitted(file: _Orientation, camera: Camera, sensor: Sensor) -> tuple[Camera,
 
 
 def _distorted_px(file: _Orientation, straight_px: Array, sensor: Sensor) -> Array:
-    """OpenPTV's distortion between pixels without and with it."""
+    """Return OpenPTV's distortion between pixels without and with it."""
     matrix = _pixel_from_metric(file, sensor)
     flat = np.linalg.solve(matrix[:2, :2], (straight_px - matrix[:2, 2]).T).T
     k1, k2, k3, p1, p2 = file.added[:5]

@@ -52,7 +52,7 @@ class Pinhole:
         return bool(np.linalg.det(self.camera_matrix @ self.rotation) < 0)
 
     def error(self, what: str, todo: str) -> InputError:
-        """The error of this camera's file."""
+        """Return the error of this camera's file."""
         return InputError(what, where=self.where, todo=todo)
 
 
@@ -66,7 +66,7 @@ class ImportedCameras(NamedTuple):
 
 
 def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> ImportedCameras:
-    """The cameras of this library that give the same pixels.
+    """Return the cameras of this library that give the same pixels.
 
     The rig frame is the first camera's, its origin where the first two optical axes come closest
     (for one camera: at the depth of the world's origin).
@@ -142,7 +142,7 @@ def _check(one: Pinhole) -> None:
 
 
 def _split(one: Pinhole, mirror: Array) -> tuple[Array, Pose]:
-    """(3, 3) upper triangular map with positive diagonal, and camera_from_world (unmirrored)."""
+    """Return an upper triangular map (3, 3) with positive diagonal, and camera_from_world."""
     from scipy.linalg import rq
 
     rotation = nearest_rotation(one.rotation) if np.any(one.distortion) else one.rotation
@@ -154,7 +154,7 @@ def _split(one: Pinhole, mirror: Array) -> tuple[Array, Pose]:
 
 
 def _working_distances(camera_from_world: list[Pose]) -> list[float]:
-    """Distance to each camera's plane Z = 0, where its axis is closest to another camera's."""
+    """Return each camera's distance to Z = 0, where its axis is closest to another camera's."""
     back = [p.inverse() for p in camera_from_world]
     out = [float(p.translation_mm[2]) for p in camera_from_world]
     for i in range(len(back) if len(back) > 1 else 0):

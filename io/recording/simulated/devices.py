@@ -72,11 +72,11 @@ class SimulatedDevice:
     faults: Faults = field(default_factory=Faults)
 
     def due_s(self, number: Ints | int) -> Array:
-        """When reading ``number`` is made, in the host's seconds from the device's start."""
+        """Return when reading ``number`` is made, in the host's seconds from the device's start."""
         return np.asarray(self.elapsed_s(number) / (1 + 1e-6 * self.drift_ppm))
 
     def elapsed_s(self, number: Ints | int) -> Array:
-        """The same by the device's own clock."""
+        """Return the same by the device's own clock."""
         return np.round(np.asarray(number) * self._ticks_apart()) * self.device.time_unit_s
 
     def first_after(self, host_s: float) -> int:
@@ -87,7 +87,7 @@ class SimulatedDevice:
         return max(number, 0)
 
     def stamps(self, number: Ints) -> Ints:
-        """The counter's ticks that readings carry."""
+        """Return the counter's ticks that readings carry."""
         ticks = np.round(number * self._ticks_apart()).astype(np.int64) + self.start_ticks
         return ticks % 2**self.device.time_bits if self.device.time_bits else ticks
 
@@ -96,7 +96,7 @@ class SimulatedDevice:
 
 
 def true_values(sim: SimulatedDevice, number: Ints) -> dict[str, Array]:
-    """The values of readings, exactly as they are sent."""
+    """Return the values of readings, exactly as they are sent."""
     phase = 2 * np.pi * sim.elapsed_s(number) / PERIOD_S
     kind = sim.device.kind
     if kind == "frames":
@@ -115,7 +115,7 @@ def true_values(sim: SimulatedDevice, number: Ints) -> dict[str, Array]:
 
 
 def messages(sim: SimulatedDevice, number: Ints) -> list[bytes]:
-    """The bytes of each of these readings."""
+    """Return the bytes of each of these readings."""
     stamps, values = sim.stamps(number).tolist(), true_values(sim, number)
     rows = list(zip(*(v.tolist() for v in values.values())))
     if sim.device.protocol == "packets":
@@ -132,7 +132,7 @@ def messages(sim: SimulatedDevice, number: Ints) -> list[bytes]:
 
 
 def answer(device: DeviceDescription, position_mm: float) -> bytes:
-    """The answer of a polled stage."""
+    """Return the answer of a polled stage."""
     if device.protocol == "grbl":
         place = {axis: position_mm if axis == device.axis else 0.0 for axis in "xyz"}
         positions = ",".join(f"{place[axis]:.3f}" for axis in "xyz")
@@ -141,14 +141,14 @@ def answer(device: DeviceDescription, position_mm: float) -> bytes:
 
 
 def stage_position_mm(elapsed_s: Array) -> Array:
-    """Position of the simulated stage."""
+    """Return the position (mm) of the simulated stage."""
     return TRAVEL_MM * (1 - np.cos(2 * np.pi * elapsed_s / PERIOD_S))
 
 
 def damage(
     pieces: list[bytes], faults: Faults, per_reading_s: float, rng: Generator
 ) -> tuple[bytes, list[int]]:
-    """The bytes that arrive over a line with faults, and the indices of the damaged pieces."""
+    """Return the bytes that arrive over a faulty line, and the indices of the damaged pieces."""
     if not faults.garbage_hz and not faults.cut_hz and not faults.lost_byte:
         return b"".join(pieces), []
     out, spoilt = list(pieces), set()
@@ -328,7 +328,7 @@ class SimulatedPorts:
 def made_since_last(
     sim: SimulatedDevice, truth: Truth, host_s: float, rng: Generator
 ) -> tuple[Ints, list[bytes], bytes]:
-    """Indices of the readings since the last call, the bytes of each, and those that arrive."""
+    """Return indices and bytes of the readings since the last call, and the bytes that arrive."""
     until = sim.first_after(host_s)
     number = np.arange(truth.sent, until)
     number = number[~np.isin(number, sim.faults.skip)]
@@ -354,7 +354,7 @@ UNPLACED = "not placed"
 
 
 def practice_devices() -> list[SimulatedDevice]:
-    """Encoder at 1 kHz, an accelerometer at 2 kHz on each arm, cameras' frame counter at 100 Hz.
+    """Return an encoder at 1 kHz, accelerometers at 2 kHz on each arm, a frame counter at 100 Hz.
 
     Their clocks drift, and the encoder's counter wraps after `WRAP_AFTER_S`.
     """
@@ -374,7 +374,7 @@ def practice_devices() -> list[SimulatedDevice]:
 
 
 def practice_rig(devices: Sequence[DeviceDescription]) -> RigDescription:
-    """A rig of two cameras that knows these devices."""
+    """Return a rig of two cameras that knows these devices."""
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     sensors = [d.name for d in devices if d.kind == "accelerometer"]
     cameras = {name: CameraDescription(name, (512, 512), 10.0) for name in ("left", "right")}

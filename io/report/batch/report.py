@@ -77,7 +77,7 @@ def _checked(job: Any) -> Job:
 
 
 def render(jobs: Sequence[Job], folder: Path, name: str) -> str:
-    """The page as text. folder : where it will lie, for the links. name : of the batch."""
+    """Return the page as text. folder : where it will lie, for the links. name : of the batch."""
     failed = [j for j in jobs if j["status"] != _DONE]
     runs = {(j["dataset"], j["run"]) for j in jobs if j["run"]}
     lost = {(j["dataset"], j["run"]) for j in failed if j["run"]}
@@ -161,7 +161,7 @@ def _text(value: Any) -> str:
 
 
 def _link(job: Job, folder: Path, results: str) -> str:
-    """From the batch's page to the report, where there is one: relative if the disk allows it."""
+    """Return the link from the batch's page to a report, relative if the disk allows it."""
     target = Path(job["dataset"]) / "results" / results / "report.html"
     if not target.is_file():
         return ""
@@ -213,7 +213,7 @@ def _times(jobs: Sequence[Job]) -> Picture | None:
 def _by_job(
     title: str, xlabel: str, ylabel: str, curves: Sequence[Curve], caption: str, none: Any = ()
 ) -> Picture:
-    """Points from zero over whole numbers of jobs. none : jobs without a result."""
+    """Return the points from zero over whole numbers of jobs. none : jobs without a result."""
     from matplotlib.ticker import MaxNLocator
 
     legend = "above" if len(curves) > 1 else ""

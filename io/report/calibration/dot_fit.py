@@ -34,7 +34,7 @@ def edge_distance_px(example: Mapping[str, Array]) -> Array:
 
 
 def dot_pictures(example: Mapping[str, Array]) -> list[Picture]:
-    """Image, surface and profile; empty when there is no example."""
+    """Draw image, surface and profile of the example; nothing without an example."""
     if not example:
         return []
     near = _cropped(example)
@@ -42,7 +42,7 @@ def dot_pictures(example: Mapping[str, Array]) -> list[Picture]:
 
 
 def _cropped(example: Mapping[str, Array]) -> dict[str, Array]:
-    """The part of the patch that lies no farther from the ellipse than its neighbours might."""
+    """Return the part of the patch no farther from the ellipse than its neighbours might be."""
     near = edge_distance_px(example) <= _reach_px(example)
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     if len(rows) < 3 or len(columns) < 3:

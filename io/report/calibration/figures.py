@@ -30,7 +30,7 @@ _LONGEST = 0.12
 
 
 def residual_field(results: CalibrationResults, index: int) -> Picture:
-    """Arrows from the predicted towards the measured place of every dot of one camera."""
+    """Draw arrows from the predicted towards the measured place of every dot of one camera."""
     camera = results.cameras[index]
     table = results.residuals[results.residuals["camera"] == camera.name]
     kept, left_out = table[table["kept"]], table[~table["kept"]]
@@ -89,7 +89,7 @@ def _arrows(table: pd.DataFrame, size_px: tuple[int, int]) -> tuple[Array, Array
 
 
 def residual_histogram(results: CalibrationResults) -> Picture:
-    """All residual coordinates against the normal distribution that the noise predicts."""
+    """Draw all residual coordinates against the normal distribution that the noise predicts."""
     table = results.residuals
     whitened = "whitened_u" in table
     columns = ["whitened_u", "whitened_v"] if whitened else ["du_px", "dv_px"]
@@ -132,7 +132,7 @@ _MOST_LABELS = 30
 
 
 def coverage(results: CalibrationResults, index: int) -> Picture:
-    """Every kept dot of one camera over the image, and the cells that no dot reached."""
+    """Draw every kept dot of one camera over the image, and the cells that no dot reached."""
     camera = results.cameras[index]
     table = results.residuals
     mine = table[(table["camera"] == camera.name) & table["kept"]]
@@ -173,7 +173,7 @@ def tilt_angles_rad(results: CalibrationResults, index: int) -> tuple[list[str],
 
 
 def tilts(results: CalibrationResults) -> Picture:
-    """Tilt and its direction for every view and camera, as a disc with 90 degrees at its rim."""
+    """Draw tilt and its direction for every view and camera on a disc, 90 degrees at its rim."""
     every: list[float] = []
     turn = np.linspace(0, 2 * np.pi, 91)
     with drawing(4.0) as sheet:
@@ -210,7 +210,7 @@ _LEVELS = 8
 
 
 def trust_pictures(results: CalibrationResults) -> list[Picture]:
-    """What the folder has of these; a single camera has none."""
+    """Return the pictures of which the folder has data; a single camera has none."""
     found = []
     if results.uncertainty:
         maps = [_map(results.uncertainty, *what) for what in (_CALIBRATION, _MEASUREMENT)]
@@ -279,7 +279,7 @@ def same_everywhere(results: CalibrationResults) -> str:
 
 
 def _halves(halves: Mapping[str, Any]) -> Picture:
-    """Arrows: how the two halves of the views differ. Circles: what the covariances predict."""
+    """Draw how the halves of the views differ as arrows, and what is predicted as circles."""
     from matplotlib.patches import Circle
 
     points, shift, sd = (

@@ -145,6 +145,6 @@ def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[st
 
 
 def contact_sheet(results: CalibrationResults) -> ContactSheet:
-    """The overlays of a calibration. Raises InputError for a picture that cannot be read."""
+    """Return the overlays of a calibration. Raises InputError for a picture that cannot be read."""
     views = list(results.views) if results.overlays else []
     return picture_sheet(views, results.camera_names, results.overlays)

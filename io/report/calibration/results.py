@@ -156,7 +156,7 @@ def _residuals(
 
 
 def _with_whitened(table: pd.DataFrame, file: Path, floor_px: float) -> pd.DataFrame:
-    """Residuals in units of the dots' own covariance, the common noise floor added to it."""
+    """Return residuals in units of the dots' own covariance, the common noise floor added to it."""
     if not file.is_file():
         return table
     names = list(DOT_COVARIANCE)

@@ -52,7 +52,7 @@ class RigOutline:
 
 
 def rig_outline(results: CalibrationResults) -> RigOutline:
-    """Everything that the drawings show, in the rig frame (mm)."""
+    """Return everything that the drawings show, in the rig frame (mm)."""
     plate = plate_corners(results.points_mm)
     poses = list(results.views.values())
     plates = np.array([pose.apply(plate) for pose in poses]).reshape(-1, 4, 3)
@@ -63,7 +63,7 @@ def rig_outline(results: CalibrationResults) -> RigOutline:
 
 
 def plate_corners(points_mm: Array, margin: float = 0.0) -> Array:
-    """(4, 3) of the rectangle round dots (N, 3) in the target's frame, widened by a share of it."""
+    """Return corners (4, 3) of the rectangle round dots (N, 3) of a target, widened by a share."""
     low, high = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
     wider = margin * float((high - low).max())
     (x0, y0), (x1, y1) = low - wider, high + wider
@@ -103,7 +103,7 @@ def _camera_outline(camera: Camera, points_mm: Array) -> CameraOutline:
 
 
 def _section(camera: Camera, depth_mm: float) -> Array:
-    """(4, 3) where the image's corners look at a depth, distortion and sensor tilt left out."""
+    """Return points (4, 3) that the image's corners see at a depth, without distortion and tilt."""
     bent = PARAMETERS[PARAMETERS.index("k1") :]
     width, height = camera.image_size_px
     u, v = width - 0.5, height - 0.5
@@ -129,7 +129,7 @@ _BOX_FACES = [[0, 0, 4, 4, 0, 0, 1, 1, 2, 2, 3, 3], [1, 2, 6, 7, 1, 5, 2, 6, 3, 
 
 
 def scene_json(results: CalibrationResults) -> str:
-    """Traces and layout for ``Plotly.newPlot``, safe inside a script element."""
+    """Return the traces and layout for ``Plotly.newPlot``, safe inside a script element."""
     outline = rig_outline(results)
     traces = [t for i, c in enumerate(outline.cameras) for t in _camera_traces(c, i)]
     traces += _target_traces(outline)
@@ -183,7 +183,7 @@ def _target_traces(outline: RigOutline) -> list[Trace]:
 
 
 def rig_plan(results: CalibrationResults) -> Picture:
-    """Cameras, fields and targets, projected along the common perpendicular of the axes."""
+    """Draw cameras, fields and targets, projected along the common perpendicular of the axes."""
     with drawing(4.2, legend="above") as sheet:
         draw_plan(sheet.axes, results)
     caption = (
@@ -195,7 +195,7 @@ def rig_plan(results: CalibrationResults) -> Picture:
 
 
 def draw_plan(axes: Any, results: CalibrationResults) -> None:
-    """Cameras, fields and all targets so far, in `common_plane`."""
+    """Draw cameras, fields and all targets so far, in `common_plane`."""
     outline = rig_outline(results)
     plane = common_plane(results).T
     for plate in outline.plates_mm @ plane:
@@ -223,7 +223,7 @@ _MARGIN = 1 / 12
 
 
 def next_pictures(results: CalibrationResults) -> list[Picture]:
-    """Two pictures of the best pose; none in folders of before, or when no pose was found."""
+    """Return two pictures of the best pose; none for old folders, or when no pose was found."""
     advice = results.file.diagnostics.next_view
     if not advice.get("poses") or len(results.cameras) < 2:
         return []

@@ -22,7 +22,7 @@ _MANY_SD = 3.0
 
 
 def key_numbers(results: CalibrationResults) -> list[Figure]:
-    """What a reader wants first."""
+    """Return the numbers that a reader wants first."""
     s = results.statistics
     per_camera = [f"{n} {number(s.get(f'rms_{n}_px'))}" for n in results.camera_names]
     kept, measured = s.get("dots_kept"), s.get("dots_measured")
@@ -62,7 +62,7 @@ def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Fi
 
 
 def parameter_rows(results: CalibrationResults) -> list[Row]:
-    """One row per parameter, one cell per camera: value +- sd, or that it was held."""
+    """Return one row per parameter, one cell per camera: value +- sd, or that it was held."""
     cameras = list(results.file.cameras.values())
     rows = []
     for name in PARAMETERS:
@@ -94,7 +94,7 @@ def _field(camera: Camera) -> str:
 
 
 def _largest_distortion(camera: Camera) -> str:
-    """How far distortion and sensor tilt move a point, at most, within the image."""
+    """Return how far distortion and sensor tilt move a point, at most, within the image."""
     grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 9) for n in camera.image_size_px)), -1)
     straight = camera.with_parameters(**dict.fromkeys(PARAMETERS[PARAMETERS.index("k1") :], 0.0))
     try:
@@ -108,7 +108,7 @@ def _largest_distortion(camera: Camera) -> str:
 
 
 def pose_rows(results: CalibrationResults) -> list[Row]:
-    """Every camera against the first; empty for one camera."""
+    """Return the pose of every camera against the first; empty for one camera."""
     return [row for camera in results.cameras[1:] for row in _pose_rows(results, camera)]
 
 
@@ -138,7 +138,7 @@ def _pose_rows(results: CalibrationResults, camera: Camera) -> list[Row]:
 
 
 def stage_rows(results: CalibrationResults) -> list[Row]:
-    """Travel axis and encoder scale from `stage_axis/`; empty without it."""
+    """Return the travel axis and encoder scale from `stage_axis/`; empty without it."""
     stage = results.file.stage
     if stage is None or stage.axis_covariance_rad2 is None:
         return []
@@ -175,7 +175,7 @@ def _tangent_sd(
 
 
 def _gap(results: CalibrationResults, camera: Camera) -> str:
-    """Length of the common perpendicular; the tangent is of rig_from_camera, in its own axes."""
+    """Return the length of the common perpendicular; the tangent is of rig_from_camera."""
     camera_from_rig = camera.camera_from_rig
     across = np.cross([0.0, 0.0, 1.0], camera_from_rig.rotation[2])
     if np.linalg.norm(across) < 1e-6:
@@ -196,7 +196,7 @@ def _fixed(values: Any, decimals: int) -> str:
 
 
 def ladder_rows(results: CalibrationResults) -> list[Row]:
-    """The steps of the ladder of lens models, taken or not; empty when the model was given."""
+    """Return the steps of the ladder of lens models, taken or not; none for a given model."""
     model = results.file.model
     return [
         Row(
@@ -229,7 +229,7 @@ def _chance(p_value: float | None) -> str:
 
 
 def _prediction(step: LadderStep) -> str:
-    """Of left-out views, before and after the step."""
+    """Return the prediction errors of left-out views, before and after the step."""
     if step.held_out is None:
         return ""
     after = number(step.held_out)
@@ -238,7 +238,7 @@ def _prediction(step: LadderStep) -> str:
 
 
 def worst_rows(results: CalibrationResults) -> list[Row]:
-    """The dots that agree least: the down-weighted ones first, then by their residual."""
+    """Return the dots that agree least: the down-weighted ones first, then by their residual."""
     table = results.residuals
     whitened = "whitened_u" in table
     columns = ["whitened_u", "whitened_v"] if whitened else ["du_px", "dv_px"]
@@ -258,7 +258,7 @@ def worst_rows(results: CalibrationResults) -> list[Row]:
 
 
 def change_rows(results: CalibrationResults) -> list[Row]:
-    """Of comparison.json: each quantity, its change with standard deviation, in deviations."""
+    """Return from comparison.json each quantity, its change with sd, and the change in sd."""
     rows = []
     for change in results.comparison.changes:
         cells = (

@@ -50,7 +50,7 @@ def target_shape(results: CalibrationResults) -> TargetShape | None:
 
 
 def _sd_mm(results: CalibrationResults, basis: Array) -> Array:
-    """(N, 3) standard deviations of the deviations: the fitted part's share is taken out."""
+    """Return (N, 3) standard deviations of the deviations: the fitted part's share is taken out."""
     names = [[f"dot {dot}.{axis}_mm" for axis in "xyz"] for dot in results.dot_ids]
     index = np.array([[results.component.get(name, -1) for name in row] for row in names])
     out = np.zeros((len(names), 3))
@@ -66,7 +66,7 @@ def _sd_mm(results: CalibrationResults, basis: Array) -> Array:
 
 
 def target_pictures(results: CalibrationResults) -> list[Picture]:
-    """In-plane deviations as arrows and heights as colours; empty when there are too few dots."""
+    """Draw in-plane deviations as arrows and heights as colours; nothing for too few dots."""
     shape = target_shape(results)
     if shape is None:
         return []

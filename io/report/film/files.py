@@ -70,7 +70,7 @@ def write_film(
 
 
 def need_av() -> Any:
-    """PyAV. Raises InputError, with what to install, where it is missing."""
+    """Return PyAV. Raises InputError, with what to install, where it is missing."""
     try:
         import av
     except ImportError as error:

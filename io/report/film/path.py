@@ -128,7 +128,7 @@ def read_film_path(folder: Path, cameras: tuple[Camera, Camera] | None) -> FilmP
 
 
 def _table(results: TrackResults, smoothed: pd.DataFrame | None) -> tuple[pd.DataFrame, str]:
-    """Rows with frame, particle, place and sd."""
+    """Return the rows with frame, particle, place and sd."""
     if smoothed is not None and len(smoothed):
         missing = {name: np.nan for name in _SD if name not in smoothed}
         return smoothed.assign(**missing), "smoothed, lab frame"
@@ -148,7 +148,7 @@ def _bodies(
     kept: pd.DataFrame,
     cameras: tuple[Camera, Camera] | None,
 ) -> tuple[Ints, Array, str]:
-    """Rows of ``kept``, their quadrics in rig axes, and in words what is drawn."""
+    """Return the rows of ``kept``, their quadrics in rig axes, and in words what is drawn."""
     here = kept[["frame", "particle"]].assign(row=np.arange(len(kept)))
     sizes = results.tracks[["frame", "particle", "d_eq_mm", *_PLACE]].merge(
         here, on=["frame", "particle"]
@@ -166,7 +166,7 @@ def _bodies(
 
 
 def _apart(kept: pd.DataFrame, sizes: pd.DataFrame) -> list[int]:
-    """Rows of ``sizes`` so far apart along their tracks that bubbles do not hide each other."""
+    """Return rows of ``sizes`` so far apart along tracks that bubbles do not hide each other."""
     points = kept[_PLACE].to_numpy(float)[sizes["row"].to_numpy(np.int64)]
     particle, diameter = sizes["particle"].to_numpy(), sizes["d_eq_mm"].to_numpy(float)
     chosen: list[int] = []
@@ -205,7 +205,7 @@ class Layout:
 
 
 def film_layout(path: FilmPath) -> Layout:
-    """A panel in true proportions and, for a slender path, one that is stretched sideways."""
+    """Return a panel in true proportions and, for a slender path, one stretched sideways."""
     reach = np.zeros_like(path.points_mm)
     reach[path.bodies] = np.sqrt(np.diagonal(path.quadrics_mm2, axis1=1, axis2=2))
     low, high = (path.points_mm - reach).min(0), (path.points_mm + reach).max(0)
@@ -247,7 +247,7 @@ def _panel(
 
 
 def _elevation_deg(stretch: int) -> float:
-    """How far the view looks down: less where depth is widened."""
+    """Return how far the view looks down: less where depth is widened."""
     return _ELEVATION_DEG if stretch == 1 else _ELEVATION_STRETCHED_DEG
 
 
@@ -267,7 +267,7 @@ def view_matrix(angle_deg: float, elevation_deg: float) -> Array:
 
 
 def _screen(panel: Panel, angle_deg: float) -> tuple[Array, Array]:
-    """(3, 3) px per mm: u right, v down, away; and (2,) px of the axes' origin."""
+    """Return (3, 3) px per mm: u right, v down, away; and (2,) px of the axes' origin."""
     view = view_matrix(angle_deg, _elevation_deg(panel.stretch))
     view = view * [panel.stretch, panel.stretch, 1]
     matrix = panel.px_per_mm * view * np.array([[1.0], [-1.0], [1.0]])
@@ -275,13 +275,13 @@ def _screen(panel: Panel, angle_deg: float) -> tuple[Array, Array]:
 
 
 def project_px(panel: Panel, points_mm: Array, angle_deg: float) -> Array:
-    """(N, 2) pixels of the picture for points in the film's axes."""
+    """Return (N, 2) pixels of the picture for points in the film's axes."""
     matrix, offset = _screen(panel, angle_deg)
     return np.asarray(points_mm @ matrix[:2].T + offset) * (DPI / 100)
 
 
 def draw_path(path: FilmPath, layout: Layout, angle_deg: float) -> Picture:
-    """(height, width, 3) RGB."""
+    """Return the picture (height, width, 3), RGB."""
     width, height = layout.size_px
     page = _Page(layout.size_px)
     for panel in layout.panels:
@@ -323,7 +323,7 @@ class _Page:
     def write(
         self, words: str, place: Any, anchor: str, colour: str = _SOFT, size: int = 13
     ) -> None:
-        """anchor : Pillow's, of the text at its place."""
+        """Write a text at its place; anchor : that of Pillow."""
         self._texts.append((words, place, anchor, colour, size))
 
     def picture(self) -> Picture:
@@ -342,7 +342,7 @@ class _Page:
 
 @cache
 def _font(size_px: float) -> Any:
-    """Matplotlib's own typeface, for Pillow."""
+    """Return Matplotlib's own typeface, for Pillow."""
     from matplotlib import get_data_path
     from PIL import ImageFont
 
@@ -358,7 +358,7 @@ def _band_words(panel: Panel) -> str:
 def _draw_box(
     page: _Page, names: Sequence[str], panel: Panel, matrix: Array, offset: Array
 ) -> None:
-    """The base and the upright edges but the nearest; ticks on two edges below and one upright."""
+    """Draw the base and the upright edges but the nearest; ticks on two edges below, one up."""
     pick = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     ends = np.array([panel.low_mm, panel.high_mm])
     corners = np.array([[[ends[a, 0], ends[b, 1], h] for a, b in pick] for h in ends[:, 2]])
@@ -380,7 +380,7 @@ def _draw_ticks(
     page: _Page, corner: Array, axis: int, panel: Panel, matrix: Array, offset: Array,
     outwards: Array, name: str,
 ) -> None:  # fmt: skip
-    """Ticks along an edge of the box through ``corner``, and the axis' name with its unit."""
+    """Draw ticks along an edge of the box through ``corner``, and the axis' name with its unit."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = panel.low_mm[axis], panel.high_mm[axis]
@@ -400,7 +400,7 @@ def _draw_ticks(
 
 
 def _draw_tracks(page: _Page, path: FilmPath, panel: Panel, matrix: Array, offset: Array) -> None:
-    """Bubbles, bands, paths and their ends, from back to front."""
+    """Draw bubbles, bands, paths and their ends, from back to front."""
     from matplotlib.collections import CircleCollection
 
     uv, away = path.points_mm @ matrix[:2].T + offset, path.points_mm @ matrix[2]
@@ -448,7 +448,7 @@ def _shaded(centres: Array, shapes: Array, particles: Ints) -> tuple[Array, Arra
 
 
 def _band(uv: Array, sd_mm: Array, times: int, matrix: Array) -> Array:
-    """(2 N, 2) polygon round the line (N, 2) of +-2 sd across it, ``times`` as wide."""
+    """Return (2 N, 2) polygon round the line (N, 2) of +-2 sd across it, ``times`` as wide."""
     good = np.isfinite(sd_mm).all(1)
     uv, sd_mm = uv[good], sd_mm[good]
     if len(uv) < 2:

@@ -91,7 +91,7 @@ def write_views_film(
 
 
 def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
-    """detections.csv with the columns of the outlines; blank shape coefficients are 0."""
+    """Read detections.csv with the columns of the outlines; blank shape coefficients are 0."""
     if not file.is_file():
         raise InputError(
             "is not there, so nothing can be drawn into the images", where=str(file),
@@ -129,7 +129,7 @@ def outlines_px(table: pd.DataFrame, points: int = 72) -> Array:
 def view_frames(
     table: pd.DataFrame, cameras: Sequence[str], frames: Sequence[int], t_s: Array | None
 ) -> Iterator[ViewFrame]:
-    """What to draw, frame by frame. A tail is the bubble's last `TAIL_FRAMES` places."""
+    """Return what to draw, frame by frame. A tail is the bubble's last `TAIL_FRAMES` places."""
     outlines = outlines_px(table)
     where = {
         key: np.asarray(rows) for key, rows in table.groupby(["frame", "camera"]).indices.items()
@@ -161,7 +161,7 @@ def draw_views(
     shades: Mapping[str, tuple[float, float]],
     frame: ViewFrame,
 ) -> Picture:
-    """(h, w, 3) RGB, even sides: the views side by side, a strip of words above."""
+    """Return (h, w, 3) RGB, even sides: the views side by side, a strip of words above."""
     parts = []
     for camera, found in zip(sizes_px, frame.found):
         image = images(camera, frame.frame)
@@ -186,7 +186,7 @@ def _view(
     found: Sequence[Found],
     camera: str,
 ) -> Picture:
-    """(h, w, 3) one camera's image with its bubbles, below a strip with the camera's name."""
+    """Return one camera's image with its bubbles, (h, w, 3), below a strip with its name."""
     import cv2
 
     factor = min(1.0, WIDTH_PX / size_px[0])
@@ -214,7 +214,7 @@ def _view(
 
 
 def _palette() -> list[Colour]:
-    """For a GIF: grey, and the lines' colours with what lies between them and black or white."""
+    """Return colours for a GIF: greys, and the lines' colours mixed with grey, black and white."""
     greys = [(g, g, g) for g in np.linspace(0, 255, 140).astype(int).tolist()]
     mixed = [
         tuple(round(share * part + (1 - share) * ground) for part in colour)
@@ -225,7 +225,7 @@ def _palette() -> list[Colour]:
 
 
 def _shades(images: Images, camera: str, frame_count: int) -> tuple[float, float]:
-    """Black and white for the whole film: from a few of its images."""
+    """Return black and white levels for the whole film, from a few of its images."""
     some = np.unique(np.linspace(0, frame_count - 1, _LOOKED_AT).astype(int))
     seen = [image for image in (images(camera, int(f)) for f in some) if image is not None]
     if not seen:

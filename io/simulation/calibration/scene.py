@@ -43,7 +43,7 @@ class View:
 
 
 def nominal_rotation(config: SimulationConfig, camera: int = 1) -> Array:
-    """(3, 3) <camera>_from_first of a camera, counted from 0, as the rig file states it."""
+    """Return (3, 3) <camera>_from_first of a camera, counted from 0, as the rig file states it."""
     return rotation_from_rotvec([0.0, np.radians(camera * config.angle_deg), 0.0])
 
 
@@ -62,7 +62,7 @@ def true_cameras(config: SimulationConfig) -> Mapping[str, Camera]:
 
 
 def _from_rig(config: SimulationConfig, camera: int) -> Pose:
-    """camera_from_rig: nominal, then the mounting error, of alternating sign from the second on."""
+    """Return camera_from_rig: nominal, and the mounting error, whose sign alternates."""
     sign = 1.0 if camera % 2 else -1.0
     mount = rotation_from_rotvec(np.radians(sign * np.array(config.mount_rotvec_deg)))
     rotation = mount @ nominal_rotation(config, camera)
@@ -226,7 +226,7 @@ def _block_ids(config: SimulationConfig) -> Ints:
 
 
 def _rotation(normal: Array, roll_deg: float, rng: np.random.Generator) -> Array:
-    """rig_from_target with the given z; without roll, its x is as near to the rig's as can be."""
+    """Return rig_from_target with this z; without roll, its x is as near to the rig's as can be."""
     start = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.99 else np.array([0.0, 0.0, 1.0])
     x = start - normal * (start @ normal)
     x /= np.linalg.norm(x)
@@ -236,7 +236,7 @@ def _rotation(normal: Array, roll_deg: float, rng: np.random.Generator) -> Array
 
 
 def wholly_inside(camera: Camera, pose: Pose, target: TrueTarget, border_px: float) -> Bools:
-    """(N,) whether each dot, its rim included, lies inside the image and off its border."""
+    """Return (N,) whether each dot, its rim included, lies inside the image and off its border."""
     uv = pixel_from_plate(camera, pose, target.points_mm, target.plate)
     radius = 1.03 * target.diameter_mm / 2 * camera["scale_px_per_mm"] * max(1, camera["aspect"])
     to_border_px = np.minimum(uv, np.array(camera.image_size_px) - 1 - uv).min(-1)

@@ -165,7 +165,7 @@ def outline_moments(outline_px: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def _slope(values: Array) -> Array:
-    """Derivative of periodic samples (..., N) by the sample's number."""
+    """Return the derivative of periodic samples (..., N) by the sample's number."""
     count = values.shape[-1]
     wave = np.fft.rfftfreq(count, 1 / count) * 2j * np.pi / count
     if count % 2 == 0:
@@ -174,7 +174,7 @@ def _slope(values: Array) -> Array:
 
 
 def _viewing_axes(bodies: Bodies, direction: Array) -> Array:
-    """(..., 3, 3) rows: two across and one along the direction, in the undeformed sphere."""
+    """Return (..., 3, 3) rows: two across and one along the direction, in the undeformed sphere."""
     away = np.einsum("...ji,...j->...i", bodies.rotation, direction) / bodies.semi_axes_mm
     away = away / np.linalg.norm(away, axis=-1, keepdims=True)
     least = np.eye(3)[np.argmin(np.abs(away), -1)]
@@ -184,7 +184,7 @@ def _viewing_axes(bodies: Bodies, direction: Array) -> Array:
 
 
 def _outermost(across: Array, away: Array, modes: Array) -> Array:
-    """(..., N) angle out of the viewing plane at which each meridian reaches farthest out.
+    """Return (..., N) angle out of the viewing plane at which each meridian reaches farthest out.
 
     cos(psi) (1 + f) is a trigonometric polynomial of degree 5, known from 12 samples.
     """
@@ -210,7 +210,7 @@ def _outermost(across: Array, away: Array, modes: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _quadrature() -> tuple[Array, Array, Array]:
-    """Directions (Q, 3), weights (Q,) and modes (Q, 21), exact to degree 23."""
+    """Return the directions (Q, 3), weights (Q,) and modes (Q, 21), exact to degree 23."""
     z, weight = np.polynomial.legendre.leggauss(12)
     turn = (np.arange(24) + 0.5) * 2 * np.pi / 24
     level = np.sqrt(1 - z**2)[:, None]
@@ -220,7 +220,7 @@ def _quadrature() -> tuple[Array, Array, Array]:
 
 
 def _sphere_moments(modes: Array) -> tuple[Array, Array]:
-    """Volume (...) and centre of volume (..., 3) of the deformed unit sphere."""
+    """Return the volume (...) and centre of volume (..., 3) of the deformed unit sphere."""
     s, weights, harmonics = _quadrature()
     radius = 1 + modes @ harmonics.T
     volume = radius**3 @ weights / 3

@@ -69,7 +69,7 @@ class Look:
 
 
 def _square(du: Array, dv: Array, metric: Array) -> Float32:
-    """(len(dv), len(du)) squared length of the offsets in a metric (2, 2)."""
+    """Return (len(dv), len(du)) squared length of the offsets in a metric (2, 2)."""
     u, v, m = du.astype(np.float32), dv.astype(np.float32)[:, None], metric.astype(np.float32)
     return np.asarray(np.maximum((m[0, 0] * u + 2 * m[0, 1] * v) * u + m[1, 1] * v * v, 0))
 
@@ -95,7 +95,7 @@ class Patch:
 
 
 def absorption_patch(bubble: Silhouette) -> Patch:
-    """The share of light that one bubble takes, in the window that it can reach."""
+    """Return the share of light that one bubble takes, in the window that it can reach."""
     outline = bubble.outline_px
     first = np.floor(outline.min(0) + 0.5).astype(int)
     count = np.floor(outline.max(0) + 0.5).astype(int) - first + 1
@@ -119,7 +119,7 @@ def absorption_patch(bubble: Silhouette) -> Patch:
 
 
 def _inside(bubble: Silhouette, first: Ints, count: Ints) -> Float32:
-    """(cells_v, cells_u) transmission behind the outline, at the fine cells' centres."""
+    """Return (cells_v, cells_u) transmission behind the outline, at the fine cells' centres."""
     _, centre, second = outline_moments(bubble.outline_px)
     values, vectors = np.linalg.eigh(second)
     axes = vectors * 2 * np.sqrt(values) @ vectors.T
@@ -128,7 +128,7 @@ def _inside(bubble: Silhouette, first: Ints, count: Ints) -> Float32:
 
 
 def _exposure(length_px: float, blur_px: float) -> tuple[Array, Array]:
-    """Gauss-Legendre moments of the exposure (-1/2..1/2), closer than the blur, and weights."""
+    """Return Gauss-Legendre moments of the exposure (-1/2..1/2) and weights."""
     if length_px < _STILL_PX:
         return np.zeros(1), np.ones(1)
     nodes, weights = np.polynomial.legendre.leggauss(2 + int(2 * length_px / max(blur_px, 0.3)))
@@ -136,7 +136,7 @@ def _exposure(length_px: float, blur_px: float) -> tuple[Array, Array]:
 
 
 def transmission(size_px: tuple[int, int], bubbles: Sequence[Silhouette]) -> Float32:
-    """(height, width) share of the light that all bubbles together let through."""
+    """Return (height, width) share of the light that all bubbles together let through."""
     width, height = size_px
     out = np.ones((height, width), np.float32)
     for bubble in bubbles:

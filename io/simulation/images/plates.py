@@ -108,7 +108,7 @@ def disc_coverage(
 def _near_image(
     camera: Camera, pose: Pose, plate: Plate, centres: Array, diameter: Array, blur_px: float
 ) -> Bools:
-    """(N,) whether a disc can reach the image; decided on the plate, never by far projections."""
+    """Return (N,) whether a disc can reach the image; decided without far projections."""
     width, height = camera.image_size_px
     edge = np.linspace(0, 1, 9)
     side = np.stack(np.meshgrid(edge * (width - 1), edge * (height - 1)), -1).reshape(-1, 2)
@@ -122,7 +122,7 @@ def _near_image(
 def _windows(
     camera: Camera, pose: Pose, plate: Plate, centres: Array, diameter: Array
 ) -> tuple[Ints, Ints]:
-    """(N, 2) first pixel and (N, 2) number of pixels of the box round each disc, as (u, v)."""
+    """Return first pixel (N, 2) and size (N, 2) in pixels of the box round each disc, as (u, v)."""
     angle = np.arange(_RIM) * 2 * np.pi / _RIM
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM)], -1)
     points = centres[:, None, :] + 0.51 * diameter[:, None, None] * rim
@@ -132,7 +132,7 @@ def _windows(
 
 
 def _cell_coverage(nodes: Array, size: Ints, radius_mm: float) -> Array:
-    """(cells_v, cells_u) share of every cell of a window that lies in the disc."""
+    """Return (cells_v, cells_u) share of every cell of a window that lies in the disc."""
     columns, rows = _interpolation(int(size[0])), _interpolation(int(size[1]))
     x, y = rows @ nodes @ columns.T
     square = x * x + y * y
@@ -175,13 +175,13 @@ def _chebyshev(count: int) -> Array:
 
 @lru_cache(maxsize=512)
 def _interpolation(count: int) -> Array:
-    """(cells, nodes): Lagrange polynomials of the window's nodes at its cells."""
+    """Return (cells, nodes): Lagrange polynomials of the window's nodes at its cells."""
     cells = (np.arange(count * SUPERSAMPLING) + 0.5) / (count * SUPERSAMPLING)
     return _lagrange(2 * cells - 1, _chebyshev(_NODES))
 
 
 def _lagrange(at: Array, nodes: Array) -> Array:
-    """(N,), (K,) -> (N, K)."""
+    """Return Lagrange polynomials (N, K) of the nodes (K,) at places (N,)."""
     gap = nodes[:, None] - nodes
     np.fill_diagonal(gap, 1.0)
     factors = np.repeat((at[:, None] - nodes)[:, None, :], len(nodes), 1)
@@ -190,7 +190,7 @@ def _lagrange(at: Array, nodes: Array) -> Array:
 
 
 def _plate_and_background(camera: Camera, pose: Pose, plate: Plate, blur_px: float) -> Array:
-    """(height, width) the bare plate before its surroundings; straight edges, blurred."""
+    """Return (height, width) the bare plate before its surroundings; straight edges, blurred."""
     width, height = camera.image_size_px
     if plate.outline_mm is None:
         return np.full((height, width), plate.plate_albedo)
@@ -271,7 +271,7 @@ def pixel_from_plate(
 
 
 def _glass_shift(direction: Array, plate: Plate) -> Array:
-    """(..., 3) directions in the target's frame -> (..., 2): straight hit minus refracted hit."""
+    """Return straight hit minus refracted hit (..., 2) of directions (..., 3) in target axes."""
     lateral = direction[..., :2]
     if plate.thickness_mm == 0:
         return np.zeros_like(lateral)

@@ -28,7 +28,7 @@ class Strip:
     look: Look
 
     def seen(self, rig_from_lab_mm: Array) -> tuple[Ints, Array]:
-        """Numbers of the dots that reach into the image, and their (M, 2) centres in px."""
+        """Return numbers of the dots that reach into the image, and their (M, 2) centres in px."""
         rig = self.lab_mm + rig_from_lab_mm
         size = np.array(self.camera.image_size_px) - 1
         reach = self.diameter_mm * self.camera["scale_px_per_mm"]
@@ -41,7 +41,7 @@ class Strip:
     def silhouettes(
         self, rig_from_lab_mm: Array, travel_mm: Array, blur_px: float
     ) -> list[Silhouette]:
-        """What the renderer draws. travel_mm : (3,) of the tank in the rig during the exposure."""
+        """Return what the renderer draws. travel_mm : (3,) of the tank in the rig at exposure."""
         chosen, uv = self.seen(rig_from_lab_mm)
         rig = self.lab_mm[chosen] + rig_from_lab_mm
         after = self.camera.project(rig + travel_mm / 2)
@@ -53,7 +53,7 @@ class Strip:
         ]
 
     def _rim_mm(self, uv_px: Array) -> Array:
-        """(M, N, 3) the dots' rims about their centres, across the rays that see them."""
+        """Return (M, N, 3) the dots' rims about their centres, across the rays that see them."""
         ray = self.camera.unproject(uv_px)[1]
         first = np.cross(ray, AXIS_RIG)
         first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -64,7 +64,7 @@ class Strip:
 
 
 def random_strips(scene: RunScene, rng: Generator) -> list[Strip]:
-    """Each camera's own strip, over all the height that it sees during the run."""
+    """Return a strip for each camera, over all the height that it sees during the run."""
     chosen = scene.config.strip
     if chosen is None:
         return []

@@ -31,7 +31,7 @@ class LinearProcess:
     noise_input: Array
 
     def stationary_covariance(self) -> Array:
-        """(n, n). Raises InputError for a process without a stationary state."""
+        """Return the covariance (n, n). Raises InputError for a process without one."""
         from scipy.linalg import solve_continuous_lyapunov
 
         if np.max(np.linalg.eigvals(self.drift).real) >= 0:
@@ -79,13 +79,13 @@ class LinearProcess:
         )
 
     def _rates(self) -> Array:
-        """(n, n) the drift with states scaled to one unit, so that its norm is a rate."""
+        """Return (n, n) the drift with states scaled to one unit, so that its norm is a rate."""
         off = np.abs(np.linalg.eigvals(self.drift)).max()
         scale = off ** -self._orders()
         return np.asarray(self.drift / scale[:, None] * scale)
 
     def _orders(self) -> Array:
-        """(n,) how many integrations lie between the white noise and each state."""
+        """Return (n,) how many integrations lie between the white noise and each state."""
         orders = np.full(len(self.noise_input), np.nan)
         reached = self.noise_input
         for order in range(len(orders)):
@@ -124,25 +124,27 @@ def square_root(covariance: Array) -> Array:
 
 
 def ornstein_uhlenbeck(sigma: float, tau_s: float) -> LinearProcess:
-    """States (integral, value): a velocity of RMS sigma that forgets within tau_s. Start the
-    integral at 0."""
+    """Return the process of the states (integral, value): a velocity of RMS sigma and time tau_s.
+
+    Its integral starts at 0.
+    """
     return LinearProcess(
         np.array([[0.0, 1.0], [0.0, -1 / tau_s]]), np.array([0.0, sigma * np.sqrt(2 / tau_s)])
     )
 
 
 def oscillator(rms: float, frequency_hz: float, damping: float) -> LinearProcess:
-    """States (displacement, velocity) of a resonator driven by white noise, of the given RMS."""
+    """Return the process (displacement, velocity) of a resonator with this RMS in white noise."""
     w = 2 * np.pi * frequency_hz
     drift = np.array([[0.0, 1.0], [-(w**2), -2 * damping * w]])
     return LinearProcess(drift, np.array([0.0, 2 * rms * np.sqrt(damping * w**3)]))
 
 
 def rig_mode(rms: float, frequency_hz: float, damping: float, force_hz: float) -> LinearProcess:
-    """States (displacement, velocity, force, its slope) of a structure's mode with displacement RMS
-    rms.
+    """Return the process of a structure's mode, whose displacement has the RMS value rms.
 
-    The force is white noise through two critically damped poles at force_hz.
+    Its states are displacement, velocity, force and the slope of the force, which is white noise
+    through two critically damped poles at force_hz.
     """
     w, f = 2 * np.pi * frequency_hz, 2 * np.pi * force_hz
     drift = np.array(
@@ -189,7 +191,7 @@ def constant_speed_path(
     azimuth_rad: float = 0.0,
     phase_rad: float = 0.0,
 ) -> Path:
-    """Zigzag (second amplitude 0), helix (equal ones) or between, with |velocity| constant.
+    """Return zigzag (second amplitude 0), helix (equal ones) or between, with |velocity| constant.
 
     The lateral path is an ellipse; the height is an elliptic integral of the second kind.
     Raises InputError when the lateral motion alone is faster than the speed.
@@ -261,7 +263,7 @@ def stochastic_paths(
 
 
 def added_mass_along(aspect: float) -> float:
-    """Added-mass coefficient of a spheroid along its pole, by quadrature of Lamb's integral.
+    """Return added-mass coefficient of a spheroid along its pole, by quadrature of Lamb's integral.
 
     gamma = a^2 c int dl / ((c^2 + l)^(3/2) (a^2 + l)) (Hydrodynamics, section 373), with l = c^2 u
     here; the coefficient is gamma / (2 - gamma).
@@ -291,7 +293,7 @@ class Forces:
     gravity_mm_s2: float
 
     def acceleration(self, t_s: float, velocity: Array) -> Array:
-        """(B, 3) in mm/s^2 at velocities (B, 3): height first, then the two lateral axes."""
+        """Return (B, 3) in mm/s^2 at velocities (B, 3): height first, then the two lateral axes."""
         speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
         along = velocity / speed
         swing = self.lift_mm_s2 * np.cos(2 * np.pi * self.lift_hz * t_s + self.lift_rad)
@@ -308,7 +310,7 @@ _LONGEST_STEP_S = 5e-4
 
 
 def driven_paths(step_s: float, steps: int, forces: Forces) -> Path:
-    """Paths of bubbles under forces, by Runge-Kutta steps of order 4, once they have settled."""
+    """Return paths of bubbles under forces, by fourth-order Runge-Kutta, after the transient."""
     velocity = np.zeros((len(forces.added_mass), 3))
     velocity[:, 0] = np.sqrt(forces.gravity_mm_s2 / forces.drag_1_mm)
     state = np.concatenate([0 * velocity, velocity], -1)

@@ -106,11 +106,11 @@ class RunScene:
         return self.carriage.shake.velocity_mm_s[:, self.carriage.frames]
 
     def rig_from_lab_mm(self, camera: int, frame: int) -> Array:
-        """(3,) to add to a lab point to have it where a camera sees it, in rig axes."""
+        """Return (3,) to add to a lab point to have it where a camera sees it, in rig axes."""
         return np.asarray(-AXIS_RIG * self.position_mm[frame] - self.shake_mm[camera, frame])
 
     def bodies_lab(self, frame: int, chosen: Ints) -> Bodies:
-        """Some of the bubbles, (M,), in the lab frame."""
+        """Return M of the bubbles in the laboratory frame."""
         population, t = self.population, self.t_s[frame]
         swing = np.cos(2 * np.pi * population.swing_hz[chosen] * t + population.swing_rad[chosen])
         modes = population.modes_static[chosen] + population.modes_swing[chosen] * swing
@@ -159,7 +159,7 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
 
 
 def liquid(config: RunConfig) -> Liquid:
-    """The run's liquid; there must be one."""
+    """Return the run's liquid; there must be one."""
     fluid = config.fluid
     assert fluid is not None, "RunConfig checks it"
     return Liquid(
@@ -251,7 +251,7 @@ def _carriage(config: RunConfig, cameras: int, speed_mm_s: float, rng: Generator
 
 
 def _drift(config: RunConfig, position_mm: Array) -> float:
-    """How far bubbles rise through the view during the run, in the mean."""
+    """Return how far bubbles rise through the view during the run, in the mean."""
     duration = (config.frames - 1) / config.frame_rate_hz
     return _mean_rise(config.motion) * duration - float(position_mm[-1] - position_mm[0])
 
@@ -262,7 +262,7 @@ def _passing(config: RunConfig) -> bool:
 
 
 def _bubble_count(config: RunConfig, position_mm: Array, size_mm: Array) -> int:
-    """Bubbles that exist, so that ``config.bubbles`` are in view at a time."""
+    """Return how many bubbles exist, so that ``config.bubbles`` are in view at a time."""
     if not _passing(config):
         return config.bubbles
     height = float(size_mm[1])
@@ -272,7 +272,7 @@ def _bubble_count(config: RunConfig, position_mm: Array, size_mm: Array) -> int:
 
 
 def _paths(config: RunConfig, count: int, rng: Generator) -> Path:
-    """One path for each bubble, or for each pair."""
+    """Return one path for each bubble, or for each pair."""
     motion = config.motion
     paths = count // 2 if motion.pairs else count
     random_rng, regular_rng = rng.spawn(2)
@@ -320,7 +320,7 @@ def _regular_path(config: RunConfig, speed_mm_s: float, rng: Generator) -> Path:
 
 
 def _lab_paths(config: RunConfig, paths: Path, rng: Generator) -> tuple[Array, Array, Array]:
-    """(B, F, 3) places from each start and velocities, and when each pair passes."""
+    """Return (B, F, 3) places from each start and velocities, and when each pair passes."""
     place = paths.height_mm[..., None] * AXIS_RIG + paths.lateral_mm @ _ACROSS
     speed = paths.height_mm_s[..., None] * AXIS_RIG + paths.lateral_mm_s @ _ACROSS
     if not config.motion.pairs:
@@ -331,7 +331,7 @@ def _lab_paths(config: RunConfig, paths: Path, rng: Generator) -> tuple[Array, A
 def _pair_paths(
     config: RunConfig, place: Array, speed: Array, rng: Generator
 ) -> tuple[Array, Array, Array]:
-    """Bubbles 2k and 2k + 1 about path k, passing each other in a straight line."""
+    """Return paths of bubbles 2k and 2k + 1 about path k, which pass on a straight line."""
     motion, pairs = config.motion, len(place)
     t = np.arange(config.frames) / config.frame_rate_hz
     middle = rng.uniform(0.25, 0.75, pairs) * t[-1]
@@ -353,7 +353,7 @@ def _unit(vectors: Array) -> Array:
 def _starts(
     config: RunConfig, lab: Array, position: Array, d_eq: Array, size_mm: Array, rng: Generator
 ) -> Array:
-    """(B, 3) offsets so that bubbles fill the view and never touch; pairs share theirs."""
+    """Return (B, 3) offsets so that bubbles fill the view and never touch; pairs share theirs."""
     group = 2 if config.motion.pairs else 1
     rise = lab @ AXIS_RIG - position + position[0]
     some = np.unique(np.linspace(0, config.frames - 1, 60).astype(int))
@@ -423,7 +423,7 @@ class Population:
 
 
 def lamb_frequency_hz(degree: int, d_eq_mm: float) -> float:
-    """Frequency at which surface tension swings a bubble's mode in water (Lamb, sec. 275)."""
+    """Return the frequency at which surface tension swings a bubble's mode (Lamb, sec. 275)."""
     radius = d_eq_mm / 2000
     n = degree
     square = (n - 1) * (n + 1) * (n + 2) * _SURFACE_TENSION_N_M / (_DENSITY_KG_M3 * radius**3)

@@ -14,7 +14,7 @@ from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
 
 
 def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
-    """`stage.csv`: the carriage, servo error included, with the encoder's noise."""
+    """Return `stage.csv`: the carriage, servo error included, with the encoder's noise."""
     carriage, stage = scene.carriage, scene.config.stage
     step = _thinning(scene, stage.encoder_rate_hz)
     position = carriage.position_mm[::step]
@@ -24,7 +24,7 @@ def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
 
 
 def accelerometer_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
-    """`accelerometer.csv`: sensors on the carriage or on camera arms, axes those of the rig."""
+    """Return `accelerometer.csv`: sensors on the carriage or on camera arms, in the rig's axes."""
     carriage, stage = scene.carriage, scene.config.stage
     step = _thinning(scene, stage.accelerometer_rate_hz)
     t = carriage.t_s[::step]

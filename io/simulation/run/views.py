@@ -39,7 +39,7 @@ class CameraView:
     overlap: Bools
 
     def silhouettes(self, scene: RunScene) -> list[Silhouette]:
-        """What the renderer needs."""
+        """Return what the renderer draws."""
         return [
             Silhouette(
                 outline, scene.population.looks[k], float(blur), (float(smear[0]), float(smear[1]))
@@ -50,7 +50,7 @@ class CameraView:
         ]
 
     def ellipse_px(self) -> tuple[Array, Array, Array]:
-        """(M,) semi-axes a >= b and the angle from +u to +v of the ellipse of equal moments."""
+        """Return (M,) semi-axes a >= b and angle from +u to +v of the ellipse of equal moments."""
         values, vectors = np.linalg.eigh(self.second_px2)
         angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
         a, b = 2 * np.sqrt(values[:, 1]), 2 * np.sqrt(values[:, 0])
@@ -58,7 +58,7 @@ class CameraView:
 
 
 def camera_view(scene: RunScene, frame: int, index: int) -> CameraView:
-    """One frame in one camera."""
+    """Return the view of one frame in one camera."""
     camera = list(scene.cameras.values())[index]
     to_rig = scene.rig_from_lab_mm(index, frame)
     near = _near(camera, scene.lab_mm[:, frame] + to_rig, scene.population.d_eq_mm)
@@ -92,7 +92,7 @@ def camera_view(scene: RunScene, frame: int, index: int) -> CameraView:
 
 
 def _near(camera: Camera, points_mm: Array, d_eq_mm: Array) -> Ints:
-    """Bubbles that may reach the image; by linear projection, as far points may not project."""
+    """Return bubbles that may reach the image, by linear projection, which also holds far away."""
     at_centre, slope = linear_projection(camera)
     uv = at_centre + points_mm @ slope.T
     reach = d_eq_mm * float(np.linalg.norm(slope, 2)) + 0.02 * max(camera.image_size_px) + 10
@@ -101,7 +101,7 @@ def _near(camera: Camera, points_mm: Array, d_eq_mm: Array) -> Ints:
 
 
 def linear_projection(camera: Camera) -> tuple[Array, Array]:
-    """Pixel (2,) of the rig's origin and its derivative (2, 3) px/mm there."""
+    """Return the pixel (2,) of the rig's origin and its derivative (2, 3) px/mm there."""
     step = 1e-3
     points = np.concatenate([np.zeros((1, 3)), step * np.eye(3), -step * np.eye(3)])
     uv = camera.project(points)
@@ -109,7 +109,7 @@ def linear_projection(camera: Camera) -> tuple[Array, Array]:
 
 
 def _overlap(outline: Array, centre: Array) -> Bools:
-    """(M,) whether another silhouette covers part of this one's outline or lies within it."""
+    """Return (M,) whether another silhouette covers a part of this outline, or all of it."""
     out = np.zeros(len(outline), bool)
     reach = np.linalg.norm(outline - centre[:, None], axis=-1).max(-1, initial=0)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1)

@@ -155,7 +155,7 @@ def foot_points(
 def coverage_near_edge(
     du_px: Array, dv_px: Array, shape_px: Array, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
-    """Coverage (..., P) and derivatives (..., 6, P) at offsets (..., P) from ellipses' centres.
+    """Return coverage (..., P) and derivatives (..., 6, P) at offsets (..., P) from centres.
 
     ``shape_px`` (..., 3), ``sigma_px`` (...). An expansion to third order in the blur over the
     edge's radius of curvature. With z = d / s the exact signed distance, k the curvature and k''

@@ -251,7 +251,7 @@ def _exact_coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
 
 
 def grey_levels(pixels: Pixels, theta: Array, levels: Array) -> tuple[Array, Array, Array]:
-    """Grey levels (D, P), derivatives (D, 12, P), and levels (D, 6), fitted where they are NaN.
+    """Return grey levels (D, P), derivatives (D, 12, P), levels (D, 6), fitted where they are NaN.
 
     The contrast gradient acts before the blur: the Gaussian of x F_sharp is x F + sigma^2 dF/dx.
     Without that term a centre would shift by sigma^2 times the relative gradient; its derivatives
@@ -382,7 +382,7 @@ def _damped_steps(information: Array, gradient: Array, damping: Array) -> Array:
 def _descend(
     pixels: Pixels, state: _State, dots: Ints, *, iterations: int, tolerance: float
 ) -> Ints:
-    """Levenberg-Marquardt of some dots at fixed weights, in place; returns those that converged.
+    """Take Levenberg-Marquardt steps in place at fixed weights; return dots that converged.
 
     A dot has converged when a step would reduce chi-square by less than ``tolerance``, relative to
     chi-square per degree of freedom above 1; that step is taken without another evaluation.

@@ -39,7 +39,7 @@ def dot_window(
     coarse: bool = False,
     known: Sequence[int] = (),
 ) -> Window:
-    """Crop and mask round one dot: its edge, its inside, and the background as far as it is free.
+    """Return crop and mask round one dot: its edge, its inside, and free background.
 
     Pixels nearer to another blob, or near a hole, are left out. Of a large dot only the
     surroundings of the edge are used, and of those beyond the blur one pixel in four (coarse :

@@ -81,7 +81,7 @@ def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = _MARGIN_S) 
 
 
 def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelerometer, ...]:
-    """Samples averaged in blocks no longer than step_s, each at its mean time; none over a gap.
+    """Return samples averaged in blocks of at most step_s, at their mean times; none over a gap.
 
     An average over T of a motion at w is too small by (w T)^2 / 24: 0.6 % at 60 Hz and 1 ms.
     """

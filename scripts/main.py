@@ -21,6 +21,7 @@ from telerig.scripts.doctor import doctor
 from telerig.scripts.export import export
 from telerig.scripts.import_files import app as import_files
 from telerig.scripts.init import init
+from telerig.scripts.plan import plan
 from telerig.scripts.record import record
 from telerig.scripts.report import report
 from telerig.scripts.run import run as run_dataset
@@ -53,8 +54,8 @@ def _main(
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "demo": demo, "init": init, "doctor": doctor, "simulate": simulate, "detect": detect,
-    "calibrate": calibrate, "bubbles": bubbles, "track": track, "smooth": smooth,
+    "demo": demo, "init": init, "doctor": doctor, "plan": plan, "simulate": simulate,
+    "detect": detect, "calibrate": calibrate, "bubbles": bubbles, "track": track, "smooth": smooth,
     "validate": validate, "run": run_dataset, "batch": batch, "record": record,
     "export": export, "report": report,
 }  # fmt: skip

@@ -42,7 +42,9 @@ def smooth(
     model: Annotated[
         str,
         typer.Option(
-            help="Priors of the shake: auto learns what no sensor measures, default fixes them."
+            "--model",
+            "--shake",
+            help="Priors of the shake: auto learns what no sensor measures, default fixes them.",
         ),
     ] = "auto",
     refine_rig: options.RefineRig = False,

@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -32,6 +33,7 @@ from telerig.estimator.batch.jobs import Job, check_run_name, fingerprint
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
+from telerig.io.results.batch import verdict_counts
 from telerig.io.results.manifest import is_whole, replaced_results
 
 Stage = Callable[[str, float, int], None]
@@ -48,7 +50,18 @@ _stopped = threading.Event()
 
 def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
     """Do a job in this process; return status, words and figures. ``stage`` gets the progress."""
+    if job.only_report:
+        return _draw(job)
     return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
+
+
+def _draw(job: Job) -> dict[str, Any]:
+    """Write the report of results that exist."""
+    from telerig.io.report.remake import remake_report, results_folders
+
+    for results in results_folders(job.results):
+        remake_report(results)
+    return {"status": DONE, "words": "", "figures": {}}
 
 
 def perform(job: Job) -> dict[str, Any]:
@@ -335,13 +348,19 @@ def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
         of_kind = [r for r in records if r["kind"] == kind]
         if of_kind:
             counts = Counter(r["status"] for r in of_kind)
-            lines.append(f"{kind}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
+            found = verdict_counts(of_kind)
+            words = ", ".join(f"{n} {status}" for status, n in counts.items())
+            lines.append(f"{kind}: {words}" + (f" ({_listed(found)})" if found else ""))
     for record in records:
         if record["status"] != DONE:
             where = record["dataset"] + (f", run {record['run']}" if record["run"] else "")
             reason = _first_line(record["words"])
             lines.append(f"  {where}: {record['kind']} {record['status']}: {reason}")
     return "\n".join(lines)
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{n} {word}" for word, n in counts.items())
 
 
 Tell = Callable[[Job, dict[str, Any], int, int], None]
@@ -355,13 +374,14 @@ def run_batch(
 ) -> list[dict[str, Any]]:
     """Do all jobs, each after those that it needs, and return their records in the same order.
 
-    A job that ``journal`` records as done with the same inputs is not done again. If a job fails,
-    only the jobs that need it are left out, and their records name it. executor : runs `perform`.
-    tell : is called after each job.
+    A job that ``journal`` records as done with the same inputs is not done again; a report that is
+    missing and wanted is drawn. If a job fails, only the jobs that need it are left out, and their
+    records name it. executor : runs `perform`. tell : is called after each job.
     """
     by_name = {job.name: job for job in jobs}
     records: dict[str, dict[str, Any]] = {}
     running: dict[Future[dict[str, Any]], tuple[Job, str]] = {}
+    drawn: dict[str, dict[str, Any]] = {}
     order = TopologicalSorter({job.name: job.needs for job in jobs})
     order.prepare()
 
@@ -378,12 +398,20 @@ def run_batch(
             if known is None:
                 inputs = fingerprint(job)
                 running[executor.submit(perform, job)] = job, inputs
+            elif known["status"] == DONE and job.lacks_report:
+                drawn[job.name] = known
+                future = executor.submit(perform, replace(job, only_report=True))
+                running[future] = job, str(known["fingerprint"])
             else:
                 keep(job, known)
         if not ready:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, inputs = running.pop(future)
-                keep(job, journal.write(job, _result(future), inputs))
+                result = _result(future)
+                if job.name in drawn and result["status"] == DONE:
+                    keep(job, drawn[job.name])
+                else:
+                    keep(job, journal.write(job, result, inputs))
     return [records[job.name] for job in jobs]
 
 

@@ -32,8 +32,8 @@ class Job:
 
     run : "" for a calibration. calibration : file for all runs; "" for the dataset's own. model,
     medium : of a calibration. shake, refine_rig, accept : of a smoothing, see `telerig.smooth`.
-    tracks : tracks.csv or its folder; "" for the results folder. needs : names of jobs to be done
-    before.
+    tracks : tracks.csv or its folder; "" for the results folder. report : write report.html.
+    only_report : do nothing else. needs : names of jobs to be done before.
     """
 
     kind: Kind
@@ -47,6 +47,7 @@ class Job:
     accept: tuple[str, ...] = ()
     tracks: str = ""
     report: bool = True
+    only_report: bool = False
     needs: tuple[str, ...] = ()
 
     @property
@@ -70,6 +71,11 @@ class Job:
     def result(self) -> Path:
         """The file that exists when the job is done."""
         return self.results / MAIN_RESULT[self.kind]
+
+    @property
+    def lacks_report(self) -> bool:
+        """Whether the report that the job should write does not exist."""
+        return self.report and not (self.results / "report.html").is_file()
 
     @property
     def command(self) -> str:
@@ -282,11 +288,13 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
 
 
 def fingerprint(job: Job) -> str:
-    """Return a hash of everything on which the result of a job depends: version, options, inputs.
+    """Return a hash of what the result of a job depends on, its report aside: version, options,
+    inputs.
 
     Recorded files enter by size and time of change, calibrations and tracks by their content.
     """
-    hashed = hashlib.sha256(f"{VERSION} {job.as_json()}".encode())
+    stated = replace(job, report=True, only_report=False)
+    hashed = hashlib.sha256(f"{VERSION} {stated.as_json()}".encode())
     place = Path(job.dataset)
     listed = [place / "rig.toml"]
     for folder in _INPUTS.get(job.kind, (f"runs/{job.run}",)):

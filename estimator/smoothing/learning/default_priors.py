@@ -29,6 +29,7 @@ _ZIGZAG_HZ = (3.0, 12.0)
 _ZIGZAG_GUESS_HZ = 6.5
 _ZIGZAG_RMS_MM = 0.5
 _ZIGZAG_DAMPING = 0.04
+_LEAST_PERIODS = 1.5
 _HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
 _CLEAR = 0.2
@@ -119,20 +120,24 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Return frequency (Hz) and RMS (mm) of the bubbles' swing (Lomb-Scargle), if there are any."""
+    """Return frequency (Hz) and RMS (mm) of the bubbles' swing (Lomb-Scargle), if there are any.
+
+    Of a track only the frequencies count of which it shows `_LEAST_PERIODS` periods.
+    """
     from scipy.signal import lombscargle
 
     trials = np.arange(_ZIGZAG_HZ[0], _ZIGZAG_HZ[1], 0.25)
     power, total, samples = np.zeros(len(trials)), 0.0, 0
     for bubble in problem.bubbles[:20]:
         t = problem.t_s[bubble.first : bubble.last + 1]
-        if len(bubble) < 12 or t[-1] - t[0] < 1.5 / _ZIGZAG_HZ[0]:
+        shown = trials * (t[-1] - t[0]) >= _LEAST_PERIODS
+        if len(bubble) < 12 or not shown.any():
             continue
         across = bubble.guess_mm - (bubble.guess_mm @ problem.up)[:, None] * problem.up
         x = (t - t.mean()) / (t[-1] - t[0])
         drift = np.stack([np.ones_like(x), x, x**2], -1)
         rest = across - drift @ np.linalg.lstsq(drift, across, rcond=None)[0]
-        power += sum(2 * lombscargle(t, column, 2 * np.pi * trials) for column in rest.T)
+        power += shown * sum(2 * lombscargle(t, column, 2 * np.pi * trials) for column in rest.T)
         total, samples = total + (rest**2).sum(), samples + 2 * len(t)
     if not samples:
         return None

@@ -70,11 +70,11 @@ def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
     out = {}
     for axis, name in enumerate(AXES):
         mine = tuple(line for part, line in lines if part[axis] > 0.7)
-        out[name] = _axis(sigma[:, axis], known[:, axis], eta[axis], rms[axis], mine)
+        out[name] = axis_verdict(sigma[:, axis], known[:, axis], eta[axis], rms[axis], mine)
     return out
 
 
-def _axis(
+def axis_verdict(
     sigma: Array, known: Array, eta: float | None, rms: float, lines: tuple[Attribution, ...]
 ) -> AxisVerdict:
     q, base = float(np.median(sigma / known)), float(np.median(known))

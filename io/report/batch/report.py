@@ -24,8 +24,10 @@ from telerig.io.report.page.figures import (
 )
 from telerig.io.report.page.number_format import ABSENT, is_number, number
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
+from telerig.io.results.batch import verdict_counts
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import read_object
+from telerig.short_text import counted
 
 Job = Mapping[str, Any]
 
@@ -90,7 +92,8 @@ def render(jobs: Sequence[Job], folder: Path, name: str) -> str:
     context = {
         "name": name,
         "headline": f"{words}, {datasets} dataset" + ("s" if datasets != 1 else ""),
-        "colour": "good" if not failed else ("rejected" if len(failed) == len(jobs) else "usable"),
+        "colour": _colour(jobs),
+        "words": _words(jobs),
         "figures": _key_numbers(jobs),
         "failures": [_failure(j) for j in failed],
         "calibrations": [_calibration(j, folder) for j in jobs if j["kind"] == "calibrate"],
@@ -100,14 +103,50 @@ def render(jobs: Sequence[Job], folder: Path, name: str) -> str:
     return render_page("template_batch.html", context, "")
 
 
+SOUND = ("GOOD", "RESOLVED")
+"""The verdicts that need no second look."""
+
+
+def _colour(jobs: Sequence[Job]) -> str:
+    failed = [j for j in jobs if j["status"] != _DONE]
+    if jobs and len(failed) == len(jobs):
+        return "rejected"
+    return "good" if not failed and set(verdict_counts(jobs)) <= set(SOUND) else "usable"
+
+
+def _words(jobs: Sequence[Job]) -> str:
+    """What the page says first: whether jobs failed, and what the verdicts are."""
+    words = []
+    if any(j["status"] != _DONE for j in jobs):
+        words.append(
+            "What failed, and what to do, is listed below; the same command tries it again and "
+            "leaves the rest."
+        )
+    else:
+        words.append("Every job was done.")
+    for kind, subject in (("calibrate", "calibration"), ("smooth", "smoothed run")):
+        counts = verdict_counts(j for j in jobs if j["kind"] == kind)
+        if counts:
+            listed = ", ".join(f"{n} {word}" for word, n in counts.items())
+            words.append(f"Verdicts of {counted(sum(counts.values()), subject)}: {listed}.")
+    unclear = verdict_counts(j for j in jobs if j["kind"] == "smooth").keys() - set(SOUND)
+    if unclear:
+        words.append(
+            "Where a run is not RESOLVED, its paths may still contain shake of the rig: its report "
+            "says how much, and what to add to the rig."
+        )
+    return " ".join(words)
+
+
 def _key_numbers(jobs: Sequence[Job]) -> list[Figure]:
     figures = []
     for kind, word in KINDS.items():
         mine = [j for j in jobs if j["kind"] == kind]
         if mine:
             counts = Counter(j["status"] for j in mine)
-            rest = ", ".join(f"{n} {s}" for s, n in counts.items() if s != _DONE)
-            figures.append(Figure(word, f"{counts[_DONE]} of {len(mine)}", rest or "none failed"))
+            rest = {s: n for s, n in counts.items() if s != _DONE} | verdict_counts(mine)
+            remark = ", ".join(f"{n} {s}" for s, n in rest.items())
+            figures.append(Figure(word, f"{counts[_DONE]} of {len(mine)}", remark or "none failed"))
     seconds = [float(j["seconds"]) for j in jobs if is_number(j.get("seconds"))]
     if seconds:
         hosts = len({j.get("host") for j in jobs if j.get("host")})

@@ -99,6 +99,17 @@ def test_what_is_done_is_not_done_again_until_an_input_changes(first_run, datase
     assert stamps == [
         (d / "results" / name).stat().st_mtime_ns for d in datasets for name in RESULTS
     ]
+    missing = datasets[0] / "results" / "rise" / "report.html"
+    words = missing.read_text(encoding="utf-8")
+    missing.unlink()
+    with local_executor(2) as executor:
+        quick = [replace(job, report=False) for job in _jobs(datasets)]
+        silent = run_batch(quick, executor, Journal(out))
+        assert not missing.is_file()
+        drawn = run_batch(_jobs(datasets), executor, Journal(out))
+    assert all(r["resumed"] for r in [*silent, *drawn])
+    assert len(missing.read_text(encoding="utf-8")) == pytest.approx(len(words), rel=0.01)
+    assert [_tables(d) for d in datasets] == before
     job = _jobs(datasets)[4]
     same = fingerprint(job)
     table = datasets[1] / "runs" / "rise" / "detections.csv"
@@ -176,7 +187,9 @@ def test_run_does_everything_for_one_dataset(tmp_path):
     data = make_dataset(tmp_path / "data", 5)
     result = CliRunner().invoke(app, ["run", str(data), "--no-report", "--quiet"])
     assert result.exit_code == 0, result.output
-    assert result.output == "calibrate: 1 done\ntrack: 1 done\nsmooth: 1 done\n"
+    assert result.output == (
+        "calibrate: 1 done (1 GOOD)\ntrack: 1 done\nsmooth: 1 done (1 UNRESOLVED)\n"
+    )
     assert all((data / "results" / name).is_file() for name in RESULTS)
 
 

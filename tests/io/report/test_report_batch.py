@@ -40,8 +40,8 @@ def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
     assert all(load.startswith("data:") for load in page.loads)
     assert len(page.pictures("svg+xml")) == 3
     for words in (
-        "1 of 2 runs done, 1 dataset", "calibrated 1 of 1 none failed",
-        "smoothed 1 of 2 1 left out", "work 2.5 min longest job 30 s, 1 machine",
+        "1 of 2 runs done, 1 dataset", "calibrated 1 of 1 1 GOOD",
+        "smoothed 1 of 2 1 left out, 1 RESOLVED", "work 2.5 min longest job 30 s, 1 machine",
         "tank GOOD radial 12 99.5% 0.0123", "sd / µm",
         "tank / rise RESOLVED 120 7 800 23.0, 13.0, 24.0", "tank / fall track failed",
         f"/data/tank, run fall track failed {evil}",
@@ -49,6 +49,27 @@ def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
         assert words in page.spaced, words
     assert evil not in file.read_text(encoding="utf-8")
     assert 'class="verdict usable"' in file.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "colour", "words"),
+    [
+        (["RESOLVED"], "good", "Verdicts of 1 smoothed run: 1 RESOLVED."),
+        (["RESOLVED", *["UNRESOLVED LABEL_AMBIGUOUS"] * 4], "usable",
+         "Verdicts of 5 smoothed runs: 1 RESOLVED, 4 UNRESOLVED."),
+        (["", "PARTIAL"], "usable", "may still contain shake"),
+    ],
+)  # fmt: skip
+def test_a_page_without_failures_says_the_verdicts(
+    tmp_path: Path, verdicts: list[str], colour: str, words: str
+) -> None:
+    jobs = [_job("smooth", f"run{i}", verdict=v) for i, v in enumerate(verdicts)]
+    file = write_batch_report(_write(tmp_path / "out", jobs))
+    page = Page(file)
+    assert words in page.spaced and "Every job was done." in page.spaced
+    assert "nothing failed" not in page.spaced.lower()
+    assert f'class="verdict {colour}"' in file.read_text(encoding="utf-8")
+    assert ("may still contain shake" in page.spaced) == (colour == "usable")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,479 @@
+"""What accuracy an experiment can reach, before anything is recorded.
+
+The covariances of a smoothing depend on what is measured when and how well, not on the readings. So
+the smoothing graph of the planned run, with the shake's true spectrum as its prior, gives the exact
+posterior. Runs that are smoothed without knowing the spectrum come within 20 % of it where marks
+or an accelerometer on each arm measure the shake (docs/decisions/038).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from telerig.arrays import Array, Ints
+from telerig.errors import InputError
+from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
+from telerig.estimator.calibration.result.calibration import Calibration, load_calibration
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.estimator.sensors.checks import Mounting
+from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
+from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, travel_of
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    Accelerometer,
+    Bubble,
+    CarriageModel,
+    Mark,
+    Observations,
+    RigMode,
+    ShakeModel,
+    SmoothingProblem,
+    Stage,
+)
+from telerig.estimator.smoothing.problem.tables import calibration_share
+from telerig.estimator.smoothing.result import trajectories
+from telerig.estimator.smoothing.verdict.identifiability import (
+    axis_verdict,
+    shake_share,
+    without_sensors,
+)
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
+from telerig.io.results.smoothing import AXES, Verdict
+from telerig.io.rig_file.description import RigDescription
+from telerig.io.simulation.calibration.scene import hand_held_views, true_cameras, true_target
+from telerig.io.simulation.calibration_files import exact_dots
+from telerig.io.simulation.config import CameraConfig, SimulationConfig
+from telerig.rig.camera import Camera
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.short_text import counted
+
+_SAMPLE_HZ = 2000.0
+_FORCE_HZ, _DAMPING = 60.0, 0.03
+_COMMON, _ARM_RATIO = 0.75, 1.6
+_EDGE = 0.1
+_INSIDE = 0.8
+_MARK_SIGMA_MM = 30.0
+_DENSITY_UG = 25.0
+_BLUR_PX, _IMAGE_NOISE = 1.0, 0.01
+_UG_MM_S2 = 1e-3 * STANDARD_GRAVITY_M_S2
+MOST_STATES = 20_000
+"""Largest product of frames and bubbles: the covariances of more would take minutes."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Describe a planned run. The rig, its stage and its sensors are those of rig.toml.
+
+    rate_hz, seconds : frame rate, and duration of the run.
+    bubbles : number of bubbles in sight.
+    diameter_mm : of a bubble; it gives the noise of its centre (`centre_sigma_px`).
+    sigma_px : standard deviation of a centre in px; None for that of the diameter.
+    rise_mm_s : rise velocity, which the stage follows.
+    zigzag_hz, zigzag_mm : frequency and RMS of the path's zigzag across the vertical.
+    shake_hz, shake_mm : frequency and RMS along the vertical of the rig's shake; across it, half.
+    marks : number of marks in each view that are fixed to the tank; mark_sigma_px : their noise.
+    arms : whether each camera's arm carries an accelerometer, besides those of rig.toml.
+    """
+
+    rate_hz: float = 500.0
+    seconds: float = 0.5
+    bubbles: int = 1
+    diameter_mm: float = 3.0
+    sigma_px: float | None = None
+    rise_mm_s: float = 250.0
+    zigzag_hz: float = 6.0
+    zigzag_mm: float = 1.4
+    shake_hz: float = 20.0
+    shake_mm: float = 0.15
+    marks: int = 0
+    mark_sigma_px: float = 0.1
+    arms: bool = False
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return round(self.rate_hz * self.seconds)
+
+    def check(self) -> None:
+        """Raise InputError for a value that is impossible or beyond what can be planned."""
+        for name in ("rate_hz", "seconds", "diameter_mm", "zigzag_hz", "shake_hz", "mark_sigma_px"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} is {value}", where="plan", todo="give a positive number")
+        for name in ("rise_mm_s", "zigzag_mm", "shake_mm", "marks"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"{name} is {value}", where="plan", todo="give 0 or more")
+        if self.sigma_px is not None and not (np.isfinite(self.sigma_px) and self.sigma_px > 0):
+            raise InputError(f"sigma_px is {self.sigma_px}", where="plan", todo="give > 0 px")
+        if self.bubbles < 1 or self.frames < 10 or self.frames * self.bubbles > MOST_STATES:
+            raise InputError(
+                f"{self.bubbles} bubbles in {self.frames} frames",
+                where="plan",
+                todo=f"plan 1 bubble or more in 10 frames or more, and at most {MOST_STATES} "
+                "bubbles times frames; a longer run is no worse",
+            )
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Hold what a planned run is expected to reach; medians without the first and last tenth.
+
+    verdict : of the worst axis.
+    position_um, velocity_mm_s : (3,) standard deviations along the rig's axes.
+    known_um : (3,) those of positions if the shake were known.
+    sigma_px : noise of a bubble's centre that was used.
+    """
+
+    verdict: Verdict
+    position_um: Array
+    velocity_mm_s: Array
+    known_um: Array
+    sigma_px: float
+
+
+def centre_sigma_px(diameter_px: float) -> float:
+    """Return the standard deviation in px of the centre of a bubble's outline.
+
+    It is the Cramer-Rao bound for a blurred disc in white noise of 1 % of the contrast with a blur
+    of 1 px, and 1 % of the radius for the shape: the centre of an outline wanders when the body
+    oscillates (docs/decisions/007).
+    """
+    radius, blur = diameter_px / 2, np.hypot(_BLUR_PX, np.sqrt(1 / 12))
+    noise = _IMAGE_NOISE * np.sqrt(2 * blur / (np.sqrt(np.pi) * radius))
+    return float(np.hypot(noise, 0.01 * radius))
+
+
+def expected_calibration(
+    rig: RigDescription, views: int = 12, sigma_px: float = 0.01, seed: int = 0
+) -> Calibration:
+    """Return the calibration that hand-held views of the target of rig.toml are expected to give.
+
+    Its cameras are the nominal ones and its covariance is the Cramer-Rao bound: that of exact dots
+    whose stated noise is ``sigma_px``.
+
+    Raises InputError if the target does not fit into the views.
+    """
+    turns = [np.asarray(turn, float) for turn in rig.rotvec_from_first_deg.values()]
+    cameras = tuple(
+        CameraConfig(c.name, c.image_size_px, c.scale_px_per_mm, c.scale_px_per_mm)
+        for c in rig.cameras.values()
+    )
+    field_mm = min(min(c.image_size_px) / c.scale_px_per_mm for c in cameras)
+    reach = 0.2 * field_mm
+    config = SimulationConfig(
+        rig.name, cameras, rig.target, views=views,
+        angle_deg=float(np.linalg.norm(turns[0])) if turns else 90.0,
+        mount_rotvec_deg=(0.0, 0.0, 0.0), axis_gap_mm=0.0, shift_mm=(reach,) * 3,
+        visible_fraction=0.5, marks_visible=False, print_factor=0.0,
+    )  # fmt: skip
+    rng = np.random.default_rng(seed)
+    true, target = true_cameras(config), true_target(config, rng)
+    dots = exact_dots(config, true, target, hand_held_views(config, true, target, rng))
+    dots = dots[dots["inside"] == 1].reset_index(drop=True)
+    dots[["suu_px2", "svv_px2"]], dots["suv_px2"] = sigma_px**2, 0.0
+    noise = sigma_px * rng.standard_normal((len(dots), 2))
+    dots[["u_px", "v_px"]] = dots[["u_px", "v_px"]].to_numpy() + noise
+    nominal = rig.rotvec_from_first_deg
+    first = true[rig.first].camera_from_rig
+    return self_calibrate(
+        dots, [replace(camera, camera_from_rig=first) for camera in true.values()], rig.target,
+        name=rig.name, model="radial",
+        nominal_rotvec_deg=nominal if len(nominal) > 1 else next(iter(nominal.values()), None),
+    )  # fmt: skip
+
+
+def calibration_of(
+    dataset: Path, rig: RigDescription, given: Path | None = None, views: int = 12
+) -> Calibration:
+    """Return the given calibration, or else the dataset's own, or else the expected one.
+
+    views : number of views of the target for the expected one.
+
+    Raises InputError for a calibration that cannot be read, for a rig with one camera, and for a
+    target that does not fit into the views.
+    """
+    own = dataset / "results" / "calibration"
+    if given is not None or (own / "calibration.json").is_file():
+        return load_calibration(given or own)
+    if len(rig.cameras) < 2:
+        raise InputError(
+            "a rig with one camera", where=str(dataset / "rig.toml"),
+            todo="describe two cameras: one alone sees no depth",
+        )  # fmt: skip
+    return expected_calibration(rig, views)
+
+
+def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -> Expected:
+    """Return what a planned run is expected to reach.
+
+    rig : the description in rig.toml: stage, accelerometers, cameras of the tracking.
+    calibration : the rig's calibration, or `expected_calibration`.
+
+    Raises InputError for an impossible experiment.
+    """
+    planned.check()
+    names = rig.tracking_cameras
+    pair = calibration if len(calibration.cameras) < 3 else calibration.pair(*names)
+    sigma_px = planned.sigma_px
+    if sigma_px is None:
+        sigma_px = centre_sigma_px(planned.diameter_mm * pair.cameras[0]["scale_px_per_mm"])
+    problem = planned_problem(rig, pair, planned, sigma_px)
+    model = planned_model(problem, rig, planned)
+    solution = solve(problem, model, Options(robust=False))
+    known = solve(
+        without_sensors(problem),
+        replace(model.without_shake(), carriage=CarriageModel(), encoder_scale_sigma=0.0),
+        Options(robust=False),
+    )
+    free = solution
+    if model.encoder_scale_sigma:
+        free = solve(problem, replace(model, encoder_scale_sigma=0.0), Options(robust=False))
+    inner = _inner(solution)
+    table = trajectories(solution, None).iloc[inner]
+    ours, theirs = (_position_sd(one)[inner] for one in (free, known))
+    eta = shake_share(solution)
+    axes = [
+        axis_verdict(ours[:, i], theirs[:, i], eta[i], planned.shake_mm, ()).verdict
+        for i in range(3)
+    ]
+    return Expected(
+        max(axes, key=list(Verdict).index),
+        1e3 * table[[f"s{a}_mm" for a in AXES]].median().to_numpy(float),
+        table[[f"sv{a}_mm_s" for a in AXES]].median().to_numpy(float),
+        1e3 * np.median(theirs, axis=0),
+        sigma_px,
+    )
+
+
+def planned_problem(
+    rig: RigDescription, calibration: Calibration, planned: Experiment, sigma_px: float
+) -> SmoothingProblem:
+    """Return the smoothing problem of a run without noise in which nothing shakes.
+
+    The stage follows the bubbles, which rise straight, at places spread over the field.
+    """
+    cameras, travel = calibration.cameras, travel_of(calibration.stage, rig.stage)
+    mounting = Mounting.of(rig.stage, travel.axis)
+    t_s = np.arange(planned.frames) / planned.rate_hz
+    encoder = planned.rise_mm_s * t_s
+    field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
+    rng = np.random.default_rng(0)
+    first = rng.uniform(-0.25 * field, 0.25 * field, (planned.bubbles, 3))
+    paths = first[:, None] + (encoder[:, None] * travel.axis)[None]
+    bubbles = tuple(Bubble(k, 0, len(t_s) - 1, path[0], path) for k, path in enumerate(paths))
+    item, frame, camera = (
+        a.ravel()
+        for a in np.meshgrid(
+            np.arange(planned.bubbles), np.arange(len(t_s)), np.arange(len(cameras)), indexing="ij"
+        )
+    )
+    seen = paths[item, frame] - encoder[frame, None] * travel.axis
+    observations = _observed(cameras, item, frame, camera, seen, sigma_px)
+    marks, references = _marks(cameras, t_s, encoder, travel.axis, planned)
+    stage = Stage(t_s, encoder) if rig.stage is not None else None
+    return SmoothingProblem(
+        tuple(cameras), t_s, travel.axis, mounting.up, bubbles, observations, stage,
+        _accelerometers(rig, [c.name for c in cameras], t_s, mounting, planned.arms), marks,
+        references, calibration_share(calibration, first, sigma_px), travel,
+        mounting.gravity_m_s2,
+    )  # fmt: skip
+
+
+def _observed(
+    cameras: Sequence[Camera], item: Ints, frame: Ints, camera: Ints, seen_mm: Array, sd: float
+) -> Observations:
+    uv = np.empty((len(item), 2))
+    for index, one in enumerate(cameras):
+        uv[camera == index] = one.project(seen_mm[camera == index])
+    covariance = np.broadcast_to(sd**2 * np.eye(2), (len(item), 2, 2))
+    return Observations(item, frame, camera, uv, covariance)
+
+
+def _marks(
+    cameras: Sequence[Camera], t_s: Array, encoder: Array, axis: Array, planned: Experiment
+) -> tuple[tuple[Mark, ...], Observations]:
+    """Return marks along the tank, so that each view always has its number of them inside."""
+    if not planned.marks:
+        return (), Observations.none()
+    marks: list[Mark] = []
+    parts = []
+    for index, camera in enumerate(cameras):
+        half = _INSIDE * min(camera.image_size_px) / camera["scale_px_per_mm"] / 2
+        pitch = 2 * half / planned.marks
+        for height in np.arange(-half + pitch / 2, encoder[-1] + half, pitch):
+            frames = np.flatnonzero(np.abs(height - encoder) <= half)
+            if len(frames) > 1:
+                seen = (height - encoder[frames])[:, None] * axis
+                ones = np.ones(len(frames), np.int64)
+                parts.append(
+                    _observed(
+                        cameras, len(marks) * ones, frames, index * ones, seen,
+                        planned.mark_sigma_px,
+                    )
+                )  # fmt: skip
+                name = f"{camera.name}{len(marks)}"
+                marks.append(Mark(name, height * axis, _MARK_SIGMA_MM))
+    fields = ("item", "frame", "camera", "uv_px", "covariance_px2")
+    joined = (np.concatenate([getattr(part, name) for part in parts]) for name in fields)
+    return tuple(marks), Observations(*joined)
+
+
+def _accelerometers(
+    rig: RigDescription, cameras: list[str], t_s: Array, mounting: Mounting, arms: bool
+) -> tuple[Accelerometer, ...]:
+    """Return the sensors of rig.toml, and one for each arm that has none if ``arms``."""
+    planned: list[tuple[str, str, Array, float | None]] = [
+        (one.name, one.mounted_on, np.asarray(one.axes, float), one.noise_density_ug_sqrt_hz)
+        for one in rig.accelerometers.values()
+    ]
+    bare = [c for c in cameras if c not in [mount for _, mount, *_ in planned]] if arms else []
+    planned += [(f"arm_{c}", c, np.eye(3), None) for c in bare]
+    times = np.arange(t_s[0], t_s[-1] + 1 / _SAMPLE_HZ, 1 / _SAMPLE_HZ)
+    at_rest = 1000 * mounting.gravity_m_s2 * mounting.up
+    return tuple(
+        Accelerometer(
+            name, CARRIAGE if mount not in cameras else cameras.index(mount), times,
+            np.broadcast_to(axes @ at_rest, (len(times), 3)).copy(), axes,
+            (density or _DENSITY_UG) * _UG_MM_S2 * np.sqrt(_SAMPLE_HZ / 2),
+        )
+        for name, mount, axes, density in planned
+    )  # fmt: skip
+
+
+def planned_model(
+    problem: SmoothingProblem, rig: RigDescription, planned: Experiment
+) -> ShakeModel:
+    """Return the true hyper-parameters of the planned run."""
+    across, up = 1 - np.abs(problem.up), np.abs(problem.up)
+
+    def triple(values: Array) -> tuple[float, float, float]:
+        x, y, z = values.tolist()
+        return x, y, z
+
+    rms = planned.shake_mm * (up + 0.5 * across)
+    modes: tuple[RigMode, ...] = (
+        RigMode(planned.shake_hz, _DAMPING, triple(np.sqrt(_COMMON) * rms), CARRIAGE),
+    )
+    modes += tuple(
+        RigMode(_ARM_RATIO * planned.shake_hz, _DAMPING, triple(np.sqrt(1 - _COMMON) * rms), j)
+        for j in range(len(problem.cameras))
+    )
+    zigzags = (
+        Zigzag(planned.zigzag_hz, _DAMPING, triple(planned.zigzag_mm * across)),
+        Zigzag(2 * planned.zigzag_hz, _DAMPING, triple(0.1 * planned.zigzag_mm * up)),
+    )
+    marked = len(problem.references) > 0 and problem.stage is not None
+    carriage = CarriageModel()
+    if problem.accelerometers:
+        carriage = CarriageModel("force", acceleration_rms_mm_s2=300.0)
+    return ShakeModel(
+        bubble=BubbleModel(zigzags=zigzags),
+        modes=modes if planned.shake_mm else (),
+        carriage=carriage,
+        encoder_sigma_mm=0.005 if rig.stage is None else float(rig.stage.position_sigma_mm),
+        encoder_scale_sigma=default_scale_sigma(problem.travel) if marked else 0.0,
+        name="planned",
+    )
+
+
+def _inner(solution: Solution) -> Ints:
+    """Return the rows of a solution without the first and the last tenth of the frames."""
+    frames = solution.graph.frame_of_row
+    edge = int(_EDGE * (frames.max() + 1))
+    return np.flatnonzero((frames >= edge) & (frames <= frames.max() - edge))
+
+
+def _position_sd(solution: Solution) -> Array:
+    assert solution.covariances is not None
+    rows, covariance = solution.graph.bubble.position, solution.covariances.bubbles
+    return np.asarray(np.sqrt(np.einsum("id,nde,ie->ni", rows, covariance, rows, optimize=True)))
+
+
+def variants(rig: RigDescription, planned: Experiment) -> dict[str, Experiment]:
+    """Return the planned experiment and what could be added to it, by name.
+
+    Only what the plan lacks is added: marks, accelerometers on the arms, both, twice the frame
+    rate, and four more bubbles.
+    """
+    out = {"as planned": planned}
+    has_arms = set(rig.tracking_cameras) <= {a.mounted_on for a in rig.accelerometers.values()}
+    lacks_arms = not (planned.arms or has_arms)
+    marks = 4 if not planned.marks else 2 * planned.marks
+    out[f"{marks} marks in each view"] = replace(planned, marks=marks)
+    if lacks_arms:
+        out["an accelerometer on each arm"] = replace(planned, arms=True)
+        out[f"both ({marks} marks)"] = replace(planned, marks=marks, arms=True)
+    more = {
+        "twice the frame rate": replace(planned, rate_hz=2 * planned.rate_hz),
+        "four more bubbles": replace(planned, bubbles=planned.bubbles + 4),
+    }
+    return out | {
+        name: one for name, one in more.items() if one.frames * one.bubbles <= MOST_STATES
+    }
+
+
+def plan_table(expected: dict[str, Expected]) -> pd.DataFrame:
+    """Return the expectations as a table: variant, verdict, standard deviations along each axis."""
+    rows = [
+        {
+            "variant": name, "verdict": str(one.verdict), "sigma_px": one.sigma_px,
+            **{f"s{a}_um": v for a, v in zip(AXES, one.position_um)},
+            **{f"sv{a}_mm_s": v for a, v in zip(AXES, one.velocity_mm_s)},
+            **{f"s{a}_shake_known_um": v for a, v in zip(AXES, one.known_um)},
+        }
+        for name, one in expected.items()
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def plan_words(
+    rig: RigDescription,
+    calibration: Calibration,
+    planned: Experiment,
+    expected: dict[str, Expected],
+) -> list[str]:
+    """Return the plan in words: the calibration's share, a table of the variants, and advice."""
+    first, *_ = expected.values()
+    share = uncertainty_map(calibration).calibration_mm2
+    um = 1e3 * np.sqrt(np.trace(share, axis1=1, axis2=2) / 3)
+    sensors = ", ".join(rig.accelerometers) or "none"
+    lines = [
+        f"{counted(planned.bubbles, 'bubble')} for {planned.seconds:g} s at "
+        f"{planned.rate_hz:g} Hz; a centre is good to {first.sigma_px:.2g} px; the rig shakes by "
+        f"{planned.shake_mm:g} mm RMS at {planned.shake_hz:g} Hz",
+        f"encoder: {'yes' if rig.stage else 'no'}; accelerometers: {sensors}; marks in each view: "
+        f"{planned.marks}",
+        f"the calibration moves all points together by {np.median(um):.2g} um per axis, in the "
+        f"worst corner of the working volume by {um.max():.2g} um",
+        "",
+        f"{'':30}{'position, um':>20}{'velocity, mm/s':>22}",
+        f"{'standard deviation':30}{'x':>7}{'y':>7}{'z':>7}{'x':>8}{'y':>7}{'z':>7}  verdict",
+    ]
+    for name, one in expected.items():
+        place = "".join(f"{v:7.3g}" for v in one.position_um)
+        speed = "".join(f"{v:7.2g}" for v in one.velocity_mm_s)
+        lines.append(f"{name:30}{place} {speed}  {one.verdict}")
+    known = "".join(f"{v:7.3g}" for v in first.known_um)
+    lines += [f"{'(as planned, shake known)':30}{known}", "", _advice(expected)]
+    return lines
+
+
+def _advice(expected: dict[str, Expected]) -> str:
+    """Return the sentence that says what to add."""
+    first, *_ = expected.values()
+    if first.verdict is Verdict.RESOLVED:
+        return "The plan separates the bubbles' motion from the shake."
+    enough = [name for name, one in expected.items() if one.verdict is Verdict.RESOLVED]
+    enough = [name for name in enough if not name.startswith("both")] or enough
+    if not enough:
+        return (
+            "None of these additions separates the bubbles' motion from the shake: record for "
+            "longer, or stiffen the rig."
+        )
+    return f"To separate the bubbles' motion from the shake, add: {' or '.join(enough)}."

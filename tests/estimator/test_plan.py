@@ -1,0 +1,133 @@
+"""Plans of experiments: against exact posteriors of another program, and as a command."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import telerig
+from telerig.errors import InputError
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
+from telerig.estimator.plan import (
+    Experiment,
+    centre_sigma_px,
+    expect,
+    expected_calibration,
+    planned_problem,
+    variants,
+)
+from telerig.io.rig_file.description import RigDescription
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.presets import run_preset
+from telerig.scripts.main import app
+
+S2 = Experiment(
+    500.0, 1.5, sigma_px=0.5, rise_mm_s=280.0, zigzag_mm=1.77, shake_hz=20.0,
+    shake_mm=0.2 / np.sqrt(2),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("plan") / "tank"
+    config = run_preset("S2", frames=12)
+    config = replace(config, stage=replace(config.stage, accelerometers=()))
+    telerig.simulate(config, rng=np.random.default_rng(0), out=folder, images=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rig(tank: Path) -> RigDescription:
+    """An encoder of 1 um whose scale is exact."""
+    described = telerig.load_dataset(tank).rig
+    assert described.stage is not None
+    exact = replace(described.stage, position_sigma_mm=0.001, scale_sigma=0.0)
+    return replace(described, stage=exact)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> telerig.Calibration:
+    cameras = true_cameras(run_preset("S2").calibration)
+    return calibration_from_cameras(list(cameras.values()))
+
+
+@pytest.mark.parametrize(
+    ("added", "position_um", "velocity_mm_s", "verdict"),
+    [
+        ({}, 39.0, 3.9, "UNRESOLVED"),
+        ({"bubbles": 5}, 32.0, 3.1, "UNRESOLVED"),
+        ({"arms": True}, 14.7, 2.23, "RESOLVED"),
+        ({"marks": 4}, 13.9, 2.23, "RESOLVED"),
+    ],
+)
+def test_the_exact_posteriors_of_an_independent_smoother(
+    rig: RigDescription, calibration: telerig.Calibration, added: dict[str, int],
+    position_um: float, velocity_mm_s: float, verdict: str,
+) -> None:  # fmt: skip
+    """Of scenario S2 along the vertical: benchmarks/results/shake_table.md."""
+    found = expect(rig, calibration, replace(S2, **added))
+    assert found.position_um[1] == pytest.approx(position_um, rel=0.08)
+    assert found.velocity_mm_s[1] == pytest.approx(velocity_mm_s, rel=0.08)
+    assert found.known_um[1] == pytest.approx(12.8, rel=0.04)
+    assert found.verdict == verdict
+
+
+def test_marks_are_where_the_cameras_look(
+    rig: RigDescription, calibration: telerig.Calibration
+) -> None:
+    problem = planned_problem(rig, calibration, replace(S2, marks=4), 0.5)
+    seen = problem.references
+    counts = pd.Series(1, index=[seen.frame, seen.camera]).groupby(level=[0, 1]).sum()
+    assert counts.between(3, 5).all() and len(counts) == 2 * S2.frames
+    size = calibration.cameras[0].image_size_px
+    assert (seen.uv_px >= 0).all() and (seen.uv_px < size).all()
+
+
+def test_a_bubbles_centre_is_worse_the_smaller_its_picture_and_the_larger_its_body() -> None:
+    sizes = [centre_sigma_px(d) for d in (4.0, 10.0, 40.0, 80.0)]
+    assert sizes[0] < 0.03 and sizes[-1] == pytest.approx(0.4, rel=0.01)
+
+
+def test_the_expected_calibration_is_the_usual_one(tank: Path) -> None:
+    data = telerig.load_dataset(tank)
+    real, expected = telerig.calibrate(data), expected_calibration(data.rig)
+    name = "right.scale_px_per_mm"
+    assert expected.sd(name) == pytest.approx(real.sd(name), rel=0.25)
+
+
+def test_variants_add_only_what_is_missing(rig: RigDescription) -> None:
+    assert "an accelerometer on each arm" in variants(rig, S2)
+    assert list(variants(rig, replace(S2, arms=True)))[:2] == ["as planned", "4 marks in each view"]
+    large = replace(S2, bubbles=20, rate_hz=1000.0, seconds=1.0)
+    assert not {"twice the frame rate", "four more bubbles"} & set(variants(rig, large))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"rate_hz": np.nan}, {"seconds": 0.001}, {"bubbles": 0}, {"marks": -1}, {"shake_mm": -1}],
+)
+def test_impossible_experiments(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="plan"):
+        replace(S2, **wrong).check()
+
+
+def test_a_rig_that_does_not_shake(rig: RigDescription, calibration: telerig.Calibration) -> None:
+    still = expect(rig, calibration, replace(S2, shake_mm=0.0, seconds=0.2))
+    assert still.verdict == "RESOLVED"
+    np.testing.assert_allclose(still.position_um, still.known_um, rtol=1e-6)
+
+
+def test_the_command_says_what_to_add(tank: Path, tmp_path: Path) -> None:
+    line = ["plan", str(tank), "--seconds", "0.2", "--quiet", "--out", str(tmp_path / "plan.csv")]
+    result = CliRunner().invoke(app, line)
+    assert result.exit_code == 0, result.output
+    assert "add: 4 marks in each view" in result.output
+    table = pd.read_csv(tmp_path / "plan.csv")
+    assert list(table["verdict"][:2]) == ["UNRESOLVED", "RESOLVED"]
+    assert CliRunner().invoke(app, [*line, "--rate-hz", "0"]).exit_code == 2
+    assert CliRunner().invoke(app, ["plan", str(tmp_path)]).exit_code == 2

@@ -82,7 +82,7 @@ def true_table(config: RunConfig, seed: int) -> pd.DataFrame:
         "eotvos": liquid.eotvos(1e-3 * d),
         "drag": 4 / 3 * scene.forces.drag_1_mm[:, None] * d,
         "shape_hz": np.broadcast_to(scene.population.swing_hz[:, [2]], speed.shape),
-        "lift_hz": np.broadcast_to(scene.forces.lift_hz[:, [0]], speed.shape),
+        "lift_hz": np.broadcast_to(scene.forces.lift_hz[:, None], speed.shape),
     }  # fmt: skip
     for i, x in enumerate("xyz"):
         columns |= {f"{x}_mm": scene.lab_mm[..., i], f"v{x}_mm_s": v[..., i]}
@@ -132,6 +132,8 @@ def true_summary(truth: pd.DataFrame) -> dict[str, float]:
     t = truth["t_s"].to_numpy()
     same = ("d_eq_mm", "aspect", "slip_mm_s", "eotvos", "reynolds", "weber", "drag", "shape_hz")
     out = {name: truth[name].mean() for name in same}
+    # of the means, as the table has it
+    out["weber"] *= out["slip_mm_s"] ** 2 / (truth["slip_mm_s"] ** 2).mean()
     out["rise_mm_s"] = -(truth["y_mm"].iloc[-1] - truth["y_mm"].iloc[0]) / (t[-1] - t[0])
     swing = dominant_oscillation(t, truth[["vx_mm_s", "vz_mm_s"]].to_numpy())
     out["zigzag_hz"] = truth["lift_hz"].iloc[0]

@@ -13,6 +13,10 @@ from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillat
 from telerig.io.results.bubbles import SUMMARY_COLUMNS, WHOLE
 from telerig.rig.bubble_physics import Liquid
 
+_LEAST_COMMON = 0.02
+"""Share of the variance that frames have in common at the least: scatter over few correlated frames
+can look like all of it."""
+
 _ABOVE_ZIGZAG = 2.6
 """Shape oscillations are sought above the zigzag's second harmonic, with which the aspect ratio
 follows the bubble's speed."""
@@ -43,7 +47,9 @@ def _row(mine: pd.DataFrame, up: Array, liquid: Liquid | None) -> dict[str, Any]
         row[value], row[sd] = mean_of_body(mine[value].to_numpy(float), mine[sd].to_numpy(float))
     row["rise_mm_s"], row["s_rise_mm_s"] = _mean_rise(t, mine, up)
     row["slip_mm_s"] = _mean(mine["slip_mm_s"])
-    row["s_slip_mm_s"] = row["s_rise_mm_s"]
+    # noise across the motion makes a mean speed too large
+    noise = (mine[[f"sv{a}_mm_s" for a in AXES]] ** 2).sum(axis=1) / (2 * mine["slip_mm_s"])
+    row["s_slip_mm_s"] = float(np.hypot(row["s_rise_mm_s"], _mean(noise)))
     row |= _zigzag(t, mine, up)
     low = _ABOVE_ZIGZAG * row.get("zigzag_hz", 0.0)
     shape = dominant_oscillation(t, np.log(mine[["aspect"]].to_numpy(float)), low)
@@ -64,7 +70,7 @@ def mean_of_body(values: Array, sd: Array) -> tuple[float, float]:
         return float("nan"), float("nan")
     x, variance = values[good], float((sd[good] ** 2).mean())
     scatter = float(x.var())
-    common = max(variance - scatter, 0.0)
+    common = max(variance - scatter, _LEAST_COMMON * variance)
     return float(x.mean()), float(np.sqrt(common + scatter * _correlated_share(x)))
 
 

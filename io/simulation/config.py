@@ -162,9 +162,10 @@ class MotionConfig:
     """Paths of the bubbles in the laboratory.
 
     path : "forces" integrates the equation of motion in the run's liquid (`FluidConfig`): buoyancy,
-    added mass, drag, and a lift across the velocity of ``lift`` times the buoyancy, which swings at
-    ``lateral_hz`` and makes the zigzag, and of RMS ``lift_noise`` below 4 Hz. Sizes decide the
-    speed; ``rise_mm_s`` tells only how many bubbles exist and how fast the stage is.
+    added mass, drag, and a lift across the velocity. The lift is ``lift`` times the buoyancy,
+    swinging at ``lateral_hz``, which makes the zigzag, and noise of RMS ``lift_noise`` times it,
+    which forgets within ``lift_tau_s``. Sizes decide the speed; ``rise_mm_s`` tells only how many
+    bubbles exist and how fast the stage is.
     "zigzag" and "helix" have a constant speed ``rise_mm_s`` along the path and the lateral
     amplitude ``lateral_mm``; "stochastic" rises at ``rise_mm_s`` in the mean, with the stochastic
     oscillations ``height_oscillation`` and ``lateral_oscillation``.
@@ -183,7 +184,8 @@ class MotionConfig:
     height_oscillation: Oscillation = (0.177, 12.0, 0.03)
     lateral_oscillation: Oscillation = (2.0, 6.0, 0.03)
     lift: Range = (0.25, 0.45)
-    lift_noise: float = 0.03
+    lift_noise: float = 0.1
+    lift_tau_s: float = 0.02
     spread: tuple[float, float] = (0.15, 0.15)
     pairs: bool = False
     closest_mm: float = 0.25

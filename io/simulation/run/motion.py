@@ -279,9 +279,10 @@ def added_mass_along(aspect: float) -> float:
 class Forces:
     """What drives each of B bubbles, per mass of displaced liquid.
 
-    drag_1_mm : (B,) drag over speed^2; added_mass : (B,). lift_mm_s2, lift_hz, lift_rad : (B, K) a
-    lift that swings; lift_azimuth : (B, K, 2) unit vectors across the vertical, to one side of
-    which it acts.
+    drag_1_mm : (B,) drag over speed^2; added_mass : (B,).
+    lift_mm_s2, lift_hz, lift_rad : (B,) a lift that swings; lift_azimuth : (B, 2) unit vector
+    across the vertical, to one side of which it acts. noise_mm_s2, noise_tau_s : RMS on both
+    horizontal axes, and correlation time, of an Ornstein-Uhlenbeck lift.
     """
 
     drag_1_mm: Array
@@ -290,15 +291,19 @@ class Forces:
     lift_hz: Array
     lift_rad: Array
     lift_azimuth: Array
+    noise_mm_s2: float
+    noise_tau_s: float
     gravity_mm_s2: float
 
-    def acceleration(self, t_s: float, velocity: Array) -> Array:
-        """Return (B, 3) in mm/s^2 at velocities (B, 3): height first, then the two lateral axes."""
+    def acceleration(self, t_s: float, velocity: Array, noise: Array) -> Array:
+        """Return (B, 3) in mm/s^2: height first, then the two lateral axes.
+
+        velocity : (B, 3). noise : (B, 2) lift in mm/s^2.
+        """
         speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
         along = velocity / speed
         swing = self.lift_mm_s2 * np.cos(2 * np.pi * self.lift_hz * t_s + self.lift_rad)
-        push = np.einsum("bk,bkj->bj", swing, self.lift_azimuth)
-        across = np.concatenate([np.zeros_like(speed), push], -1)
+        across = np.concatenate([0 * speed, swing[:, None] * self.lift_azimuth + noise], -1)
         across = across - along * (across * along).sum(-1, keepdims=True)
         force = across - self.drag_1_mm[:, None] * speed * velocity
         force[:, 0] += self.gravity_mm_s2
@@ -309,34 +314,44 @@ _WARM_UP_S = 1.0
 _LONGEST_STEP_S = 5e-4
 
 
-def driven_paths(step_s: float, steps: int, forces: Forces) -> Path:
-    """Return paths of bubbles under forces, by fourth-order Runge-Kutta, after the transient."""
-    velocity = np.zeros((len(forces.added_mass), 3))
+def driven_paths(step_s: float, steps: int, forces: Forces, rng: Generator) -> Path:
+    """Return paths of bubbles under forces, by fourth-order Runge-Kutta, after the transient.
+
+    The noise is drawn at the beginning, middle and end of every step.
+    """
+    count = len(forces.added_mass)
+    fine = int(np.ceil(step_s / _LONGEST_STEP_S))
+    h = step_s / fine
+    warm = int(np.ceil(_WARM_UP_S / step_s)) * fine
+    process = ornstein_uhlenbeck(forces.noise_mm_s2, forces.noise_tau_s)
+    noise = np.zeros((2 * (warm + steps * fine) + 1, count, 2))
+    if forces.noise_mm_s2 > 0:
+        drawn = process.paths(
+            h / 2, len(noise), rng, paths=2 * count,
+            start_covariance=np.diag([0.0, forces.noise_mm_s2**2]),
+        )[..., VELOCITY]  # fmt: skip
+        noise = drawn.reshape(count, 2, -1).transpose(2, 0, 1)
+    velocity = np.zeros((count, 3))
     velocity[:, 0] = np.sqrt(forces.gravity_mm_s2 / forces.drag_1_mm)
     state = np.concatenate([0 * velocity, velocity], -1)
 
-    def slope(t: float, state: Array) -> Array:
-        return np.concatenate([state[:, 3:], forces.acceleration(t, state[:, 3:])], -1)
+    def slope(half: int, state: Array) -> Array:
+        t = (half / 2 - warm) * h
+        rate = forces.acceleration(t, state[:, 3:], noise[half])
+        return np.concatenate([state[:, 3:], rate], -1)
 
-    def advanced(state: Array, t: float, span_s: float) -> Array:
-        count = int(np.ceil(span_s / _LONGEST_STEP_S))
-        h = span_s / count
-        for i in range(count):
-            now = t + i * h
-            first = slope(now, state)
-            second = slope(now + h / 2, state + h / 2 * first)
-            third = slope(now + h / 2, state + h / 2 * second)
-            fourth = slope(now + h, state + h * third)
-            state = state + h / 6 * (first + 2 * second + 2 * third + fourth)
-        return state
-
-    state = advanced(state, -_WARM_UP_S, _WARM_UP_S)
-    state[:, :3] = 0.0
     states, rates = [], []
-    for i in range(steps):
-        states.append(state)
-        rates.append(forces.acceleration(i * step_s, state[:, 3:]))
-        state = advanced(state, i * step_s, step_s)
+    for i in range(warm + (steps - 1) * fine + 1):
+        first = slope(2 * i, state)
+        if i == warm:
+            state[:, :3] = 0.0
+        if i >= warm and (i - warm) % fine == 0:
+            states.append(state)
+            rates.append(first[:, 3:])
+        second = slope(2 * i + 1, state + h / 2 * first)
+        third = slope(2 * i + 1, state + h / 2 * second)
+        fourth = slope(2 * i + 2, state + h * third)
+        state = state + h / 6 * (first + 2 * second + 2 * third + fourth)
     place, rate = np.stack(states, 1), np.stack(rates, 1)
     return Path(
         place[..., 0], place[..., 1:3], place[..., 3], place[..., 4:], rate[..., 0], rate[..., 1:]

@@ -144,7 +144,7 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     population = random_population(config, count, shape_rng)
     if config.motion.path == "forces":
         forces = _forces(config, population, path_rng)
-        paths = driven_paths(1 / config.frame_rate_hz, config.frames, forces)
+        paths = driven_paths(1 / config.frame_rate_hz, config.frames, forces, path_rng)
     else:
         paths, forces = _paths(config, count, path_rng), None
     lab, velocity, closest = _lab_paths(config, paths, path_rng)
@@ -173,8 +173,6 @@ _LAWS = {
     "mendelson": mendelson_velocity,
     "tomiyama": tomiyama_velocity,
 }
-_NOISES = 8
-_NOISE_HZ = (0.5, 4.0)
 
 
 def _forces(config: RunConfig, population: Population, rng: Generator) -> Forces:
@@ -194,18 +192,16 @@ def _forces(config: RunConfig, population: Population, rng: Generator) -> Forces
             todo="ask for larger ones, or another law",
         )
     gravity = 1000 * config.stage.gravity_m_s2
-    swing = gravity * rng.uniform(*motion.lift, count)[:, None]
-    noise = np.full((count, _NOISES), gravity * motion.lift_noise * np.sqrt(2 / _NOISES))
-    hertz = rng.uniform(*motion.lateral_hz, count)[:, None]
-    turn = rng.uniform(0, 2 * np.pi, (count, 1 + _NOISES))
-    azimuth = rng.uniform(0, 2 * np.pi, (count, 1 + _NOISES))
+    azimuth = rng.uniform(0, 2 * np.pi, count)
     return Forces(
         0.75 * drag / population.d_eq_mm,
         np.array([added_mass_along(a) for a in population.aspect]),
-        np.concatenate([swing, noise], -1),
-        np.concatenate([hertz, rng.uniform(*_NOISE_HZ, (count, _NOISES))], -1),
-        turn,
+        gravity * rng.uniform(*motion.lift, count),
+        rng.uniform(*motion.lateral_hz, count),
+        rng.uniform(0, 2 * np.pi, count),
         np.stack([np.cos(azimuth), np.sin(azimuth)], -1),
+        gravity * motion.lift_noise,
+        motion.lift_tau_s,
         gravity,
     )
 

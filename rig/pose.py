@@ -22,8 +22,7 @@ def hat(v: ArrayLike) -> Array:
 
 
 def across(direction: ArrayLike) -> Array:
-    """Return two orthonormal vectors, the columns of (3, 2), that are perpendicular to a direction
-    (3,)."""
+    """Return two orthonormal vectors, as columns (3, 2), perpendicular to a direction (3,)."""
     return np.asarray(np.linalg.svd(np.asarray(direction, float)[None])[2][1:].T)
 
 
@@ -86,8 +85,7 @@ class Pose:
         return rotvec_from_rotation(self.rotation)
 
     def apply(self, points_mm: ArrayLike) -> Array:
-        """Return the points (..., N, 3) in target coordinates, for N points (..., N, 3) in source
-        coordinates."""
+        """Return points (..., N, 3) in target coordinates, from those in source coordinates."""
         rotated = np.asarray(points_mm, float) @ self.rotation.mT
         return np.asarray(rotated + self.translation_mm[..., None, :])
 

@@ -54,8 +54,7 @@ def intrinsics_from(parameters: Mapping[str, float]) -> Array:
 
 
 def turned_wall(intrinsics: Array, wall: Wall) -> Wall:
-    """Return the window after its normal has been turned by wall_x_rad and wall_y_rad of the
-    intrinsics."""
+    """Return the window with its normal turned by wall_x_rad and wall_y_rad of the intrinsics."""
     return wall.turned(intrinsics[_WALL])
 
 
@@ -85,9 +84,7 @@ def ideal_from_pixel(uv_px: Array, intrinsics: Array, rho_mm: float) -> Array:
 
 
 def sensor_from_distorted(xy_mm: Array, intrinsics: Array) -> Array:
-    """Return the coordinates (..., 2) on the tilted sensor of distorted coordinates (..., 2), in
-    mm.
-    """
+    """Return tilted-sensor coordinates (..., 2) of distorted coordinates (..., 2), in mm."""
     q, w = intrinsics[_TX : _TY + 1], intrinsics[_W]
     if not q.any():
         return xy_mm

@@ -68,9 +68,7 @@ class Target:
         return self.layout == "points" or self.extent == "bounded"
 
     def ids(self) -> Ints:
-        """Return the ids (N,) of all N dots of a bounded target, without marks that are missing
-        dots.
-        """
+        """Return the ids (N,) of all dots of a bounded target, without marks that lack a dot."""
         if self.layout == "points":
             return np.arange(len(self._points()))
         every = np.arange(self.rows * self.columns)
@@ -88,8 +86,7 @@ class Target:
         return np.asarray((r + _HALF) * (2 * _HALF) + (c + _HALF))
 
     def row_column_from_id(self, dot: ArrayLike) -> tuple[Ints, Ints]:
-        """Return the rows (...) and columns (...) of dot ids; for the layout "points" they are (0,
-        dot)."""
+        """Return rows (...) and columns (...) of dot ids; (0, dot) for the layout "points"."""
         d = np.asarray(dot, np.int64)
         if self.layout == "points":
             return np.zeros_like(d), d.copy()
@@ -150,8 +147,7 @@ class Target:
         return [np.rot90(grid, k * (4 // order)).ravel() for k in range(order)]
 
     def mirror_images_differ(self) -> bool:
-        """Return whether the marks of a grid, or the listed points, distinguish the target from its
-        mirror image."""
+        """Return whether marks or listed points tell the target from its mirror image."""
         if self.layout == "points":
             place = self._complex_points()
             far = int(np.argmax(np.abs(place))) if len(place) else 0

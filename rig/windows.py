@@ -51,8 +51,7 @@ class Wall:
 
     @property
     def ratios(self) -> tuple[float, float]:
-        """The refractive index on the camera's side divided by that of the glass, and by that
-        behind the glass."""
+        """Refractive index on the camera's side over that of the glass, and over that behind it."""
         return self.indices[0] / self.indices[1], self.indices[0] / self.indices[2]
 
     @property
@@ -180,9 +179,7 @@ def ideal_from_water(points_mm: Array, kappa: float, wall: Wall) -> Array:
 
 
 def ideal_jacobians(points_mm: Array, kappa: float, wall: Wall) -> IdealPrediction:
-    """Return `ideal_from_water` with its derivatives, which follow from the implicit function
-    theorem.
-    """
+    """Return `ideal_from_water` and its derivatives, by the implicit function theorem."""
     ideal = ideal_from_water(points_mm, kappa, wall)
     rays = _refract(ideal, points_mm, kappa, wall)
     by_ideal, by_kappa = _ray_jacobians(ideal, rays, kappa, wall)

@@ -268,8 +268,7 @@ class Journal:
         self.folder = Path(batch) / "jobs"
 
     def done(self, job: Job) -> dict[str, Any] | None:
-        """Return the record of the job if it was done with the same inputs, options and version,
-        else None."""
+        """Return the job's record if it was done with the same inputs, options and version."""
         record = self.read(job)
         if record is None or record.get("status") != DONE or not is_whole(job.result):
             return None
@@ -340,9 +339,7 @@ def write_batch(
 
 
 def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the summary for the user: the number of jobs of each kind and status, and every
-    failure.
-    """
+    """Return the summary: the number of jobs of each kind and status, and every failure."""
     lines = []
     for kind in ("calibrate", "track", "smooth"):
         of_kind = [r for r in records if r["kind"] == kind]

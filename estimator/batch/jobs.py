@@ -268,9 +268,7 @@ def check_run_name(run: Path) -> None:
 
 
 def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
-    """Raise InputError for a calibration that does not exist, and for an unknown lens model or
-    medium.
-    """
+    """Raise InputError for a calibration that does not exist, an unknown lens model or medium."""
     from telerig.errors import CalibrationError
     from telerig.estimator.calibration.calibrate import checked_medium
     from telerig.rig.lens_parameters import checked_model

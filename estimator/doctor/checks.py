@@ -51,8 +51,7 @@ class Check:
 
 
 def check_installation() -> Iterator[Check]:
-    """Check Python, the packages that telerig needs, that only one OpenCV is installed, and the
-    extras."""
+    """Check Python, the packages that telerig needs, the extras, and that OpenCV is there once."""
     python = platform.python_version()
     known = _OLDEST <= sys.version_info[:2] <= _NEWEST
     yield Check(
@@ -121,8 +120,7 @@ def _version(name: str) -> str | None:
 
 
 def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
-    """Check for every serial port whether it may be opened, and the latency timer of its
-    adapter."""
+    """Check for every serial port whether it may be opened, and its adapter's latency timer."""
     ports = found_ports()
     if not ports:
         words = "none found"

@@ -119,9 +119,7 @@ def _averaged(t: Array, values: Array, grid: Grid) -> Array:
 
 
 def _bridged(at: Array, t: Array) -> Bools:
-    """Return whether each time (n,) lies between samples (N,) that are not farther apart than
-    usual.
-    """
+    """Return whether each time (n,) lies between samples (N,) no farther apart than usual."""
     if len(t) < 2:
         return np.zeros(len(at), bool)
     longest = _GAP * max(float(np.median(np.diff(t))), float(at[1] - at[0]) if len(at) > 1 else 0)

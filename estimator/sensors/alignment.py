@@ -102,9 +102,7 @@ class Alignment:
 
     @property
     def at_zero(self) -> bool:
-        """Whether the data show a connection at the clock of the frames, and none clearly better
-        elsewhere.
-        """
+        """Whether the data connect at the clock of the frames, and nowhere clearly better."""
         return self.connected and self.at_zero_nats > _MOST_OF_PEAK * self.nats
 
 

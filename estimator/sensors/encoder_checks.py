@@ -46,8 +46,7 @@ class EncoderFault:
 
     @property
     def acceleration_m_s2(self) -> float:
-        """The least acceleration that would move the carriage by the size of the fault within its
-        step."""
+        """The least acceleration that moves the carriage by the fault's size within its step."""
         return 4e-3 * abs(self.size_mm) / self.step_s**2
 
     def affects(self, t_s: Array, frames_t_s: Array) -> bool:

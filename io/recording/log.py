@@ -197,8 +197,7 @@ class LogScan:
 
 
 def scan_log(path: Path) -> LogScan:
-    """Read a raw log once to see what is damaged in it. Raises InputError for a file that is no
-    log."""
+    """Read a raw log to see what is damaged in it. Raises InputError for another file."""
     header, start = _open(path)
     damaged, ordered, end_ns = 0, True, None
     latest: dict[tuple[int, int], int] = {}

@@ -44,8 +44,7 @@ def write_calibration(
     images: bool,
     complete: Callable[[RigDescription], RigDescription] = lambda rig: rig,
 ) -> tuple[Mapping[str, Camera], TrueTarget]:
-    """Write `rig.toml`, `calibration/` and `truth/`; return the true cameras by name, and the
-    target."""
+    """Write `rig.toml`, `calibration/` and `truth/`; return the true cameras and the target."""
     seed = seed_of(rng)
     scene_rng, dots_rng, image_rng = rng.spawn(3)
     cameras = true_cameras(settings)

@@ -198,9 +198,7 @@ def _fits(
     problem: Problem, rich: Solution, path: list[Lenses], alternatives: list[Lenses]
 ) -> list[FittedModel]:
     # a fork of a process that has used GTSAM can hang, because GTSAM's threads are not copied
-    """Return the fitted models of the path and of the alternatives; only the path is
-    cross-validated.
-    """
+    """Return fitted models of the path and the alternatives; only the path is cross-validated."""
     tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in alternatives]
     here = problem.solver == "gtsam" or len(problem.uv_px) < DOTS_FOR_WORKERS
     workers = 1 if here else quick_workers(len(tasks))

@@ -72,9 +72,7 @@ class QuadraticCost:
 
     @staticmethod
     def of(problem: Problem, solution: Solution) -> QuadraticCost:
-        """Return the quadratic form from a fit of the rich model, or from any state near its
-        minimum.
-        """
+        """Return the quadratic form from a fit of the rich model, or a state near its minimum."""
         names = [(c, p) for c, free in enumerate(problem.free) for p in free]
         posterior = solution.equations.posterior(whole=False)
         step, still = solution.equations.step(1e-12)
@@ -118,8 +116,7 @@ class QuadraticCost:
         return float(d @ np.linalg.solve(inside, d)) / self.variance
 
     def cost(self, lenses: Lenses) -> float:
-        """Return the value of the criterion, up to a constant: the rise of chi-square plus the
-        penalties."""
+        """Return the criterion, up to a constant: the rise of chi-square plus the penalties."""
         return self.rise(lenses) + sum(self.penalty_of(lens) for lens in lenses)
 
     def cost_of_fit(self, lenses: Lenses, fitted_cost: float) -> float:
@@ -134,8 +131,7 @@ class QuadraticCost:
         return self.penalty * sum(len(GROUPS[g]) for g in own) + self.group_penalty * len(groups)
 
     def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
-        """Return the largest ratio of posterior to prior standard deviation among the parameters of
-        a group."""
+        """Return the largest ratio of posterior to prior sd among the parameters of a group."""
         held = self._held(lenses)
         mine = [i for i, n in enumerate(self.names) if n[0] == camera and n[1] in GROUPS[group]]
         cross = self.covariance[np.ix_(mine, held)]
@@ -214,8 +210,7 @@ def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lense
 
 
 def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Addition]:
-    """Yield (camera, group, model) for every allowed model that has one group more than
-    ``lenses``."""
+    """Yield (camera, group, model) for each allowed model with one group more than ``lenses``."""
     for c, options in enumerate(allowed):
         for lens in options:
             more = lens - lenses[c]
@@ -224,9 +219,7 @@ def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Add
 
 
 def steps_to(quadratic: QuadraticCost, chosen: Lenses, least: Lenses) -> list[Addition]:
-    """Return the steps from the simplest model ``least`` to ``chosen``, the most useful group
-    first.
-    """
+    """Return the steps from the simplest model ``least`` to ``chosen``, the most useful first."""
     within = [list(_between(low, high)) for low, high in zip(least, chosen)]
     now = least
     out: list[Addition] = []

@@ -133,9 +133,7 @@ def _names(problem: Problem) -> tuple[str, ...]:
 
 
 def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior) -> Array:
-    """Return J C J^T (M, 2, 2) of each used measurement: the share of its noise that the fit
-    absorbs.
-    """
+    """Return J C J^T (M, 2, 2) of each used measurement: the noise share that the fit absorbs."""
     system, out = System(problem), np.empty((int(np.sum(problem.kept)), 2, 2))
     for c, obs in enumerate(system.images):
         columns = system.columns(solution.state, c)[:-1].transpose(2, 1, 0)

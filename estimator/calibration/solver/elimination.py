@@ -271,8 +271,7 @@ class GraphEquations:
         return out[: self.layout.system.size, : self.layout.system.size]
 
     def _square_root(self) -> tuple[Array, Ints]:
-        """Return the upper triangular matrix R (W, W) of the Bayes net, and the scalar (W,) of each
-        column."""
+        """Return the Bayes net's upper triangular R (W, W), and the scalar (W,) of each column."""
         net = self._net(0.0)
         place = np.concatenate([self.layout.places[key] for key in self.layout.order])
         row_of = np.empty_like(place)

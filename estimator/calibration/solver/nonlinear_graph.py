@@ -42,8 +42,7 @@ def keys_of(problem: Problem) -> Keys:
 
 
 def nonlinear_graph(problem: Problem, start: State) -> tuple[Any, Any, Keys]:
-    """Return the problem as (gtsam.NonlinearFactorGraph, gtsam.Values, keys), with values from
-    ``start``."""
+    """Return gtsam.NonlinearFactorGraph, gtsam.Values from ``start``, and keys of the problem."""
     import gtsam
 
     keys, system = keys_of(problem), System(problem)

@@ -130,9 +130,7 @@ class Problem:
         return self.weight > 0
 
     def observations(self) -> Observations:
-        """Return the measurements of positive weight, whitened with the square root of their
-        weight.
-        """
+        """Return measurements of positive weight, whitened with the square root of their weight."""
         keep = self.kept
         whitener = whitening(self.covariance_px2[keep])
         whitener = whitener * np.sqrt(self.weight[keep])[:, None, None]
@@ -186,15 +184,12 @@ def whitening(covariance: Array) -> Array:
 
 
 def parameter_unit(camera: Camera) -> Array:
-    """Return for each parameter (20,) the change that moves a pixel at the image corner by about 1
-    px.
-    """
+    """Return by parameter (20,) the change that moves a pixel at the image corner by about 1 px."""
     return np.array([p.step(camera.scales) for p in LENS_PARAMETERS.values()])
 
 
 def wall_freedom(camera: Camera) -> tuple[str, ...]:
-    """Return the names of the parameters that turn the window's normal, () if the normal is
-    exact."""
+    """Return names of the parameters that turn the window's normal, () if the normal is exact."""
     return _WALL if camera.wall is not None and camera.wall.normal_sigma_rad > 0 else ()
 
 
@@ -207,9 +202,7 @@ def prior_sigma(camera: Camera) -> Array:
 
 
 def nominal_state(problem: Problem) -> State:
-    """Return the state with nominal cameras and dots, and with the target of every view at the
-    origin.
-    """
+    """Return the state with nominal cameras and dots, and every view's target at the origin."""
     poses = np.array([matrix_from_camera(c) for c in problem.cameras])
     intrinsics = np.array([c.intrinsics for c in problem.cameras])
     views = np.tile(np.eye(4), (len(problem.views), 1, 1))
@@ -484,8 +477,7 @@ class System:
         return Priors(cameras, views, dots, distance)
 
     def moved(self, state: State, step: Array) -> State:
-        """Return the state after a step (D,). A pose (R, t) becomes (R exp(w), t + R v) for the
-        tangent (w, v)."""
+        """Return the state after a step (D,); a pose (R, t) becomes (R exp(w), t + R v)."""
         intrinsics, cameras = state.intrinsics.copy(), state.rig_from_camera.copy()
         for c, (free, unit, places) in enumerate(zip(self.free, self.unit, self.camera_places)):
             intrinsics[c, free] += step[places[: len(free)]] * unit

@@ -57,9 +57,7 @@ class Solution:
 
 
 def is_large(problem: Problem) -> bool:
-    """Return whether the Schur complement solves the problem rather than GTSAM
-    (docs/decisions/020).
-    """
+    """Return whether the Schur complement solves the problem, not GTSAM (docs/decisions/020)."""
     numbers = 6 * len(problem.views) + 3 * len(problem.dot_ids)
     return len(problem.view) > MANY_DOTS or numbers > MANY_PARAMETERS
 
@@ -142,14 +140,12 @@ class RobustFit:
 
 
 def pixel_residuals(problem: Problem, state: State) -> Array:
-    """Return the residuals (M, 2) of all M measured dots, predicted minus measured, including
-    left-out dots."""
+    """Return residuals (M, 2) of all measured dots, left-out ones too, predicted minus measured."""
     return pixels(state, problem.unweighted(), problem.rho_mm) - problem.uv_px
 
 
 def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:
-    """Return the squared Mahalanobis distances (M,) of residuals (M, 2) with covariances (M, 2,
-    2)."""
+    """Return squared Mahalanobis distances (M,) of residuals (M, 2) with covariances (M, 2, 2)."""
     solved = np.linalg.solve(covariance_px2, residual_px[..., None])[..., 0]
     return np.asarray((residual_px * solved).sum(-1))
 

@@ -76,8 +76,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Window:
-    """Pixels of a fit: grey levels (V, U) of a crop, its first pixel, and a mask (V, U) of those
-    that are used."""
+    """Pixels of a fit: grey levels (V, U) of a crop, its first pixel, a mask (V, U) of the used."""
 
     grey: Array
     first_u: int

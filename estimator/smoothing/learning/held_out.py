@@ -88,8 +88,7 @@ def _compared(window: Window, model: ShakeModel) -> HeldOut | None:
 def learning_record(
     problem: SmoothingProblem, model: ShakeModel
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return from what a model was learned and how it holds elsewhere, and warnings where it does
-    not."""
+    """Return from what a model was learned, how it holds elsewhere, and warnings if it does not."""
     t = _used(problem).problem.t_s
     frames = sum(len(part.problem.t_s) for part in learning_parts(problem))
     record: dict[str, Any] = {

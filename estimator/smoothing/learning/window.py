@@ -138,8 +138,7 @@ def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tup
 
 
 def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Window]:
-    """Return up to ``most`` windows, spread over the rest of the run, as long as the one used, or
-    as `MOST_FRAMES`."""
+    """Return up to ``most`` windows over the rest, as long as the one used, or `MOST_FRAMES`."""
     end = used.first + len(used.problem.t_s)
     length = min(end - used.first, MOST_FRAMES)
     before, after = _spread(0, used.first, length), _spread(end, len(problem.t_s), length)

@@ -320,9 +320,7 @@ class SmoothingProblem:
 
     @property
     def measures_shake(self) -> bool:
-        """Whether the shake is measured, by marks fixed to the tank or by an accelerometer on each
-        arm.
-        """
+        """Whether the shake is measured: by marks fixed to the tank, or a sensor on each arm."""
         return len(self.references) > 0 or len(self.arms_with_sensor) == len(self.cameras)
 
     def __post_init__(self) -> None:

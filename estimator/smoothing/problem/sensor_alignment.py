@@ -566,9 +566,7 @@ def _corrected_drift(
 
 
 def _at_frames(images: _Images, sensor: Accelerometer) -> tuple[Array, Bools]:
-    """Return a placed sensor's smoothed readings (n, 3) on the grid of the images, and which are
-    known.
-    """
+    """Return a placed sensor's smoothed readings (n, 3) on the images' grid, and the known."""
     found = _readings(images.grid, sensor)
     if found.grid.count < 2:
         return np.zeros((images.grid.count, 3)), np.zeros(images.grid.count, bool)

@@ -142,8 +142,7 @@ def _mode_json(mode: ShakeMode) -> dict[str, Any]:
 
 
 def remedies_of(problem: SmoothingProblem) -> tuple[Remedy, ...]:
-    """Return the measurements that would separate shake and motion better, of those that the run
-    lacks."""
+    """Return measurements that the run lacks and that would separate shake and motion better."""
     has_arms = len(problem.arms_with_sensor) == len(problem.cameras)
     if len(problem.references):
         return (Remedy.LONGER,) if has_arms else (Remedy.ARMS,)

@@ -285,8 +285,7 @@ def _stamps(recording: Recording, name: str) -> Array | None:
 
 
 def _unit_of_times(recording: Recording, values: Array, name: str) -> str:
-    """Return the unit of times that state none: by the stated rate, as times since 1970, or
-    seconds."""
+    """Return the unit of times that state none: by the stated rate, from 1970, or seconds."""
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
     if step > 0:
         rates = {unit: 1 / (step * TIME_UNITS[unit]) for unit in ("s", "ms", "us", "ns")}

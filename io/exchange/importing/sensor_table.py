@@ -53,8 +53,7 @@ def _axes(mean_m_s2: Array) -> list[list[int]]:
 
 
 def _noise_density(t_s: Array, readings_m_s2: Array) -> float:
-    """Return the noise density in micro-g per root hertz of the noisiest axis, from second
-    differences."""
+    """Return the noisiest axis' density in micro-g per root hertz, from second differences."""
     if len(t_s) < 4:
         return 100.0
     bend = np.abs(np.diff(readings_m_s2, 2, axis=0)) / np.sqrt(6)

@@ -172,8 +172,7 @@ def hand_held_views(
 def _plate_normals(
     config: SimulationConfig, cameras: list[Camera], rng: np.random.Generator
 ) -> Array:
-    """Return directions (N, 3) of the target's z axis, evenly spread, within ``tilt_deg`` of each
-    camera."""
+    """Return directions (N, 3) of the target's z, evenly spread, within a tilt of each camera."""
     directions = rng.standard_normal((_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     axes = np.array([camera.camera_from_rig.rotation[2] for camera in cameras])

@@ -76,16 +76,14 @@ def random_screen(
 
 @dataclass(frozen=True)
 class Specks:
-    """Describe specks of dirt: places (specks, 2), sd of a Gaussian (px), and share of light
-    absorbed."""
+    """Specks of dirt: places (specks, 2), sd of a Gaussian (px), and share of light absorbed."""
 
     uv_px: Array
     sigma_px: Array
     depth: Array
 
     def darken(self, image: Float32, shift_px: Array) -> None:
-        """Multiply ``image`` (height, width) in place by the transmission of the specks, moved by
-        shift_px."""
+        """Multiply ``image`` in place by the transmission of the specks, moved by shift_px."""
         height, width = image.shape
         reach = np.ceil(_SPECK_REACH * self.sigma_px)
         places = self.uv_px + shift_px

@@ -62,8 +62,7 @@ def bodies_about(
     *,
     d_eq_mm: ArrayLike | None = None,
 ) -> Bodies:
-    """Return bodies with the given centres of volume (..., 3), scaled to the diameters (...) if
-    given."""
+    """Return bodies with these centres of volume (..., 3), scaled to diameters (...) if given."""
     centre, turn = np.asarray(centre_mm, float), np.asarray(rotation, float)
     axes, amplitudes = np.asarray(semi_axes_mm, float), np.asarray(modes, float)
     volume, offset = _sphere_moments(amplitudes)
@@ -92,8 +91,7 @@ def volume_centre_mm(bodies: Bodies) -> Array:
 
 
 def surface_modes(directions: Array) -> Array:
-    """Return the real spherical harmonics (..., 21) at unit vectors (..., 3), in the order of
-    `MODES`."""
+    """Return real spherical harmonics (..., 21) at unit vectors (..., 3), ordered as `MODES`."""
     x, y, z = np.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     xy, minus = 2 * x * y, xx - yy
@@ -127,8 +125,7 @@ def outline_px(bodies: Bodies, camera: Camera, count: int = 128) -> Array:
 
 
 def rim_mm(bodies: Bodies, direction: ArrayLike, count: int = 128) -> Array:
-    """Return the points (..., count, 3) in mm that form the outline seen along ``direction`` (...,
-    3)."""
+    """Return points (..., count, 3) in mm of the outline seen along ``direction`` (..., 3)."""
     axes = _viewing_axes(bodies, np.asarray(direction, float))
     angle = np.arange(count) * 2 * np.pi / count
     across = axes[..., None, 0, :] * np.cos(angle)[:, None] + axes[..., None, 1, :] * np.sin(

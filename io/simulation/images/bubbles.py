@@ -76,8 +76,7 @@ def _square(du: Array, dv: Array, metric: Array) -> Float32:
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A bubble as one camera sees it: outline (N, 2), Gaussian blur with defocus, motion during
-    exposure."""
+    """A bubble as a camera sees it: outline (N, 2), blur of the defocus, motion during exposure."""
 
     outline_px: Array
     look: Look

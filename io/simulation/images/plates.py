@@ -238,8 +238,7 @@ class Plate:
 def plate_from_pixel(
     camera: Camera, rig_from_target: Pose, uv_px: ArrayLike, plate: Plate, z_mm: ArrayLike = 0.0
 ) -> Array:
-    """Return where the rays of pixels (..., 2) meet the plane ``z_mm`` of the target, (..., 2) in
-    mm."""
+    """Return where rays of pixels (..., 2) meet the target's plane ``z_mm``, (..., 2) in mm."""
     origin, direction = camera.unproject(uv_px)
     target_from_rig = rig_from_target.inverse()
     origin = target_from_rig.apply(np.atleast_2d(origin))

@@ -102,8 +102,7 @@ class LinearProcess:
         paths: int = 1,
         start_covariance: Array | None = None,
     ) -> Array:
-        """Return samples (paths, steps, n) from a random start, by default from the stationary
-        state."""
+        """Return samples (paths, steps, n) from a random start, by default a stationary one."""
         start = self.stationary_covariance() if start_covariance is None else start_covariance
         transition, root = self.discretised(step_s)
         n = len(self.noise_input)
@@ -377,8 +376,7 @@ def stage_trajectory(
 
 @dataclass(frozen=True)
 class Shake:
-    """Hold the cameras' offsets from the carriage and their derivatives, each (cameras, steps,
-    axes)."""
+    """Cameras' offsets from the carriage and their derivatives, each (cameras, steps, axes)."""
 
     offset_mm: Array
     velocity_mm_s: Array

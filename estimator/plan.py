@@ -37,6 +37,7 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.estimator.smoothing.problem.tables import calibration_share
 from telerig.estimator.smoothing.result import trajectories
+from telerig.estimator.smoothing.verdict.evidence import shake_of
 from telerig.estimator.smoothing.verdict.identifiability import (
     axis_verdict,
     shake_share,
@@ -237,7 +238,7 @@ def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -
     inner = _inner(solution)
     table = trajectories(solution, None).iloc[inner]
     ours, theirs = (_position_sd(one)[inner] for one in (free, known))
-    eta = shake_share(solution)
+    eta = shake_share(solution, shake_of(solution))
     axes = [
         axis_verdict(ours[:, i], theirs[:, i], eta[i], planned.shake_mm, ()).verdict
         for i in range(3)

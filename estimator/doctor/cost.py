@@ -9,6 +9,7 @@ import numpy as np
 from telerig.errors import TelerigError
 from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
 from telerig.io.dataset.run import RunData
+from telerig.io.files.frame_table import FrameTable
 from telerig.io.machine.parallel import cores
 
 _BACKGROUND_S_PER_MPX = 1.5
@@ -25,8 +26,12 @@ def cost_words(run: RunData) -> str:
     """
     detect_s = background_s = pixels = 0.0
     if run.detections is not None:
-        known = np.isfinite(run.detections["u_px"].to_numpy(float))
-        bubbles = known.sum() / (run.frame_count * len(run.cameras))
+        found = run.detections
+        if isinstance(found, FrameTable):
+            known = found.rows
+        else:
+            known = int(np.isfinite(found["u_px"].to_numpy(float)).sum())
+        bubbles = known / (run.frame_count * len(run.cameras))
     else:
         counts: list[int] = []
         for camera in run.cameras:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,8 @@ from telerig.estimator.smoothing.graph.stage_travel import (
     total_scale,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel
+from telerig.estimator.smoothing.results_file import StoredTables, Tables
+from telerig.estimator.smoothing.verdict.evidence import BUBBLES, MARKS, Evidence, Pixels, Span
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
 from telerig.factors.bubble_motion import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
@@ -37,29 +39,50 @@ class Smoothing(ShortText):
 
     trajectories : table of positions and velocities of the bubbles; `docs/files.md` describes it.
     shake : table of the cameras' shake in each frame; `docs/files.md` describes it.
+
     verdict : the part of smoothing.json that states how far the data separate the bubbles' motion
         from the shake; empty if this was not judged.
     summary : the rest of smoothing.json.
     model : the hyper-parameters that were used.
+    tables : which hold ``trajectories``, ``shake``, ``states`` and ``bodies``; those of a long run,
+        which was smoothed in pieces, are read from files when they are asked for.
     states : the estimated states of the bubbles, one row for each row of ``trajectories``, and of
         the shake, one row for each frame, with their covariances and with the rows that give
         positions and velocities from them: the group "states" of results.h5. Empty if a folder has
         no results.h5.
-    solution : the solution of the graph; None if the smoothing was read from a folder.
-    name : name of the run; "" if it is not known.
     bodies : table of the bubbles' sizes, aspect ratios and poles by frame, measured from their
         outlines (`telerig.estimator.physics.bodies`); None if there are no bubbles.
+    solution : the solution of the graph; None if the smoothing was read from a folder, and of a
+        long run.
+    name : name of the run; "" if it is not known.
     """
 
-    trajectories: pd.DataFrame
-    shake: pd.DataFrame
     verdict: Mapping[str, Any]
     summary: Mapping[str, Any]
     model: ShakeModel
-    states: Mapping[str, Array] = field(default_factory=dict)
+    tables: Tables | StoredTables
     solution: Solution | None = None
     name: str = ""
-    bodies: pd.DataFrame | None = None
+
+    @property
+    def trajectories(self) -> pd.DataFrame:
+        """The table of the bubbles."""
+        return self.tables.trajectories
+
+    @property
+    def shake(self) -> pd.DataFrame:
+        """The table of the cameras' shake."""
+        return self.tables.shake
+
+    @property
+    def states(self) -> Mapping[str, Array]:
+        """The states and their covariances."""
+        return self.tables.states
+
+    @property
+    def bodies(self) -> pd.DataFrame | None:
+        """The table of the bubbles' bodies."""
+        return self.tables.bodies
 
     def title(self) -> str:
         """Return the name of the run and the verdict."""
@@ -69,14 +92,14 @@ class Smoothing(ShortText):
 
     def facts(self) -> dict[str, str]:
         """Return the size, the verdict along each axis, the accuracy and the warnings, in words."""
-        table, axes = self.trajectories, self.verdict.get("axes", {})
-        bubbles = counted(int(table["particle"].nunique()), "bubble")
-        facts = {"bubbles": f"{bubbles} in {counted(len(self.shake), 'frame')}"}
+        axes, (bubbles, frames) = self.verdict.get("axes", {}), self.tables.sizes()
+        facts = {"bubbles": f"{counted(bubbles, 'bubble')} in {counted(frames, 'frame')}"}
         facts["axes"] = ", ".join(f"{name} {axis['verdict']}" for name, axis in axes.items())
         for name, pattern, factor, unit in (
             ("position sd", "s{}_mm", 1e3, "um"), ("velocity sd", "sv{}_mm_s", 1.0, "mm/s")
         ):  # fmt: skip
             columns = [pattern.format(axis) for axis in AXES]
+            table = self.tables.typical(columns)
             if len(table) and set(columns) <= set(table):
                 x, y, z = factor * table[columns].median()
                 facts[name] = f"x {x:.3g}, y {y:.3g}, z {z:.3g} {unit} (median)"
@@ -134,18 +157,30 @@ class Smoothing(ShortText):
 
     def write_files(self, out: Path) -> None:
         """Write the files of `save` into an existing folder, one after the other."""
-        from telerig.io.files.csv_table import write_table
+        import pandas as pd
+
+        from telerig.io.files.csv_table import append_table, write_table
         from telerig.io.results.smoothing import SmoothingFile
 
-        write_table(self.trajectories, out / "trajectories.csv")
-        write_table(self.shake, out / "shake.csv")
-        bubbles = bubble_table(self)
-        if len(bubbles):
-            write_table(bubbles, out / "bubbles.csv")
-            write_table(bubble_summary(self, bubbles), out / "bubble_summary.csv")
+        self.tables.write(out, self.verdict.get("inflation", (1.0, 1.0, 1.0)))
+        open_, ended = list[pd.DataFrame](), list[pd.DataFrame]()
+        for part in self.tables.parts():
+            bubbles = bubble_table(replace(self, tables=part))
+            if not len(bubbles):
+                continue
+            append_table(bubbles, out / "bubbles.csv")
+            known = pd.concat([*open_, bubbles], ignore_index=True)
+            going_on = known["particle"].isin(bubbles["particle"])
+            open_ = [known[going_on]]
+            if not going_on.all():
+                ended.append(bubble_summary(self, known[~going_on]))
+        if open_:
+            ended.append(bubble_summary(self, open_[0]))
+            summary = pd.concat(ended, ignore_index=True)
+            summary = summary.sort_values("particle", kind="stable", ignore_index=True)
+            write_table(summary, out / "bubble_summary.csv")
         file = out / "smoothing.json"
         SmoothingFile.of({**self.verdict, **self.summary}, file).write(file)
-        write_hdf5(self, out / "results.h5")
 
 
 def bubble_table(smoothing: Smoothing, fluid: Any = None) -> pd.DataFrame:
@@ -191,26 +226,29 @@ def _surroundings(smoothing: Smoothing, fluid: Any) -> tuple[Array, float, Any]:
     return up, gravity, (summary.get("fluid") or None) if fluid is None else fluid
 
 
-def summary_of(solution: Solution) -> dict[str, Any]:
+def summary_of(solution: Solution, evidence: Evidence, frames: int | None = None) -> dict[str, Any]:
     """Return the content of smoothing.json without the verdict.
 
     It holds the hyper-parameters, the estimated constants with their standard deviations, and
     numbers about the residuals.
+
+    evidence : of the run.
+    frames : of a run of which the solution is the piece in the middle; None for a whole run's.
     """
     from telerig.io.results.smoothing import SmoothingFile
 
-    graph = solution.graph
+    graph, whole = solution.graph, frames is None
     problem, model = graph.problem, graph.model
     names = [c.name for c in problem.cameras]
     return {
         "schema": SmoothingFile.SCHEMA,
         "cameras": names,
-        "frames": len(problem.t_s),
-        "bubbles": len(problem.bubbles),
+        "frames": len(problem.t_s) if whole else frames,
+        "bubbles": len(evidence.means),
         "model": asdict(model),
-        "log_evidence": solution.log_evidence,
-        "passes": solution.passes,
-        "states": {"shake": list(graph.shake.labels), "nodes": len(graph.nodes.t_s)},
+        "log_evidence": solution.log_evidence if whole else None,
+        "passes": evidence.passes,
+        "states": {"shake": list(graph.shake.labels), "nodes": evidence.nodes},
         "unseen": {
             n: f"along its depth, {_direction(c.camera_from_rig.rotation[2])} in rig axes"
             for n, c in zip(names, problem.cameras)
@@ -219,15 +257,15 @@ def summary_of(solution: Solution) -> dict[str, Any]:
         "gravity_m_s2": float(problem.gravity_m_s2),
         "depth_axes": {n: c.camera_from_rig.rotation[2] for n, c in zip(names, problem.cameras)},
         "residuals": {
-            "bubbles": _residuals(solution, 0),
-            "references": _residuals(solution, 1),
+            "bubbles": _residuals(evidence.pixels[BUBBLES]),
+            "references": _residuals(evidence.pixels[MARKS]),
         },
         "whiteness": pixel_whiteness(solution),
         "accelerometer_spectra": accelerometer_spectra(solution),
         "encoder": _encoder(solution),
         "travel": _travel(solution),
-        "accelerometers": _sensors(solution),
-        "bubble_means": _means(solution),
+        "accelerometers": _sensors(solution, evidence),
+        "bubble_means": _means(evidence),
         **_accelerations(solution),
     }
 
@@ -248,19 +286,15 @@ def _direction(vector: Array) -> str:
     return "(" + ", ".join(f"{v:.3g}" for v in vector) + ")"
 
 
-def _residuals(solution: Solution, which: int) -> dict[str, Any]:
-    values, weights = solution.residuals[which], solution.weights[which]
-    kept = weights > 0.5
-    if not len(values):
+def _residuals(pixels: Pixels) -> dict[str, Any]:
+    if not pixels.count:
         return {"pixels": 0}
-    square = (values[kept] ** 2).sum(-1)
+    kept = pixels.count - pixels.lost
     return {
-        "pixels": len(values),
-        "outliers": int((~kept).sum()),
-        "rms_sigmas": float(np.sqrt(square.mean() / 2)) if kept.any() else None,
-        "median_sigmas": float(np.sqrt(np.median(square) / (2 * np.log(2))))
-        if kept.any()
-        else None,
+        "pixels": pixels.count,
+        "outliers": pixels.lost,
+        "rms_sigmas": float(np.sqrt(pixels.total / kept / 2)) if kept else None,
+        "median_sigmas": float(np.sqrt(np.median(pixels.some) / (2 * np.log(2)))) if kept else None,
     }
 
 
@@ -300,7 +334,7 @@ def _travel(solution: Solution) -> dict[str, Any]:
     }
 
 
-def _sensors(solution: Solution) -> dict[str, Any]:
+def _sensors(solution: Solution, evidence: Evidence) -> dict[str, Any]:
     graph = solution.graph
     names = ["bias_x_mm_s2", "bias_y_mm_s2", "bias_z_mm_s2"]
     names += ["scale"] * graph.sensor_flags[0]
@@ -311,10 +345,7 @@ def _sensors(solution: Solution) -> dict[str, Any]:
         found["delay_s"] = float(solution.delays_s[i])
         if clocks is not None and graph.sensor_flags[1]:
             found["sdelay_s"] = float(np.sqrt(clocks[graph.clock_of[i], 0, 0]))
-        found["masked_samples"] = sensor.masked_samples
-        weight = solution.sample_weights[i] if solution.sample_weights else None
-        if weight is not None:
-            found["masked_samples"] = int(np.count_nonzero(weight < _USED))
+        found["masked_samples"] = evidence.lost[sensor.name].masked
         found["delay_s"] += sensor.offset_s
         found["offset_s"] = found["delay_s"]
         found["offset_sd_s"] = found.get("sdelay_s", sensor.offset_sd_s)
@@ -324,15 +355,14 @@ def _sensors(solution: Solution) -> dict[str, Any]:
     return out
 
 
-def _means(solution: Solution) -> dict[str, Any]:
-    names = ["x_mm_s", "y_mm_s", "z_mm_s"]
-    block = _block(solution, "means")
-    return {
-        str(b.particle): _with_sd(
-            names, solution.state.means[i], None if block is None else block[i]
-        )
-        for i, b in enumerate(solution.graph.problem.bubbles)
-    }
+def _means(evidence: Evidence) -> dict[str, Any]:
+    names, out = ["x_mm_s", "y_mm_s", "z_mm_s"], {}
+    for particle, mean in evidence.means.items():
+        found = dict(zip(names, mean.velocity_mm_s.tolist()))
+        if mean.sigma_mm_s is not None:
+            found |= {f"s{n}": s for n, s in zip(names, mean.sigma_mm_s.tolist())}
+        out[str(particle)] = found
+    return out
 
 
 def _block(solution: Solution, name: str) -> Array | None:
@@ -347,22 +377,28 @@ def _with_sd(names: list[str], values: Array, covariance: Array | None) -> dict[
     return out
 
 
-def states_of(solution: Solution) -> dict[str, Array]:
-    """Return the ``states`` of a `Smoothing`."""
+def states_of(solution: Solution, span: Span | None = None) -> dict[str, Array]:
+    """Return the ``states`` of a `Smoothing`; span : its frames, None for all."""
     layout, found = solution.graph, solution.covariances
+    frames: Any = slice(None)
+    rows: Any = slice(None)
+    if span is not None:
+        frames = slice(span.own.start, span.own.stop)
+        rows = np.flatnonzero(span.holds(layout.frame_of_row))
     arrays = {
-        "shake": layout.shake_at_frames(solution.state.shake),
-        "bubbles": solution.state.bubbles,
+        "shake": layout.shake_at_frames(solution.state.shake)[frames],
+        "bubbles": solution.state.bubbles[rows],
         "shake_offset_rows": np.asarray(layout.shake.offset),
         "bubble_position_rows": np.asarray(layout.bubble.position),
         "bubble_velocity_rows": np.asarray(layout.bubble.velocity),
     }
     if found is not None:
-        arrays |= {"shake_covariance": found.shake, "bubble_covariance": found.bubbles}
+        arrays["shake_covariance"] = found.shake[frames]
+        arrays["bubble_covariance"] = found.bubbles[rows]
     moved = solution.accelerations
     if moved is not None:
-        arrays["bubble_acceleration"] = moved.value_mm_s2
-        arrays["bubble_acceleration_covariance"] = moved.covariance
+        arrays["bubble_acceleration"] = moved.value_mm_s2[rows]
+        arrays["bubble_acceleration_covariance"] = moved.covariance[rows]
     return arrays
 
 
@@ -403,38 +439,9 @@ def load_smoothing(folder: str | Path) -> Smoothing:
             todo=SmoothingFile.AGAIN,
         ) from error
     paths, offsets = paths.reset_index(drop=True), offsets.reset_index(drop=True)
-    return Smoothing(
-        paths, offsets, verdict, content, model, states, name=place.resolve().name, bodies=bodies
-    )
+    tables = Tables(paths, offsets, states, bodies)
+    return Smoothing(verdict, content, model, tables, name=place.resolve().name)
 
-
-def write_hdf5(smoothing: Smoothing, path: Path) -> None:
-    """Write both tables, the states and their covariances into an HDF5 file.
-
-    The file's attribute ``rows`` explains how positions and velocities follow from the states. The
-    covariances are those of the solution; the attribute ``inflation`` holds the factors of the
-    standard deviations along x, y and z by which contradicting measurements widen the tables'.
-    """
-    from telerig.io.files.hdf5 import hdf5_file
-    from telerig.io.results.smoothing import SmoothingFile
-
-    with hdf5_file(path) as file:
-        for name, table in (("trajectories", smoothing.trajectories), ("shake", smoothing.shake)):
-            group = file.create_group(name)
-            for column in table.columns:
-                group.create_dataset(column, data=table[column].to_numpy(), compression="gzip")
-        states = file.create_group("states")
-        for name, array in smoothing.states.items():
-            # level 1 of shuffled bytes is three times as fast as the default, and not larger
-            states.create_dataset(
-                name, data=array, compression="gzip", compression_opts=1, shuffle=True
-            )
-        file.attrs["schema"] = SmoothingFile.SCHEMA
-        file.attrs["inflation"] = smoothing.verdict.get("inflation", (1.0, 1.0, 1.0))
-        file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"
-
-
-_USED = 0.5
 
 AXES = ("x", "y", "z")
 LONGEST_RTS = 5000
@@ -449,6 +456,8 @@ def trajectories(
     solution: Solution,
     tracks: pd.DataFrame | None,
     inflation: Sequence[float] = (1.0, 1.0, 1.0),
+    *,
+    rts: bool = True,
 ) -> pd.DataFrame:
     """Return the table of the bubbles' positions (mm), velocities (mm/s) and accelerations (mm/s^2)
     in the laboratory frame.
@@ -460,6 +469,7 @@ def trajectories(
     tracks : table with the columns of tracks.csv, from which the triangulated positions, the result
         of a plain RTS smoother and the diameters are added; None to leave these columns out.
     inflation : (3,) factor of the standard deviations along each axis where measurements disagree.
+    rts : whether the result of a plain RTS smoother is computed; otherwise it is NaN.
     """
     import pandas as pd
 
@@ -483,7 +493,7 @@ def trajectories(
         columns |= _named(np.sqrt(sigma**2 + speed) * inflation, "sv{}_mm_s")
     columns["observed"] = _observed(solution)
     if tracks is not None:
-        columns |= _baselines(solution, tracks)
+        columns |= _baselines(solution, tracks, rts=rts)
     found = solution.accelerations
     if found is not None:
         columns |= _named(found.value_mm_s2, "a{}_mm_s2")
@@ -512,7 +522,7 @@ def _observed(solution: Solution) -> Ints:
     return out
 
 
-def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
+def _baselines(solution: Solution, tracks: pd.DataFrame, *, rts: bool) -> dict[str, Array]:
     """Return columns for comparison: triangulated ("naive") positions, the result of a plain RTS
     smoother, and the diameters that the tracker found.
     """
@@ -535,7 +545,7 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
         mine = slice(graph.first_row[k], graph.first_row[k + 1])
         t = problem.t_s[graph.frame_of_row[mine]]
         velocity[mine] = _central_velocity(t, naive[mine])
-        if 1 < len(t) <= LONGEST_RTS and mine.stop <= MOST_RTS_ROWS:
+        if rts and 1 < len(t) <= LONGEST_RTS and mine.stop <= MOST_RTS_ROWS:
             plain[:, mine] = _rts(t, naive[mine], covariance[mine], graph.model.bubble)
     out = _named(naive, "naive_{}_mm") | _named(velocity, "naive_v{}_mm_s")
     out |= _named(plain[0], "rts_{}_mm") | _named(plain[1], "rts_v{}_mm_s")

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from telerig.errors import InputError
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import pair_of_run
+from telerig.estimator.smoothing.results_file import StoredTables
 from telerig.estimator.smoothing.smooth import smooth
-from telerig.estimator.tracking.tracks import Tracks, load_tracks, read_track_table
+from telerig.estimator.tracking.tracks import StoredTracks, Tracks, open_tracks, read_track_table
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import reading, replaced_results
@@ -73,27 +74,29 @@ def smooth_run(
         *window_warnings(run.rig, calibration),
         *([] if refine_rig else _moved(followed)),
     ]
-    found = smooth(
-        followed, calibration, stage=run, model=model, progress=stage or False,
-        refine_rig=refine_rig, accept=accept,
-    )  # fmt: skip
-    found = replace(
-        found, summary={**found.summary, "warnings": [*warnings, *found.summary["warnings"]]}
-    )
     tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
-    record = run_record(
-        "smooth", run.path, [*tables, source, *marks, *inputs],
-        {"model": model, "refine_rig": refine_rig, "accept": list(accept)},
-        {"smooth": time.perf_counter() - begun},
-    )  # fmt: skip
-    if tracked.content():
-        record["tracks"] = tracked.tracks or tracked.content()
     again = again or f"telerig smooth {shlex.quote(str(run.path))}"
     with replaced_results(folder, "smooth", again=again, inputs=fingerprint) as staged:
+        found = smooth(
+            followed, calibration, stage=run, model=model, progress=stage or False,
+            refine_rig=refine_rig, accept=accept, folder=staged,
+        )  # fmt: skip
+        found = replace(
+            found, summary={**found.summary, "warnings": [*warnings, *found.summary["warnings"]]}
+        )
         found.write_files(staged)
+        record = run_record(
+            "smooth", run.path, [*tables, source, *marks, *inputs],
+            {"model": model, "refine_rig": refine_rig, "accept": list(accept)},
+            {"smooth": time.perf_counter() - begun},
+        )  # fmt: skip
+        if tracked.content():
+            record["tracks"] = tracked.tracks or tracked.content()
         write_json_atomic(staged / "run.json", record)
         if report:
             _report(staged, folder, source.parent)
+    if isinstance(found.tables, StoredTables):
+        found = replace(found, tables=StoredTables(folder))
     return found
 
 
@@ -107,7 +110,7 @@ def run_sources(run: RunData) -> list[Path | Source]:
     ]
 
 
-def _check_cameras(tracks: Tracks | Any, calibration: Calibration) -> None:
+def _check_cameras(tracks: Tracks | StoredTracks | Any, calibration: Calibration) -> None:
     """Raises InputError when a camera by which the run was tracked is not in the calibration."""
     used = list(getattr(tracks, "summary", {}).get("image_size_px") or [])
     have = [camera.name for camera in calibration.cameras]
@@ -119,7 +122,7 @@ def _check_cameras(tracks: Tracks | Any, calibration: Calibration) -> None:
         )
 
 
-def _moved(tracks: Tracks | Any) -> list[str]:
+def _moved(tracks: Tracks | StoredTracks | Any) -> list[str]:
     """What `telerig track` found of a movement of the cameras, for trajectories that keep it."""
     change = getattr(tracks, "summary", {}).get("rig_change") or {}
     if not change.get("moved"):
@@ -131,14 +134,14 @@ def _moved(tracks: Tracks | Any) -> list[str]:
     ]
 
 
-def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:
+def read_tracks(path: Path, run: Path) -> tuple[Tracks | StoredTracks | Any, Path]:
     """What `telerig track` wrote, or a bare table of tracks; and the file it came from."""
     if path.is_dir():
         if not (path / "tracks.csv").is_file():
             raise InputError(
                 "there are no tracks", where=str(path), todo=f"run `telerig track {run}` first"
             )
-        return load_tracks(path), path / "tracks.csv"
+        return open_tracks(path), path / "tracks.csv"
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), todo="give tracks.csv")
     with reading(path.parent, [path.name]):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +28,7 @@ from telerig.estimator.smoothing.learning.likelihood import (
 )
 from telerig.estimator.smoothing.learning.window import MOST_FRAMES
 from telerig.estimator.smoothing.phases import Phases
+from telerig.estimator.smoothing.pieces import Constants, Piece, pieces_of, solved_pieces
 from telerig.estimator.smoothing.problem.problem import (
     Observations,
     ShakeModel,
@@ -38,11 +41,13 @@ from telerig.estimator.smoothing.problem.tables import (
     accelerometers_of,
     bubbles_of,
     calibration_share,
+    frames_between,
     read_tracks,
     references_of,
     stage_of,
     thinned,
 )
+from telerig.estimator.smoothing.problem.window import Window, all_of
 from telerig.estimator.smoothing.refined_pose import (
     Refinement,
     change_words,
@@ -53,12 +58,15 @@ from telerig.estimator.smoothing.refined_pose import (
 )
 from telerig.estimator.smoothing.result import Smoothing, states_of, summary_of, trajectories
 from telerig.estimator.smoothing.result import shake as shake_table
+from telerig.estimator.smoothing.results_file import StoredTables, Tables, results_file
+from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from telerig.estimator.bubbles.shape.spheroid import Deviations
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.rig_drift import DriftPrior
     from telerig.io.dataset.run import RunData
@@ -67,6 +75,7 @@ if TYPE_CHECKING:
 Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _COARSE_STEP_S = 2e-3
+_MOST_ALIGNED, _MOST_PIXELS = 20_000, 500_000
 _ENCODER_SIGMA_MM = 0.005
 _LEAST_SAMPLES = 2
 _LEAST_LEARNED_S = 0.2
@@ -90,6 +99,7 @@ def smooth(
     progress: Steps | bool = False,
     refine_rig: bool | DriftPrior = False,
     accept: Iterable[str] = (),
+    folder: Path | None = None,
 ) -> Smoothing:
     """Smooth a run: estimate every bubble's motion in the laboratory frame and every camera's
     shake.
@@ -130,6 +140,11 @@ def smooth(
         names its code): SENSOR_UNIT, SENSOR_GRAVITY, SENSOR_AXES, SENSOR_MOUNT, SENSOR_SCALE,
         SENSOR_CLOCK, ENCODER_SIGN, ENCODER_UNIT, ENCODER_STUCK, ENCODER_SCALE, ENCODER_JUMP,
         ENCODER_CLOCK, FRAME_TIMES, RISE_SPEED.
+    folder : an existing folder for results.h5 of a run that is too long for memory; None for a
+        temporary one, which lasts as long as what is returned.
+
+    A run of more than 12,000 frames, or of more than 120,000 of all bubbles together, is smoothed
+    in pieces; its tables are read from results.h5 when they are asked for.
 
     Returns a `Smoothing`: the tables ``trajectories`` and ``shake``, the ``verdict``, and
     ``summary``, whose "warnings" say what the checks found, what was assumed and which samples are
@@ -143,13 +158,16 @@ def smooth(
     with phases.phase("checks", "checking tracks and sensors"):
         table = getattr(tracks, "table", tracks)
         calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
-        refinement = refinement_of(table, calibration, refine_rig)
+        refinement = None
+        if refine_rig:
+            some = table if hasattr(table, "assign") else table.between(0, _MOST_ALIGNED)
+            refinement = refinement_of(some, calibration, refine_rig)
         problem, tracked, encoder_sigma, findings = problem_of(
             tracks, calibration, stage=stage, accelerometers=accelerometers,
             references=references, rig=rig, t_s=t_s,
             drift=None if refinement is None else refinement.drift,
         )  # fmt: skip
-        problem, findings = aligned(problem, findings)
+        problem, findings = _aligned(problem, findings)
         warnings = settled(findings, accepted)
     options = replace(options or Options(), draws=True)
     with phases.phase("learning", "learning the shake") as step:
@@ -158,57 +176,222 @@ def smooth(
         if chosen.learned and len(problem.t_s) > MOST_FRAMES:
             learned, more = learning_record(problem, chosen)
             warnings = [*warnings, *more]
-    with phases.phase("smoothing", _smoothing_words(problem)) as step:
-        if isinstance(model, ShakeModel):
-            solution = solve(problem, chosen, options, step)
-        else:
-            solution = _adapted_solution(problem, chosen, options, step)
-            chosen = solution.graph.model
-            if chosen.learned:
-                step("uncertainty of what was learned", 0.9)
-                solution = with_hyperparameter_uncertainty(solution)
-    with phases.phase("accelerations", "estimating accelerations"):
-        if problem.bubbles and solution.covariances is not None:
-            solution = replace(solution, accelerations=accelerations_of(solution, drawn(solution)))
-    with phases.phase("verdict", "judging the result"):
-        from telerig.estimator.smoothing.verdict.contradiction import (
-            sample_warnings,
-            speed_warnings,
-        )
+    given, pieces = isinstance(model, ShakeModel), pieces_of(problem, chosen, options.frames)
+    run = _Run(problem, tracks, tracked, chosen, given, options, phases)
+    if len(pieces) == 1:
+        done = run.smoothed()
+    else:
+        keep = None if folder else TemporaryDirectory(prefix="telerig-")
+        done = run.in_pieces(pieces, StoredTables(folder or Path(keep.name if keep else ""), keep))
+    from telerig.estimator.smoothing.verdict.contradiction import sample_warnings, speed_warnings
+
+    verdict, evidence, solution = done.verdict, done.evidence, done.solution
+    summary = summary_of(solution, evidence, None if len(pieces) == 1 else len(problem.t_s))
+    summary["accepted"] = sorted(accepted)
+    summary["warnings"] = [
+        *warnings, *sample_warnings(evidence), *speed_warnings(problem, evidence.mean_velocities)
+    ]  # fmt: skip
+    change = refined_change(solution, calibration)
+    if change is not None:
+        words = change_words(change, problem.cameras[0].name)
+        summary["rig_change"] = {**change.as_dict(), "words": words}
+    described = rig or getattr(stage, "rig", None)
+    if done.deviations is not None:
+        summary["bodies"] = asdict(done.deviations)
+        if not getattr(described, "bubbles", None):  # else part of the images counts
+            summary["swarm"] = done.swarm
+    fluid = getattr(described, "fluid", None)
+    summary["fluid"] = {} if fluid is None else asdict(fluid)
+    summary["learning"], summary["seconds"] = learned, phases.seconds
+    whole = solution if len(pieces) == 1 else None
+    name = getattr(tracks, "name", "")
+    return Smoothing(verdict, summary, solution.graph.model, done.tables, whole, name)
+
+
+class _Done(NamedTuple):
+    """verdict, evidence : of the run.  All others: of it, or of the piece in its middle.
+
+    deviations : of the bubbles' shapes; None without tracks.  swarm : what `swarm_numbers` returns.
+    """
+
+    verdict: dict[str, Any]
+    evidence: Evidence
+    solution: Solution
+    tables: Tables | StoredTables
+    deviations: Deviations | None
+    swarm: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run whose hyper-parameters are chosen.
+
+    given : whether they are as they are, and not set again from a first solution.
+    """
+
+    problem: SmoothingProblem
+    tracks: Any
+    tracked: Tracked | None
+    model: ShakeModel
+    given: bool
+    options: Options
+    phases: Phases
+
+    def smoothed(self) -> _Done:
+        """Smooth it as a whole."""
+        problem = self.problem
+        with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
+            solution = self._solved(problem, step)
+        with self.phases.phase("accelerations", "estimating accelerations"):
+            solution = _with_accelerations(solution)
+        with self.phases.phase("verdict", "judging the result"):
+            from telerig.estimator.smoothing.verdict.judge import judge
+
+            evidence = Evidence.of(solution, drawn(solution))
+            verdict = judge(problem, solution.graph.model, solution, evidence)
+            solution = replace(solution, draws=None)
+        with self.phases.phase("tables", "making the tables"):
+            inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
+            table = None if self.tracked is None else self.tracked.between(0, len(problem.t_s))
+            paths = trajectories(solution, table, inflation)
+            offsets = shake_table(solution, inflation)
+            tracks = self.tracks
+            if hasattr(tracks, "between"):
+                tracks = tracks.between(0, len(problem.t_s))
+            bodies, deviations = self._bodies(tracks)
+            swarm = self._swarm(solution, paths, bodies, Span.whole(solution))
+        tables = Tables(paths, offsets, states_of(solution), bodies)
+        return _Done(verdict, evidence, solution, tables, deviations, swarm)
+
+    def _bodies(self, tracks: Any) -> tuple[pd.DataFrame | None, Deviations | None]:
+        """The bubbles' bodies, and their deviations from them; None without tracks."""
+        if self.tracked is None:
+            return None, None
+        from telerig.estimator.physics.bodies import bodies_table
+
+        return bodies_table(tracks, self.problem.cameras, self.problem.up)
+
+    def _swarm(
+        self, solution: Solution, paths: pd.DataFrame, bodies: pd.DataFrame | None, span: Span
+    ) -> dict[str, Any] | None:
+        """Numbers of the swarm in some frames, of which there are the rows of the tables."""
+        if bodies is None:
+            return None
+        from telerig.estimator.physics.swarm import swarm_numbers
+
+        first, problem = span.first + span.own.start, self.problem
+        return swarm_numbers(
+            paths.assign(frame=paths["frame"] - first),
+            bodies.assign(frame=bodies["frame"] - first),
+            carriage(solution)[0][span.own.start : span.own.stop], problem.axis, problem.up,
+            problem.cameras,
+        )  # fmt: skip
+
+    def _solved(self, problem: SmoothingProblem, step: Progress) -> Solution:
+        """Solve a run, or a piece; hyper-parameters that are not given are set by the result."""
+        if self.given:
+            return solve(problem, self.model, self.options, step)
+        solution = _adapted_solution(problem, self.model, self.options, step)
+        if solution.graph.model.learned:
+            step("uncertainty of what was learned", 0.9)
+            solution = with_hyperparameter_uncertainty(solution)
+        return solution
+
+    def in_pieces(self, pieces: Sequence[Piece], tables: StoredTables) -> _Done:
+        """Smooth it piece by piece, each of which is written as it comes.
+
+        Hyper-parameters that are not given are set by the piece in the middle, which is solved
+        again at the end for what the verdict takes from the middle of a run.
+        """
         from telerig.estimator.smoothing.verdict.judge import judge
 
-        verdict = judge(problem, chosen, solution)
+        problem, model, parts = self.problem, self.model, list[Evidence]()
+        deviations = swarm = None
+        with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
+            middle = len(pieces) // 2
+            if not self.given:
+                step("a piece in the middle", 0.0)
+                model = self._solved(pieces[middle].cut(problem).problem, _silent).graph.model
+            step("what is constant along the run", 0.0)
+            constants = Constants.of(problem, model, pieces, self.options, step)
+            with results_file(tables.folder) as file:
+                for piece, window, solution in solved_pieces(
+                    problem, model, pieces, self.options, step, constants
+                ):
+                    widened = _with_accelerations(with_hyperparameter_uncertainty(solution))
+                    span = Span(piece.own, piece.low, problem.t_s)
+                    parts.append(Evidence.of(widened, drawn(widened), span))
+                    paths, offsets = self._tables(piece, window, widened, span)
+                    bodies, found = self._bodies(
+                        frames_between(self.tracks, piece.first, piece.end)
+                    )
+                    file.append(paths, offsets, states_of(widened, span), _beside(paths, bodies))
+                    if piece == pieces[middle]:
+                        deviations, swarm = found, self._swarm(widened, paths, bodies, span)
+                    del solution, widened
+                with self.phases.phase("verdict", "judging the result"):
+                    evidence = evidence_of(parts)
+                    _, window, solution = next(
+                        solved_pieces(
+                            problem, model, pieces, self.options, _silent, constants, [middle]
+                        )
+                    )
+                    solution = _with_accelerations(with_hyperparameter_uncertainty(solution))
+                    verdict = judge(window.problem, model, solution, evidence)
+                inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
+                file.widen(inflation)
+                file.finish(inflation)
         solution = replace(solution, draws=None)
-        inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
-        summary = summary_of(solution)
-        summary["accepted"] = sorted(accepted)
-        summary["warnings"] = warnings + sample_warnings(solution) + speed_warnings(solution)
-        change = refined_change(solution, calibration)
-        if change is not None:
-            words = change_words(change, problem.cameras[0].name)
-            summary["rig_change"] = {**change.as_dict(), "words": words}
-    described = rig or getattr(stage, "rig", None)
-    with phases.phase("tables", "making the tables"):
-        paths = trajectories(solution, None if tracked is None else tracked.table, inflation)
-        offsets = shake_table(solution, inflation)
-        bodies = None
-        if tracked is not None:
-            from telerig.estimator.physics.bodies import bodies_table
-            from telerig.estimator.physics.swarm import swarm_numbers
+        return _Done(verdict, evidence, solution, tables, deviations, swarm)
 
-            bodies, deviations = bodies_table(tracks, problem.cameras, problem.up)
-            summary["bodies"] = asdict(deviations)
-            if not getattr(described, "bubbles", None):  # else part of the images counts
-                summary["swarm"] = swarm_numbers(
-                    paths, bodies, carriage(solution)[0], problem.axis, problem.up, problem.cameras
-                )
-        fluid = getattr(described, "fluid", None)
-        summary["fluid"] = {} if fluid is None else asdict(fluid)
-    summary["learning"], summary["seconds"] = learned, phases.seconds
-    return Smoothing(
-        paths, offsets, verdict, summary, chosen, states_of(solution), solution,
-        name=getattr(tracks, "name", ""), bodies=bodies,
-    )  # fmt: skip
+    def _tables(
+        self, piece: Piece, window: Window, solution: Solution, span: Span
+    ) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Rows of the trajectories and of the shake in a piece's own frames."""
+        table = None
+        if self.tracked is not None:
+            table = self.tracked.between(piece.low, piece.high)
+            there = {bubble.particle for bubble in window.problem.bubbles}
+            table = table[table["particle"].isin(there)]
+            table = table.assign(frame=table["frame"] - piece.low)
+        every = trajectories(solution, table, rts=piece.first == 0), shake_table(solution)
+        own = (part[span.holds(part["frame"].to_numpy())] for part in every)
+        paths, offsets = (part.assign(frame=part["frame"] + piece.low) for part in own)
+        return paths, offsets
+
+
+def _with_accelerations(solution: Solution) -> Solution:
+    """The solution with accelerations, where there are bubbles and covariances."""
+    if not solution.graph.problem.bubbles or solution.covariances is None:
+        return solution
+    return replace(solution, accelerations=accelerations_of(solution, drawn(solution)))
+
+
+def _beside(paths: pd.DataFrame, bodies: pd.DataFrame | None) -> pd.DataFrame | None:
+    """The bodies in the rows of the trajectories, NaN where there are none."""
+    if bodies is None:
+        return None
+    keys = ["frame", "particle"]
+    return paths[keys].merge(bodies, "left", on=keys).drop(columns=keys)
+
+
+def _silent(_what: str, _share: float) -> None:
+    """Report nothing."""
+
+
+def _aligned(
+    problem: SmoothingProblem, findings: list[Finding]
+) -> tuple[SmoothingProblem, list[Finding]]:
+    """Return the problem with its sensors on the clock of the frames, and what was found.
+
+    A long run without accelerometers has nothing to be moved; the encoder is compared with the
+    images in the middle of it.
+    """
+    count = len(problem.t_s)
+    if problem.accelerometers or count <= _MOST_ALIGNED:
+        return aligned(problem, findings)
+    first = (count - _MOST_ALIGNED) // 2
+    return problem, aligned(all_of(problem, first, first + _MOST_ALIGNED).problem, findings)[1]
 
 
 def _smoothing_words(problem: SmoothingProblem) -> str:
@@ -242,7 +425,7 @@ def _cameras_of(table: Any, calibration: Calibration, stage: Any, rig: Any) -> l
     """Names of the cameras whose pixels a table of tracks has; without one, those of the run."""
     known = [camera.name for camera in calibration.cameras]
     if table is not None:
-        return [name for name in known if f"{name}_u_px" in table]
+        return [name for name in known if f"{name}_u_px" in table.columns]
     of_rig = getattr(rig or getattr(stage, "rig", None), "tracking_cameras", known[:2])
     return list(getattr(stage, "cameras", of_rig))
 
@@ -318,7 +501,7 @@ def problem_of(
     )
     findings = list(sensors.findings)
     if tracked is not None:
-        findings += check_tracks(tracked.table, calibration)
+        findings += check_tracks(tracked.sample, calibration)
     record = stage_of(sensors.encoder, at_frames)
     if record is not None and travel.scale:
         record = replace(record, position_mm=record.position_mm / (1 + travel.scale))
@@ -330,9 +513,10 @@ def problem_of(
     bubbles = () if tracked is None else bubbles_of(tracked, positions, axis)
     share = None
     if tracked is not None:
-        points = tracked.table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+        points = tracked.sample[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         some = points[np.linspace(0, len(points) - 1, min(len(points), 200)).astype(int)]
-        noise = np.median(np.sqrt(tracked.observations.covariance_px2[:, 0, 0]))
+        step = len(tracked.observations) // _MOST_PIXELS + 1
+        noise = np.median(np.sqrt(tracked.observations.covariance_px2[::step, 0, 0]))
         share = calibration_share(calibration, some, float(noise), drift)
     problem = SmoothingProblem(
         cameras, at_frames, axis, mounting.up, bubbles,

@@ -25,7 +25,7 @@ _SCALE_FROM = {
 
 def smoothing_words(found: Smoothing) -> str:
     """The verdict, the standard deviations, encoder and warnings, a line each."""
-    verdict, summary, table = found.verdict, found.summary, found.trajectories
+    verdict, summary = found.verdict, found.summary
     lines = []
     if "verdict" in verdict:
         flags = ", ".join(verdict.get("flags", ()))
@@ -39,6 +39,7 @@ def smoothing_words(found: Smoothing) -> str:
         lines += [f"  {line}" for line in uses_words(usable)]
     bubbles = "1 bubble" if summary["bubbles"] == 1 else f"{summary['bubbles']} bubbles"
     lines.append(f"{bubbles} in {summary['frames']} frames; priors: {found.model.name}")
+    table = found.tables.typical([f"s{x}_mm" for x in "xyz"] + [f"sv{x}_mm_s" for x in "xyz"])
     if len(table) and "sx_mm" in table:
         position = [1000 * float(np.median(table[f"s{x}_mm"])) for x in "xyz"]
         velocity = [float(np.median(table[f"sv{x}_mm_s"])) for x in "xyz"]
@@ -60,7 +61,7 @@ def _encoder_words(found: Smoothing) -> list[str]:
         return []
     ppm, sd = 1e6 * encoder["scale"], 1e6 * encoder["sscale"]
     lines = [f"  encoder: scale {ppm:+.0f} ± {sd:.0f} ppm, {_SCALE_FROM[encoder['scale_from']]}"]
-    table = found.trajectories
+    table = found.tables.typical([f"s{x}_mm" for x in "xyz"])
     if travel and len(table) and "sx_mm" in table:
         share = max(travel["left_open_mm"])
         if share > _MUCH * max(float(np.median(table[f"s{x}_mm"])) for x in "xyz"):

@@ -22,7 +22,7 @@ from numpy.random import Generator
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import pair_of_run
-from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.solve import Options, Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.results_folder import run_sources, with_followed_references
 from telerig.estimator.smoothing.smooth import smooth
@@ -125,8 +125,10 @@ def validate(
             found = smooth(
                 track_of(bubble, calibration, run.t_s), calibration,
                 stage=_without(run, mark, rest), model=model, accept=accept,
+                options=Options(frames=run.frame_count),
             )  # fmt: skip
-            of_rise = speed_warnings(_solution(found))  # marks do not rise
+            solved = _solution(found)
+            of_rise = speed_warnings(solved.graph.problem, solved.state.means)  # marks do not rise
             warnings += [w for w in found.summary["warnings"] if w not in of_rise]
             done.append(judged(mark, rest, found, motion, calibration.cameras))
     entries = tuple(overall(done, rest) for rest in rests)

@@ -25,13 +25,15 @@ from telerig.estimator.tracking.track import (
     TrackingStream,
     TrackOptions,
     check_calibration,
-    numbered_particles,
+    ids_of,
+    numbers_of,
     stage_axis,
     tracking_stream,
 )
 from telerig.estimator.tracking.tracks import events_table
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
+from telerig.io.files.frame_table import FrameTable
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import replaced_results
@@ -160,8 +162,8 @@ def _stale_inputs(files: Sequence[Path]) -> list[str]:
     return [sentence for file in files for sentence in stale(file.parent, [file.name])]
 
 
-def _check_ids(detections: pd.DataFrame) -> None:
-    names = numbered_particles(detections)[1]
+def _check_ids(detections: pd.DataFrame | FrameTable) -> None:
+    names = numbers_of(ids_of(detections))[1]
     if names:
         raise InputError(
             f"particle {names[0]!r} is no whole number, and the report needs numbers",

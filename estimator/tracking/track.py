@@ -39,6 +39,7 @@ from telerig.estimator.tracking.frames_to_rows import Linked, RowMaker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
+from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.machine.parallel import cores
 from telerig.progress import Progress as Steps
@@ -217,9 +218,9 @@ def tracking_stream(
     first_id, labels, scene, marks = 0, None, None, None
     batches: Callable[[], Iterator[pd.DataFrame]]
     if run.detections is not None:
-        table, labels = numbered_particles(_complete(run.detections))
-        first_id = int(table["particle"].max()) + 1
-        batches = partial(iter, (table,))
+        numbers, labels = numbers_of(ids_of(run.detections))
+        first_id = max(numbers.values(), default=NO_PARTICLE) + 1
+        batches = partial(_given, run.detections, numbers)
     else:
         inputs = {
             "options": repr(chosen), "cameras": repr(cameras), "frames": str(run.frame_count)
@@ -312,20 +313,35 @@ def _complete(detections: pd.DataFrame) -> pd.DataFrame:
     return detections.assign(**blank)
 
 
-def numbered_particles(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str] | None]:
-    """Return the table with the given ids as whole numbers, -1 where blank, and the ids' names.
+def ids_of(detections: pd.DataFrame | FrameTable) -> set[str]:
+    """Return the given ids of bubbles, as text."""
+    if isinstance(detections, FrameTable):
+        return set(detections.particles) - {""}
+    if "particle" not in detections:
+        return set()
+    return set(detections["particle"].unique().astype(str)) - {""}
 
-    The names map each number to the id's text; they are None if all given ids are whole numbers.
+
+def numbers_of(ids: set[str]) -> tuple[dict[str, int], dict[int, str] | None]:
+    """Return the number of each given id, and the ids' names by number.
+
+    The names are None if all given ids are whole numbers.
     """
-    texts = table["particle"].astype(str) if "particle" in table else pd.Series("", table.index)
-    given = sorted(set(texts) - {""})
+    given = sorted(ids)
     if all(text.isascii() and text.isdecimal() and str(int(text)) == text for text in given):
-        numbers = {text: int(text) for text in given}
-        labels = None
-    else:
-        numbers = {text: i for i, text in enumerate(given)}
-        labels = {i: text for text, i in numbers.items()}
-    return table.assign(particle=texts.map(numbers | {"": NO_PARTICLE}).astype(np.int64)), labels
+        return {text: int(text) for text in given}, None
+    return {text: i for i, text in enumerate(given)}, dict(enumerate(given))
+
+
+def _given(
+    detections: pd.DataFrame | FrameTable, numbers: dict[str, int]
+) -> Iterator[pd.DataFrame]:
+    """Yield a user's detections with numbers for their ids, -1 where blank."""
+    parts = detections.parts() if isinstance(detections, FrameTable) else iter((detections,))
+    for part in parts:
+        texts = part["particle"].astype(str) if "particle" in part else pd.Series("", part.index)
+        particle = texts.map(numbers | {"": NO_PARTICLE}).astype(np.int64)
+        yield _complete(part).assign(particle=particle)
 
 
 def _labelled(part: Linked, labels: dict[int, str]) -> Linked:
@@ -388,17 +404,16 @@ def _linked(
     without: dict[str, dict[str, int]],
     stage: Progress | None,
 ) -> Iterator[Linked]:
-    empty: Tables | None = None
     done = 0
     if stage is not None:
         stage("tracks", 0, run.frame_count)
-    for batch in batches:
+    for batch, last in _with_ends(batches, run.frame_count):
         _count_reasons(batch, without)
-        split = _split(batch, cameras)
-        empty = empty or (batch.iloc[:0], batch.iloc[:0])
-        last = run.frame_count if run.detections is not None else int(batch["frame"].max()) + 1
+        empty = batch.iloc[:0], batch.iloc[:0]
+        numbers = batch["frame"].to_numpy()
         for first in range(done, last, _FRAMES_AT_ONCE):
             frames = range(first, min(first + _FRAMES_AT_ONCE, last))
+            split = _split(batch[(numbers >= first) & (numbers < frames.stop)], cameras)
             tables = [split.get(frame, empty) for frame in frames]
             for frame, pair, sight in zip(frames, tables, linker.sights(tables)):
                 position = None if run.position_mm is None else float(run.position_mm[frame])
@@ -411,6 +426,16 @@ def _linked(
     rows = linker.finish()
     if rows is not None:
         yield rows
+
+
+def _with_ends(batches: Iterator[pd.DataFrame], frames: int) -> Iterator[tuple[pd.DataFrame, int]]:
+    """Yield each batch with the frame after its last one, which is the run's end for the last."""
+    before = next(batches)
+    for batch in batches:
+        if len(batch):
+            yield before, int(batch["frame"].min())
+            before = batch
+    yield before, frames
 
 
 def _count_reasons(batch: pd.DataFrame, without: dict[str, dict[str, int]]) -> None:

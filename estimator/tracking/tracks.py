@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,8 @@ import numpy as np
 import pandas as pd
 
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column, read_table
+from telerig.io.files.csv_table import Column, read_part, read_table
+from telerig.io.files.frame_table import FrameTable
 from telerig.io.results.manifest import reading, replaced_results
 from telerig.io.results.tracking import EVENTS, POINT, REFERENCES, TrackingFile
 from telerig.short_text import ShortText, counted, first_of
@@ -104,6 +106,53 @@ class Tracks(ShortText):
             record.write(out / "tracking.json")
 
 
+@dataclass(frozen=True)
+class StoredTracks:
+    """Hold the tracks of a long run, whose tables stay in their files.
+
+    name, summary, references : as for `Tracks`.
+    table, detections : the files of the tables; None without detections.
+    """
+
+    name: str
+    table: FrameTable
+    detections: FrameTable | None
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    references: pd.DataFrame | None = None
+
+    def between(self, first: int, end: int) -> Tracks:
+        """Return what there is in the frames from ``first`` to before ``end``."""
+        table = self.table.between(first, end)
+        detections = (
+            table.iloc[:0] if self.detections is None else self.detections.between(first, end)
+        )
+        return Tracks(self.name, detections, table, pd.DataFrame(columns=EVENT_COLUMNS))
+
+
+def open_tracks(folder: str | Path) -> Tracks | StoredTracks:
+    """Read the files that `telerig track` wrote into a folder; large tables stay on disk.
+
+    Raises InputError as `load_tracks` does.
+    """
+    place = Path(folder)
+    files = _files(place)
+    marks = place / "references.csv"
+    with reading(place, [file.name for file in (*files, marks)]):
+        table = FrameTable.of(files[1], partial(_read_part, files[1], TRACK_COLUMNS), _unseen)
+        detections = FrameTable.of(
+            files[0], partial(_read_part, files[0], DETECTION_COLUMNS), _unseen
+        )
+        if table is None or detections is None:
+            return load_tracks(folder)
+        summary = TrackingFile.read(files[3]).content()
+        references = _read(marks, REFERENCES) if marks.is_file() else None
+    return StoredTracks(str(summary.get("run", place.name)), table, detections, summary, references)
+
+
+def _unseen(_part: pd.DataFrame) -> None:
+    """Look at nothing."""
+
+
 def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
     """Return the events as a table with the columns `EVENT_COLUMNS`, in the order of time."""
     rows = [
@@ -120,14 +169,11 @@ def load_tracks(folder: str | Path) -> Tracks:
     missing.
     """
     place = Path(folder)
-    files = [place / n for n in ("detections.csv", "tracks.csv", "events.csv", "tracking.json")]
-    for file in files:
-        if not file.is_file():
-            raise InputError(f"there is no {file.name}", where=str(place), todo="run telerig track")
+    files = _files(place)
     marks = place / "references.csv"
     with reading(place, [file.name for file in (*files, marks)]):
         summary = TrackingFile.read(files[3]).content()
-        detections = _read(files[0], [_FRAME, Column("camera", "name"), *_PIXEL])
+        detections = _read(files[0], DETECTION_COLUMNS)
         table = read_track_table(files[1])
         events = _read(files[2], EVENTS)
         references = _read(marks, REFERENCES) if marks.is_file() else None
@@ -136,8 +182,19 @@ def load_tracks(folder: str | Path) -> Tracks:
     )
 
 
+def _files(place: Path) -> list[Path]:
+    """Return detections.csv, tracks.csv, events.csv and tracking.json, all of which are there."""
+    files = [place / n for n in ("detections.csv", "tracks.csv", "events.csv", "tracking.json")]
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"there is no {file.name}", where=str(place), todo="run telerig track")
+    return files
+
+
 _FRAME = Column("frame", "whole")
 _PIXEL = [Column("u_px", blank=True), Column("v_px", blank=True)]
+DETECTION_COLUMNS = [_FRAME, Column("camera", "name"), *_PIXEL]
+TRACK_COLUMNS = [_FRAME, Column("particle", "name"), Column("t_s"), *map(Column, POINT)]
 
 
 def read_track_table(file: Path) -> pd.DataFrame:
@@ -146,16 +203,32 @@ def read_track_table(file: Path) -> pd.DataFrame:
     Returns all columns of the file. Raises InputError for a table without frame, particle, t_s and
     the position (mm), and for cells that are not what their column says.
     """
-    columns = [_FRAME, Column("particle", "name"), Column("t_s"), *map(Column, POINT)]
-    return _read(file, columns)
+    return _read(file, TRACK_COLUMNS)
 
 
 def _read(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
     """Read a table with all its columns; ids of bubbles that are whole numbers become such."""
+    return _numbered(read_table(file, _with_texts(columns), extra=True, empty=True))
+
+
+def _read_part(
+    file: Path, columns: Sequence[Column], content: bytes, row: int
+) -> pd.DataFrame | None:
+    """Read some rows as `_read` reads all of them; None for an unusual text."""
+    table = read_part(file, content, row, _with_texts(columns))
+    return None if table is None else _numbered(table)
+
+
+def _with_texts(columns: Sequence[Column]) -> list[Column]:
+    """The columns, and those that have text where a table has them."""
     texts = [Column(name, "text", required=False, blank=True) for name in ("flags", "reason")]
     named = {column.name for column in columns}
-    more = [column for column in texts if column.name not in named]
-    table = read_table(file, [*columns, *more], extra=True, empty=True).reset_index(drop=True)
+    return [*columns, *(column for column in texts if column.name not in named)]
+
+
+def _numbered(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with whole numbers for ids of bubbles that are such."""
+    table = table.reset_index(drop=True)
     if "particle" in table:
         ids = pd.to_numeric(table["particle"].replace("", np.nan), errors="coerce")
         ids = ids.where(np.isfinite(ids))

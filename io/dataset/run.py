@@ -20,11 +20,13 @@ from telerig.io.dataset.tables import (
     choose_source,
     read_accelerometer_csv,
     read_detections_csv,
+    read_detections_part,
     read_frames_csv,
     read_references_csv,
     read_run_toml,
     read_stage_csv,
 )
+from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.names import check_name
 from telerig.io.images.frames import FILE_EXTENSIONS, FrameSource, open_frames
 from telerig.io.images.high_speed import HighSpeedFrames
@@ -42,7 +44,8 @@ class RunData:
     t_s : (F,) the middle of each frame's exposure in s. position_mm : (F,) the stage's position at
     t_s, NaN outside the encoder's record; None without stage.csv.
     image_sizes_px : (width, height) by camera. source : "images" or "detections".
-    rig, stage, accelerometers, references, detections : None where there is no such file.
+    rig, stage, accelerometers, references, detections : None where there is no such file. Large
+    detections are a `FrameTable`, which stays on disk.
     notes : sentences that a user should read. `image` adds one for each frame that it cannot read.
     skip_unreadable : True if `image` returns None for every frame that cannot be read, False if for
     none; None means that only the last frame of a recording may be unreadable.
@@ -62,7 +65,7 @@ class RunData:
     stage: pd.DataFrame | None = field(default=None, repr=False, compare=False)
     accelerometers: pd.DataFrame | None = field(default=None, repr=False, compare=False)
     references: pd.DataFrame | None = field(default=None, repr=False, compare=False)
-    detections: pd.DataFrame | None = field(default=None, repr=False, compare=False)
+    detections: pd.DataFrame | FrameTable | None = field(default=None, repr=False, compare=False)
     notes: list[str] = field(default_factory=list)
     skip_unreadable: bool | None = None
     sources: Mapping[str, FrameSource] = field(default_factory=dict, repr=False, compare=False)
@@ -124,7 +127,9 @@ class RunData:
             t_s=self.t_s[:frames],
             position_mm=None if self.position_mm is None else self.position_mm[:frames],
             references=earlier(self.references),
-            detections=earlier(self.detections),
+            detections=self.detections.before(frames)
+            if isinstance(self.detections, FrameTable)
+            else earlier(self.detections),
             positions={name: places[:frames] for name, places in self.positions.items()},
             notes=[*self.notes, f"only the first {frames} of {self.frame_count} frames are used"],
         )
@@ -324,20 +329,30 @@ def _detections(
     every: list[str],
     sizes: Mapping[str, tuple[int, int]],
     notes: list[str],
-) -> pd.DataFrame:
+) -> pd.DataFrame | FrameTable:
     """Read detections.csv and keep the rows of the cameras ``names``; append to ``notes``."""
-    file = folder / "frames.csv"
+    file, path = folder / "frames.csv", folder / "detections.csv"
     count = len(read_frames_csv(file, None, every)) if file.is_file() else None
-    table = _of(names, read_detections_csv(folder / "detections.csv", every, sizes, count))
-    if not len(table):
+    seen: set[str] = set()
+
+    def read(content: bytes, row: int) -> pd.DataFrame | None:
+        part = read_detections_part(path, content, row, every, sizes, count)
+        return None if part is None else _of(names, part)
+
+    table: pd.DataFrame | FrameTable | None
+    table = FrameTable.of(path, read, lambda part: seen.update(part["camera"].unique()))
+    if table is None:
+        table = _of(names, read_detections_csv(path, every, sizes, count))
+        seen = set(table["camera"])
+    if not seen:
         raise InputError(
             f"has no row of the cameras {', '.join(names)}",
-            where=str(folder / "detections.csv"),
+            where=str(path),
             todo="name the cameras that saw bubbles: [tracking] cameras in rig.toml",
         )
     if not all(name in sizes for name in names):
         notes.append("the images' sizes are not known: detections outside them are not noticed")
-    absent = [name for name in names if name not in set(table["camera"])]
+    absent = [name for name in names if name not in seen]
     notes += [f"detections.csv has nothing of camera {name}" for name in absent]
     return table
 
@@ -346,7 +361,7 @@ def _times(
     folder: Path,
     names: list[str],
     count: int | None,
-    detections: pd.DataFrame | None,
+    detections: pd.DataFrame | FrameTable | None,
     notes: list[str],
     recorded: tuple[Path, Array] | None = None,
 ) -> Array:
@@ -361,7 +376,11 @@ def _times(
             notes.append("the frames' times are those of frames.csv, not of run.toml")
         return np.asarray(read_frames_csv(file, count, names)["t_s"], float)
     if count is None:
-        count = 0 if detections is None else int(detections["frame"].max()) + 1
+        count = 0
+        if isinstance(detections, FrameTable):
+            count = int(detections.last[-1]) + 1
+        elif detections is not None:
+            count = int(detections["frame"].max()) + 1
     if settings.is_file():
         rate, start = read_run_toml(settings)
         return start + np.arange(count) / rate

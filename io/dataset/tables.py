@@ -15,7 +15,7 @@ import pandas as pd
 
 from telerig.arrays import Bools
 from telerig.errors import InputError, suggestion
-from telerig.io.files.csv_table import Column, Rows, read_table, rows_of
+from telerig.io.files.csv_table import Column, Rows, read_part, read_table, rows_of
 from telerig.io.files.toml import read_toml
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
@@ -371,7 +371,8 @@ def read_references_csv(
     `fill_covariance`, from `REFERENCE_SIGMA_PX` where the file states none. Raises InputError for
     impossible values.
     """
-    table = _pixel_table(path, [Column("mark", "name")], cameras, sizes_px, frame_count)
+    table = read_table(path, _pixel_columns([Column("mark", "name")]), extra=True)
+    _check_pixels(table, path, cameras, sizes_px, frame_count)
     _check_named_once(table, "mark", path)
     known = fill_covariance(table, path, REFERENCE_SIGMA_PX, of="the mark's place")
     return _finished(table, known)
@@ -391,12 +392,36 @@ def read_detections_csv(
     ``attrs["sigma_known"]`` is True when it does.
     Raises InputError, with the row and the column, for values that are not possible.
     """
-    own = [
-        Column("particle", "name", required=False, blank=True),
-        *(Column(name, required=False, blank=True) for name in ("a_px", "b_px", "angle_rad")),
-        Column("flags", "text", required=False, blank=True),
-    ]
-    table = _pixel_table(path, own, cameras, sizes_px, frame_count)
+    table = read_table(path, _pixel_columns(_OF_BUBBLES), extra=True)
+    return _detections(table, path, cameras, sizes_px, frame_count)
+
+
+def read_detections_part(
+    path: Path, content: bytes, row: int, cameras: list[str], sizes_px: Sizes,
+    frame_count: int | None,
+) -> pd.DataFrame | None:  # fmt: skip
+    """Read some rows of `detections.csv` as `read_detections_csv` reads all of them.
+
+    content, row : as for `read_part`, and so is the result for an unusual text.
+    """
+    table = read_part(path, content, row, _pixel_columns(_OF_BUBBLES))
+    if table is None:
+        return None
+    return _detections(table, path, cameras, sizes_px, frame_count)
+
+
+_OF_BUBBLES = [
+    Column("particle", "name", required=False, blank=True),
+    *(Column(name, required=False, blank=True) for name in ("a_px", "b_px", "angle_rad")),
+    Column("flags", "text", required=False, blank=True),
+]
+
+
+def _detections(
+    table: pd.DataFrame, path: Path, cameras: list[str], sizes_px: Sizes, frame_count: int | None
+) -> pd.DataFrame:
+    """Check rows of `detections.csv` and fill in what they lack."""
+    _check_pixels(table, path, cameras, sizes_px, frame_count)
     if "particle" not in table:
         table["particle"] = ""
     _check_named_once(table, "particle", path)
@@ -405,11 +430,9 @@ def read_detections_csv(
     return _finished(table, known)
 
 
-def _pixel_table(
-    path: Path, own: list[Column], cameras: list[str], sizes_px: Sizes, frame_count: int | None
-) -> pd.DataFrame:
-    """Read a CSV table of pixels with ``own`` columns; check its cameras, pixels and frames."""
-    columns = [
+def _pixel_columns(own: list[Column]) -> list[Column]:
+    """The columns of a table of pixels with ``own`` columns."""
+    return [
         Column("frame", "whole"),
         Column("camera", "name"),
         Column("u_px"),
@@ -418,7 +441,12 @@ def _pixel_table(
         *(Column(name, required=False) for name in COVARIANCE),
         *own,
     ]
-    table = read_table(path, columns, extra=True)
+
+
+def _check_pixels(
+    table: pd.DataFrame, path: Path, cameras: list[str], sizes_px: Sizes, frame_count: int | None
+) -> None:
+    """Check the cameras, pixels and frames of a table of pixels."""
     check_cameras(table, cameras, path)
     if all(name in sizes_px for name in cameras):
         check_pixels(table, sizes_px, path)
@@ -430,7 +458,6 @@ def _pixel_table(
         lambda i: f"is {frame[i]}, " + ("before 0" if frame[i] < 0 else f"the last is {last}"),
         "frames count from 0; correct the cell, or complete the times of the frames",
     )
-    return table
 
 
 def _check_named_once(table: pd.DataFrame, name: str, path: Path) -> None:

@@ -116,6 +116,14 @@ def write_table(table: pd.DataFrame, path: str | PathLike[str]) -> None:
         table.astype(flags).to_csv(temporary, index=False, encoding="utf-8", lineterminator="\n")
 
 
+def append_table(table: pd.DataFrame, path: Path) -> None:
+    """Append rows to a CSV table as `write_table` writes it, or begin it."""
+    flags = {name: int for name, kind in table.dtypes.items() if kind.kind == "b"}
+    with path.open("a", encoding="utf-8", newline="") as file:
+        begun = file.tell() > 0
+        table.astype(flags).to_csv(file, index=False, header=not begun, lineterminator="\n")
+
+
 @dataclass(frozen=True)
 class Rows:
     """Name rows of a file in errors.
@@ -148,12 +156,24 @@ def rows_of(table: pd.DataFrame, file: Path) -> Rows:
     return Rows(file, table.index)
 
 
-def _sound_table(
-    file: Path, columns: Sequence[Column], others: Literal["refuse", "keep", "leave out"]
+def read_part(
+    file: Path, content: bytes, row: int, columns: Sequence[Column]
 ) -> pd.DataFrame | None:
+    """Read a part of a CSV table as `read_table` reads all of it, further columns included.
+
+    content : the header and some rows.  row : number of the first one in the file.
+    Returns None where the text is unusual; `read_table` of the file then finds out what it is.
+    """
+    return _sound_table(file, columns, "keep", content, row)
+
+
+def _sound_table(
+    file: Path, columns: Sequence[Column], others: Literal["refuse", "keep", "leave out"],
+    content: bytes | None = None, row: int = 2,
+) -> pd.DataFrame | None:  # fmt: skip
     """Read a CSV table with pandas' fast reader; None for an unusual file, left to `_cells`."""
     try:
-        content = file.read_bytes()
+        content = file.read_bytes() if content is None else content
         header = content.split(b"\n", 1)[0].decode("utf-8-sig").rstrip("\r").split(",")
     except (OSError, UnicodeDecodeError):
         return None
@@ -182,7 +202,7 @@ def _sound_table(
             )  # fmt: skip
     except (ValueError, OverflowError, pd.errors.ParserError):
         return None
-    rows = Rows(file, pd.RangeIndex(2, len(table) + 2, name="file_row"))
+    rows = Rows(file, pd.RangeIndex(row, len(table) + row, name="file_row"))
     values: dict[str, Any] = {}
     for name in names:
         cells, column = table[name], known.get(name)

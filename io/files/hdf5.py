@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import FileIO
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,21 +18,43 @@ if TYPE_CHECKING:
     import h5py
 
 
+class _Disk(FileIO):
+    """A file that keeps the first error of writing, and then pretends to write.
+
+    The HDF5 library may crash the process when the disk is full while it writes.
+    """
+
+    error: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        size = memoryview(content).nbytes
+        if self.error is None:
+            try:
+                done = super().write(content)
+                while done < size:
+                    done += super().write(memoryview(content).cast("B")[done:])
+            except OSError as error:
+                self.error = error
+        return size
+
+
 @contextmanager
 def hdf5_file(path: str | PathLike[str]) -> Iterator[h5py.File]:
-    """Yield an HDF5 file in memory, and write it to ``path`` at the end.
+    """Yield a new HDF5 file, which appears at ``path`` when it is complete.
 
-    The HDF5 library may crash the process when the disk is full while it writes, so it does not
-    write to the disk itself.
     Raises InputError when the file cannot be written.
     """
     import h5py
 
-    memory = io.BytesIO()
-    with h5py.File(memory, "w") as file:
-        yield file
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(memory.getbuffer())
+    with atomic_path(path) as temporary, _Disk(temporary, "w+b") as disk:
+        try:
+            with h5py.File(disk, "w") as file:
+                yield file
+        except Exception:
+            if disk.error is None:
+                raise
+        if disk.error is not None:
+            raise disk.error
 
 
 def read_arrays(path: str | PathLike[str], group: str) -> dict[str, Array]:

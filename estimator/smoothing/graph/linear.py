@@ -43,7 +43,7 @@ _SLOPE_S = 2e-3
 def priors_and_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
     """Everything but the measurements."""
     out = _shake_motion(graph, state) + bubble_priors(graph, state)
-    return out + _constant_priors(graph, state)
+    return out + constant_priors(graph, state) + _known(graph, state)
 
 
 def _shake_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
@@ -101,29 +101,49 @@ def bubble_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
     return [begin, between, means]
 
 
-def _constant_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
+def constant_values(graph: GraphLayout, state: State) -> dict[str, Array]:
+    """Values (N, n) of all constants by family; clocks are the delays beyond the stated ones."""
+    clocks = state.clocks
+    if graph.sensor_flags[1] and len(clocks):
+        given = np.array([a.delay_s for a in graph.problem.accelerometers])
+        _, first = np.unique(graph.clock_of, return_index=True)
+        clocks = clocks + (graph.delays_s - given)[first, None]
+    constants = np.concatenate([state.encoder, state.calibration])[None]
+    return {
+        "sensors": state.sensors, "constants": constants, "marks": state.marks, "clocks": clocks
+    }  # fmt: skip
+
+
+def constant_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
+    """Priors of what does not change along a run: sensors, encoder, calibration, marks, clocks."""
     model, problem, base = graph.model, graph.problem, graph.base()
     scale, delay = graph.sensor_flags
-    out = list[LinearFactors]()
+    values, out = constant_values(graph, state), list[LinearFactors]()
     if problem.accelerometers:
         extra = [model.accelerometer_scale_sigma] * scale
         sigma = np.array([[a.bias_sigma_mm_s2] * 3 + extra for a in problem.accelerometers])
         out.append(_priors(base.sensors, state.sensors, sigma))
         if delay:
-            given = np.array([a.delay_s for a in problem.accelerometers])
-            _, first = np.unique(graph.clock_of, return_index=True)
-            value = state.clocks + (graph.delays_s - given)[first, None]
-            out.append(_priors(base.clocks, value, model.accelerometer_delay_sigma_s))
+            out.append(_priors(base.clocks, values["clocks"], model.accelerometer_delay_sigma_s))
     sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
     sigmas = np.concatenate([sigmas[np.array(graph.encoder_flags)], np.ones(graph.share_size)])
-    out.append(
-        _priors(base.constants, np.concatenate([state.encoder, state.calibration])[None], sigmas)
-    )
+    out.append(_priors(base.constants, values["constants"], sigmas))
     if problem.marks:
         guess = np.array([m.guess_mm for m in problem.marks])
         sigma = np.array([[m.sigma_mm] for m in problem.marks])
         out.append(_priors(base.marks, state.marks - guess, sigma))
     return [p for p in out if p.rhs.size]
+
+
+def _known(graph: GraphLayout, state: State) -> list[LinearFactors]:
+    """What other parts of the run tell of the constants."""
+    values, base, out = constant_values(graph, state), graph.base(), list[LinearFactors]()
+    for known in graph.problem.known:
+        keys = tuple(np.array([getattr(base, family) + i]) for family, i in known.keys)
+        now = sum(b @ values[f][i] for b, (f, i) in zip(known.blocks, known.keys))
+        blocks = tuple(block[None] for block in known.blocks)
+        out.append(LinearFactors(keys, blocks, (known.side - now)[None], np.zeros(1)))
+    return out
 
 
 def _priors(base: int, deviation: Array, sigma: ArrayLike) -> LinearFactors:

@@ -52,6 +52,7 @@ _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
 _LARGEST_STEP_PX = 5.0
 _STACK_BYTES = 512 << 20
 _AT_ONCE = 8192
+_COLUMNS_AT_ONCE = 4
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,9 @@ class Options:
     tolerance_px : the passes end when no bubble moved by more than this in the last one. Affine
         cameras with constants that are not estimated need only one pass.
     draws : whether `Draws` are made, too, which costs less than afterwards (`drawn`).
+    constants : whether the joint covariance of all constants is computed.
+    frames : of a piece of a run that `telerig.smooth` smooths in pieces; None for as many as fit
+        into memory.
     """
 
     passes: int = 6
@@ -71,6 +75,8 @@ class Options:
     covariances: bool = True
     tolerance_px: float = 0.05
     draws: bool = False
+    constants: bool = False
+    frames: int | None = None
 
 
 @dataclass(frozen=True)
@@ -133,6 +139,8 @@ class Solution:
         are 1, and their whitened residuals (N, k) along the k directions of modelled motion.
     draws : None if they were not asked for.
     accelerations : None where they were not asked for (`accelerations.accelerations_of`).
+    constants : joint covariance of the constants in the order of their keys (sensors, encoder and
+        calibration, marks, clocks); None if it was not asked for.
     """
 
     graph: GraphLayout
@@ -146,6 +154,7 @@ class Solution:
     sample_residuals: tuple[Array, ...] = ()
     draws: Draws | None = None
     accelerations: Accelerations | None = None
+    constants: Array | None = None
 
     @property
     def delays_s(self) -> Array:
@@ -351,13 +360,29 @@ def _finish(
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
     evidence -= last.done.log_det()
     draws = draws_of(graph, last.factors, last.done) if options.draws else None
+    constants = _constants_covariance(graph, last.done) if options.constants else None
     last.factors.clear()
     found = None
     if options.covariances:
         progress("covariances", 0.0)
         found = _covariances(graph, last.done.blocks())
     progress("smoothing", 1.0)
-    return Solution(graph, state, found, *fitted, float(evidence), done, draws=draws)
+    return Solution(
+        graph, state, found, *fitted, float(evidence), done, draws=draws, constants=constants
+    )
+
+
+def _constants_covariance(graph: GraphLayout, done: EliminatedGraph | EliminatedCrowd) -> Array:
+    """Joint covariance of what does not change along a run; its keys are the last ones."""
+    sizes = [n * d for n, d in graph.counts()]
+    count, every = sum(sizes[3:]), sum(sizes)
+    out = np.zeros((count, count))
+    for first in range(0, count, _COLUMNS_AT_ONCE):
+        mine = np.arange(first, min(first + _COLUMNS_AT_ONCE, count))
+        side = np.zeros((every, len(mine)))
+        side[every - count + mine, np.arange(len(mine))] = 1.0
+        out[:, mine] = done.solved(side)[every - count :]
+    return (out + out.T) / 2
 
 
 def drawn(solution: Solution, draws: int | None = None) -> Draws:

@@ -129,7 +129,7 @@ def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tup
     seen, cameras = problem.observations, len(problem.cameras)
     most, found, there = -1, 0, 0
     for first in firsts.tolist():
-        inside = seen.item[(seen.frame >= first) & (seen.frame < first + length)]
+        inside = seen.between(first, first + length).item
         each = np.sort(np.bincount(inside))[::-1][:MOST_BUBBLES]
         each = each[each >= share * cameras * length]
         if each.sum() > most:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -137,6 +138,21 @@ class Observations:
         parts = (self.item, self.frame, self.camera, self.uv_px, self.covariance_px2)
         return Observations(*(p[keep] for p in parts))
 
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether frames do not decrease, so that those of some frames are neighbours."""
+        return bool(np.all(self.frame[1:] >= self.frame[:-1]))
+
+    def between(self, first: int, end: int) -> Observations:
+        """Return those in the frames from ``first`` to before ``end``, which count from 0 then."""
+        keep: Any = (
+            (self.frame >= first) & (self.frame < end)
+            if not self.in_order
+            else slice(*np.searchsorted(self.frame, (first, end)).tolist())
+        )
+        inside = self.of(keep)
+        return replace(inside, frame=inside.frame - first)
+
     @staticmethod
     def none() -> Observations:
         """Return zero observations."""
@@ -256,6 +272,21 @@ class CalibrationShare:
     drift: Array | None = None
 
 
+ConstantFamily = Literal["sensors", "constants", "marks", "clocks"]
+
+
+@dataclass(frozen=True)
+class Known:
+    """Hold what other parts of a run tell of some constants x_k: |sum_k A_k x_k - b|^2.
+
+    keys : family and number of each.  blocks : A_k (n, d_k).  side : (n,) b.
+    """
+
+    keys: tuple[tuple[ConstantFamily, int], ...]
+    blocks: tuple[Array, ...]
+    side: Array
+
+
 def check_increasing(t_s: Array, where: str, first_row: int) -> None:
     """Raise InputError, which names the row, if the times (N,) do not increase.
 
@@ -283,6 +314,7 @@ class SmoothingProblem:
     calibration : uncertainty of the calibration; None if it moves no pixel.
     travel : how well travel axis and encoder scale are known; None if they are exact.
     gravity_m_s2 : gravity of the laboratory, which accelerometers read at rest.
+    known : for a part of a run, what the other parts tell of its constants.
 
     Raises InputError for times that do not increase and for fewer than two frames.
     """
@@ -300,6 +332,7 @@ class SmoothingProblem:
     calibration: CalibrationShare | None = None
     travel: Travel | None = None
     gravity_m_s2: float = STANDARD_GRAVITY_M_S2
+    known: tuple[Known, ...] = ()
 
     @property
     def gravity_mm_s2(self) -> Array:

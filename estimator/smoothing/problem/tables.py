@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
 
 
 _MICRO_G_MM_S2 = 1e-3 * STANDARD_GRAVITY_M_S2
-_MARGIN_S = 0.25
+MARGIN_S = 0.25
 _MARK_SIGMA_MM = 100.0
 _FELT_PX = 2e-3
 
@@ -72,7 +75,7 @@ def accelerometers_of(
     return tuple(out)
 
 
-def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = _MARGIN_S) -> Accelerometer:
+def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = MARGIN_S) -> Accelerometer:
     """Return the sensor with the samples that were measured within a margin about the frames.
 
     t_s : (F,) times of the frames.  There may be no such samples.
@@ -209,49 +212,170 @@ def calibration_share(
     return CalibrationShare(root @ turn[felt].T, free, covariance, drift)
 
 
-def _near(t: Array, t_s: Array, margin_s: float = _MARGIN_S) -> Bools:
+def _near(t: Array, t_s: Array, margin_s: float = MARGIN_S) -> Bools:
     return np.asarray((t >= t_s[0] - margin_s) & (t <= t_s[-1] + margin_s))
 
 
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 _LOOSE_PX = 0.5
-_SHARPEST_PX = 0.01
+_SHARPEST_PX, _SOME, _FRAMES_AT_ONCE = 0.01, 200, 2000
 """Standard deviation added to that of each centre, since tables may state next to none."""
+
+
+def frames_between(tracks: Any, first: int, end: int) -> Any:
+    """Return `Tracks`, or a table of tracks, in the frames from ``first`` to before ``end``."""
+    if hasattr(tracks, "between"):
+        return tracks.between(first, end)
+    if hasattr(tracks, "table"):
+        parts = {name: getattr(tracks, name) for name in ("table", "detections")}
+        return replace(tracks, **{n: frames_between(part, first, end) for n, part in parts.items()})
+    return tracks[(tracks["frame"] >= first) & (tracks["frame"] < end)]
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """table : rows of tracks.csv that are used.  particles : their ids, in order.
+    """Hold what is read of tracks: all of it, or what does not grow much with a long run.
 
-    observations : of the bubbles by their index in ``particles``.
+    tracks : as they were given.  sample : rows of their table, evenly spread; all of a table in
+        memory.  particles : ids, in order.  observations : of the bubbles by their index in
+        ``particles``.
+    places : for each of these its first frame and its positions (n, 3) in mm in the rig frame from
+        there on, NaN where it has none.
     """
 
-    table: pd.DataFrame
+    tracks: Any
+    sample: pd.DataFrame
     particles: list[int]
     observations: Observations
     t_s: Array
+    places: list[tuple[int, Array]]
+
+    def between(self, first: int, end: int) -> pd.DataFrame:
+        """Return the table's rows in the frames from ``first`` to before ``end``."""
+        rows: pd.DataFrame = frames_between(getattr(self.tracks, "table", self.tracks), first, end)
+        return rows
 
 
 def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | None) -> Tracked:
-    """Return pixels of a tracks table, and of detections that only one camera made.
+    """Pixels out of a tracks table, and of detections that only one camera made.
 
+    tracks : `Tracks`, `StoredTracks`, or a table with the columns of tracks.csv.
     Raises InputError for missing columns, cameras that the calibration does not have, NaN.
     """
-    table = getattr(tracks, "table", tracks)
-    detections = getattr(tracks, "detections", None)
-    _check(table, cameras)
-    t_s = _times(table, frame_times_s)
-    particles = sorted(int(p) for p in table["particle"].unique())
+    ends: dict[int, tuple[int, int]] = {}
+    corrected, samples, times_of = {c.name: False for c in cameras}, [], []
+    for table, _ in _parts(tracks):
+        _check(table, cameras)
+        spans = table.groupby("particle")["frame"].agg(["min", "max"])
+        for particle, low, high in zip(spans.index, spans["min"], spans["max"]):
+            before = ends.get(int(particle), (low, high))
+            ends[int(particle)] = min(int(low), before[0]), max(int(high), before[1])
+        for camera in cameras:
+            corrected[camera.name] |= _corrected(table, camera.name)
+        samples.append(table if _in_memory(tracks) else table.iloc[:: len(table) // _SOME + 1])
+        if frame_times_s is None and "t_s" in table:
+            times_of.append(table.drop_duplicates("frame")[["frame", "t_s"]])
+    import pandas as pd
+
+    sample = samples[0] if len(samples) == 1 else pd.concat(samples, ignore_index=True)
+    if not ends:
+        _check(sample, cameras)
+    known = pd.concat(times_of, ignore_index=True) if times_of else sample
+    t_s = _times(known, max(last for _, last in ends.values()), frame_times_s)
+    particles = sorted(ends)
     number = {p: i for i, p in enumerate(particles)}
-    parts = [_paired(table, c, camera.name, number) for c, camera in enumerate(cameras)]
-    if detections is not None and "particle" in detections:
-        parts += [
-            _single(table, detections, c, camera.name, number) for c, camera in enumerate(cameras)
-        ]
-    joined = [np.concatenate(p) for p in zip(*parts)]
-    observations = Observations(*joined)
-    order = np.lexsort((observations.camera, observations.item, observations.frame))
-    return Tracked(table, particles, observations.of(order), t_s)
+    places = [(ends[p][0], np.full((ends[p][1] - ends[p][0] + 1, 3), np.nan)) for p in particles]
+    with _store(tracks) as store:
+        for table, detections in _parts(tracks):
+            _place(table, number, places)
+            parts = [_paired(table, c, camera.name, number) for c, camera in enumerate(cameras)]
+            if detections is not None and "particle" in detections:
+                parts += [
+                    _single(table, detections, c, camera.name, number, ends, corrected)
+                    for c, camera in enumerate(cameras)
+                ]
+            found = Observations(*(np.concatenate(p) for p in zip(*parts)))
+            store.add(found.of(np.lexsort((found.camera, found.item, found.frame))))
+        observations = store.observations()
+    return Tracked(tracks, sample, particles, observations, t_s, places)
+
+
+def _in_memory(tracks: Any) -> bool:
+    return not hasattr(tracks, "between")
+
+
+def _parts(tracks: Any) -> Iterator[tuple[pd.DataFrame, pd.DataFrame | None]]:
+    """Yield the table of tracks and the detections: all, or some frames of stored ones."""
+    if _in_memory(tracks):
+        yield getattr(tracks, "table", tracks), getattr(tracks, "detections", None)
+        return
+    for first in range(0, int(tracks.table.last[-1]) + 1, _FRAMES_AT_ONCE):
+        part = tracks.between(first, first + _FRAMES_AT_ONCE)
+        if len(part.table):
+            yield part.table, part.detections
+
+
+def _place(table: pd.DataFrame, number: dict[int, int], places: list[tuple[int, Array]]) -> None:
+    """Put the table's positions into those of the bubbles."""
+    frame, item = table["frame"].to_numpy(np.int64), table["particle"].map(number).to_numpy()
+    points = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    order = np.argsort(item, kind="stable")
+    for mine in np.split(order, np.flatnonzero(np.diff(item[order])) + 1):
+        first, place = places[int(item[mine[0]])]
+        place[frame[mine] - first] = points[mine]
+
+
+@dataclass
+class _Store:
+    """Collect observations: in memory, or their pixels in files of a folder."""
+
+    folder: TemporaryDirectory[str] | None
+    parts: list[Observations] = field(default_factory=list)
+
+    def add(self, part: Observations) -> None:
+        if self.folder is not None:
+            for name in ("uv_px", "covariance_px2"):
+                with (Path(self.folder.name) / name).open("ab") as file:
+                    file.write(np.ascontiguousarray(getattr(part, name)).tobytes())
+            none = Observations.none()
+            part = replace(
+                part, item=part.item.astype(np.int32), frame=part.frame.astype(np.int32),
+                camera=part.camera.astype(np.int8), uv_px=none.uv_px,
+                covariance_px2=none.covariance_px2,
+            )  # fmt: skip
+        self.parts.append(part)
+
+    def observations(self) -> Observations:
+        names = ("item", "frame", "camera", "uv_px", "covariance_px2")
+        joined = [np.concatenate([getattr(p, name) for p in self.parts]) for name in names]
+        if self.folder is not None:
+            shapes = ((len(joined[0]), 2), (len(joined[0]), 2, 2))
+            joined[3:] = [
+                cast("Array", OnDisk(self.folder, name, shape))
+                for name, shape in zip(names[3:], shapes)
+            ]
+        return Observations(*joined)
+
+
+@contextmanager
+def _store(tracks: Any) -> Iterator[_Store]:
+    yield _Store(None if _in_memory(tracks) else TemporaryDirectory(prefix="telerig-"))
+
+
+@dataclass(frozen=True)
+class OnDisk:
+    """An array of numbers in a file of a temporary folder; parts of it are read when needed."""
+
+    folder: TemporaryDirectory[str] = field(repr=False)
+    name: str
+    shape: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, which: Any) -> Array:
+        path = Path(self.folder.name) / self.name
+        return np.array(np.memmap(path, np.float64, "r", shape=self.shape)[which])
 
 
 def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
@@ -298,8 +422,8 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
         )
 
 
-def _times(table: pd.DataFrame, frame_times_s: Array | None) -> Array:
-    last = int(table["frame"].max())
+def _times(table: pd.DataFrame, last: int, frame_times_s: Array | None) -> Array:
+    """Times of the frames up to the last one, from those in a table if they are not given."""
     if frame_times_s is not None:
         if len(frame_times_s) <= last:
             raise InputError(
@@ -335,13 +459,18 @@ def _paired(
 
 
 def _single(
-    table: pd.DataFrame, detections: pd.DataFrame, index: int, camera: str, number: dict[int, int]
+    table: pd.DataFrame,
+    detections: pd.DataFrame,
+    index: int,
+    camera: str,
+    number: dict[int, int],
+    ends: dict[int, tuple[int, int]],
+    corrected: dict[str, bool],
 ) -> tuple[Any, ...]:
     """Return the detections of a track in frames in which the other camera did not see it."""
     rows = detections[(detections["camera"] == camera) & detections["particle"].notna()]
     ids = rows["particle"].to_numpy(float).astype(np.int64)
     paired = set(zip(table["frame"].tolist(), table["particle"].tolist()))
-    ends = {p: (f.min(), f.max()) for p, f in table.groupby("particle")["frame"]}
     inside = [
         p in number and (f, p) not in paired and ends[p][0] <= f <= ends[p][1]
         for f, p in zip(rows["frame"].tolist(), ids.tolist())
@@ -355,7 +484,7 @@ def _single(
     frame = rows["frame"].to_numpy(np.int64)[good]
     item = np.array([number[int(p)] for p in ids], np.int64)
     # its own correction towards the centre of volume needs both views
-    loose = _covariance(values) + _LOOSE_PX**2 * np.eye(2) * _corrected(table, camera)
+    loose = _covariance(values) + _LOOSE_PX**2 * np.eye(2) * corrected[camera]
     return item, frame, np.full(len(item), index), values[:, :2], loose
 
 
@@ -372,14 +501,11 @@ def _covariance(values: Array) -> Array:
 
 def bubbles_of(tracked: Tracked, positions_mm: Array, axis: Array) -> tuple[Bubble, ...]:
     """Return every bubble with its triangulated lab positions and straight lines over its gaps."""
-    out = []
-    for particle in tracked.particles:
-        rows = tracked.table[tracked.table["particle"] == particle].sort_values("frame")
-        frames = rows["frame"].to_numpy(np.int64)
-        lab = rows[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-        lab = lab + positions_mm[frames, None] * axis
-        every = np.arange(frames[0], frames[-1] + 1)
-        t = tracked.t_s
+    out, t = [], tracked.t_s
+    for particle, (first, places) in zip(tracked.particles, tracked.places):
+        frames = first + np.flatnonzero(np.isfinite(places[:, 0]))
+        lab = places[frames - first] + positions_mm[frames, None] * axis
+        every = np.arange(first, first + len(places))
         guess = np.stack([np.interp(t[every], t[frames], column) for column in lab.T], -1)
         out.append(Bubble(particle, int(every[0]), int(every[-1]), guess[0], guess))
     return tuple(out)

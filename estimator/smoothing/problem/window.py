@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.smoothing.problem.problem import Bubble, Observations, SmoothingProblem
+from telerig.estimator.smoothing.problem.problem import (
+    Bubble,
+    Observations,
+    SmoothingProblem,
+    Stage,
+)
+from telerig.estimator.smoothing.problem.tables import MARGIN_S, near_frames
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ def cut_out(
     seen, marks = problem.observations, problem.references
     if weights is not None:
         seen, marks = seen.of(weights[0] > 0.5), marks.of(weights[1] > 0.5)
-    seen, marks = _between(seen, first, end), _between(marks, first, end)
+    seen, marks = seen.between(first, end), marks.between(first, end)
     often = np.bincount(seen.item, minlength=len(problem.bubbles))
     if throughout:
         often *= [b.first <= first and b.last >= end - 1 for b in problem.bubbles]
@@ -52,13 +58,41 @@ def cut_out(
         observations=_renumbered(seen, chosen),
         marks=tuple(problem.marks[m] for m in known),
         references=_renumbered(marks, known),
+        known=(),
     )
     return Window(cut, first, chosen)
 
 
-def _between(obs: Observations, first: int, end: int) -> Observations:
-    inside = obs.of((obs.frame >= first) & (obs.frame < end))
-    return replace(inside, frame=inside.frame - first)
+def all_of(problem: SmoothingProblem, first: int, end: int) -> Window:
+    """Return the frames from ``first`` to before ``end`` with everything that was measured then.
+
+    Sensors are cut to a quarter of a second about the frames, the encoder to that and to the
+    readings on both sides.
+    """
+    seen, marks = problem.observations.between(first, end), problem.references.between(first, end)
+    t_s = problem.t_s[first:end]
+    often = np.bincount(seen.item, minlength=len(problem.bubbles))
+    lasting = np.array([b.last >= first and b.first < end for b in problem.bubbles], bool)
+    chosen, known = np.flatnonzero(lasting & (often > 0)), np.unique(marks.item)
+    sensors = (near_frames(sensor, t_s) for sensor in problem.accelerometers)
+    cut = replace(
+        problem,
+        t_s=t_s,
+        bubbles=tuple(_cut(problem.bubbles[b], first, end) for b in chosen),
+        observations=_renumbered(seen, chosen),
+        stage=None if problem.stage is None else _stage_near(problem.stage, t_s),
+        accelerometers=tuple(sensor for sensor in sensors if len(sensor.t_s) > 1),
+        marks=tuple(problem.marks[m] for m in known),
+        references=_renumbered(marks, known),
+    )
+    return Window(cut, first, chosen)
+
+
+def _stage_near(stage: Stage, t_s: Array) -> Stage:
+    low = int(np.searchsorted(stage.t_s, t_s[0] - MARGIN_S)) - 1
+    high = int(np.searchsorted(stage.t_s, t_s[-1] + MARGIN_S)) + 1
+    near = slice(max(low, 0), high)
+    return Stage(stage.t_s[near], stage.position_mm[near])
 
 
 def _renumbered(obs: Observations, chosen: Ints) -> Observations:

@@ -19,21 +19,18 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph.draws import Draws
-from telerig.estimator.smoothing.graph.linear import encoder
 from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
+from telerig.estimator.smoothing.verdict.evidence import BUBBLES, ENCODER, MARKS, Evidence, Tally
 from telerig.io.results.smoothing import AXES, Contradiction, Disagreement
 
-BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
 HIGHEST_SPEED_MM_S = 10_000.0
 MOST_OUTLIERS = 0.2
 _MOST_SD = 5.0
 _LEAST_RISE_MM_S = 5.0
 _RATIO, _SURE, _LEAST_EXPECTED = 1.2, 6.0, 20.0
-_WINDOW_S, _LEAST_FRAMES = 0.1, 10
 _WINDOW_SURE = 3.0
 _BEYOND_NOISE = 3.0
 
@@ -46,9 +43,12 @@ class Contradictions:
     inflation: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-def contradictions(solution: Solution, draws: Draws) -> Contradictions:
-    """Return what disagrees in a solved run.  draws : at the solution."""
-    found = list(_of_one(solution, draws))
+def contradictions(solution: Solution, evidence: Evidence) -> Contradictions:
+    """Return what disagrees in a solved run.
+
+    solution : of the run, or of a part of it.  evidence : of the run.
+    """
+    found = list(_of_one(solution, evidence))
     if not found:
         return Contradictions()
     factor = max(1.0, *(f.statistic for f in found))
@@ -61,35 +61,29 @@ def contradictions(solution: Solution, draws: Draws) -> Contradictions:
     return Contradictions(tuple(dict.fromkeys(order)), inflation)
 
 
-def _of_one(solution: Solution, draws: Draws) -> Iterator[Contradiction]:
-    yield from _outliers(solution)
-    yield from _constants(solution)
-    yield from _speeds(solution)
-    yield from residual_contradictions(solution, draws)
+def _of_one(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
+    yield from _outliers(evidence)
+    yield from _constants(solution, evidence)
+    yield from _speeds(solution, evidence)
+    yield from residual_contradictions(evidence)
 
 
-def _outliers(solution: Solution) -> Iterator[Contradiction]:
+def _outliers(evidence: Evidence) -> Iterator[Contradiction]:
     """Return the sources of which so many pixels are left out that these cannot be outliers."""
-    problem = solution.graph.problem
-    for source, obs, weights in (
-        (BUBBLES, problem.observations, solution.weights[0]),
-        (MARKS, problem.references, solution.weights[1]),
-    ):
-        out = weights < 0.5
-        if len(out) and out.mean() > MOST_OUTLIERS:
-            when = problem.t_s[obs.frame[out]]
+    for one in evidence.pixels.values():
+        share = one.lost / max(one.count, 1)
+        if share > MOST_OUTLIERS:
             yield Contradiction(
-                source=source, from_s=float(when.min()), to_s=float(when.max()),
-                statistic=float(out.mean() / MOST_OUTLIERS), test=Disagreement.OUTLIERS,
+                source=one.source, from_s=one.from_s, to_s=one.to_s,
+                statistic=share / MOST_OUTLIERS, test=Disagreement.OUTLIERS,
             )  # fmt: skip
 
 
-def _constants(solution: Solution) -> Iterator[Contradiction]:
+def _constants(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
     """Return the biases and delays that their priors do not allow."""
     graph = solution.graph
-    delays = solution.delays_s
+    delays, (first, last) = solution.delays_s, evidence.times_s
     for i, sensor in enumerate(graph.problem.accelerometers):
-        first, last = float(graph.problem.t_s[0]), float(graph.problem.t_s[-1])
         by_axis = np.abs(solution.state.sensors[i, :3]) / sensor.bias_sigma_mm_s2
         axis = int(by_axis.argmax())
         if by_axis[axis] > _MOST_SD:
@@ -106,31 +100,33 @@ def _constants(solution: Solution) -> Iterator[Contradiction]:
             )  # fmt: skip
 
 
-def _speeds(solution: Solution) -> Iterator[Contradiction]:
+def _speeds(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
     """Return a mean speed of the bubbles that no bubble has."""
-    problem = solution.graph.problem
-    if not problem.bubbles:
+    problem, means = solution.graph.problem, evidence.mean_velocities
+    if not len(means):
         return
-    speed = np.median(solution.state.means, axis=0)
+    speed = np.median(means, axis=0)
     axis = int(np.abs(speed).argmax())
     if abs(speed[axis]) > HIGHEST_SPEED_MM_S:
         yield Contradiction(
             source=BUBBLES if problem.stage is None else ENCODER, axis=AXES[axis],
-            from_s=float(problem.t_s[0]), to_s=float(problem.t_s[-1]),
+            from_s=evidence.times_s[0], to_s=evidence.times_s[1],
             statistic=float(abs(speed[axis]) / HIGHEST_SPEED_MM_S), test=Disagreement.SPEED,
         )  # fmt: skip
 
 
-def speed_warnings(solution: Solution) -> list[str]:
+def speed_warnings(problem: SmoothingProblem, means: Array) -> list[str]:
     """Return a warning for bubbles that hover or sink, as in a flow downwards.
 
     An encoder with another sign or unit has the same effect, and without marks no residual shows
     it.
+
+    means : (K, 3) mean velocities of the bubbles, mm/s.
     """
-    problem = solution.graph.problem
-    if not problem.bubbles or problem.stage is None or not np.ptp(problem.stage.position_mm):
+    stage = problem.stage
+    if not len(means) or stage is None or not np.ptp(stage.position_mm):
         return []
-    rise = float(np.median(solution.state.means @ problem.up))
+    rise = float(np.median(means @ problem.up))
     if rise > _LEAST_RISE_MM_S:
         return []
     how = "sink" if rise < -_LEAST_RISE_MM_S else "hover"
@@ -140,97 +136,48 @@ def speed_warnings(solution: Solution) -> list[str]:
     ]
 
 
-def sample_warnings(solution: Solution) -> list[str]:
+def sample_warnings(evidence: Evidence) -> list[str]:
     """Return a warning for each accelerometer with samples that other measurements contradict."""
-    words = []
-    for sensor, weight in zip(solution.graph.problem.accelerometers, solution.sample_weights):
-        if weight is None:
-            continue
-        lost = weight < 0.5
-        if sensor.kept is not None:
-            lost &= sensor.kept
-        if lost.any():
-            when = sensor.t_s[lost]
-            words.append(
-                f"accelerometer {sensor.name}: {len(when)} of {len(lost)} samples, from "
-                f"{when[0]:.4g} to {when[-1]:.4g} s, are not used: there it and the other "
-                "measurements contradict each other"
-            )
-    return words
+    return [
+        f"accelerometer {name}: {len(lost.t_s)} of {lost.samples} samples, from "
+        f"{lost.t_s[0]:.4g} to {lost.t_s[-1]:.4g} s, are not used: there it and the other "
+        "measurements contradict each other"
+        for name, lost in evidence.lost.items()
+        if len(lost.t_s)
+    ]
 
 
-@dataclass(frozen=True)
-class Group:
-    """Squared residuals of one source along one axis (n,), and of draws from the model (n, K)."""
-
-    source: str
-    axis: str
-    t_s: Array
-    square: Array
-    expected: Array
-
-
-def residual_contradictions(solution: Solution, draws: Draws) -> Iterator[Contradiction]:
+def residual_contradictions(evidence: Evidence) -> Iterator[Contradiction]:
     """Return the sources whose residuals are larger than a right model leaves them, and than noise.
 
     The latter keeps short runs, whose fit takes up most of the noise, from false alarms.
     """
-    for group in groups(solution, draws):
-        seen, number = float(group.square.sum()), group.expected.shape[-1]
-        expected = float(group.expected.sum() / number)
-        spread = np.sqrt(2 * expected * (1 + 1 / number))
+    for tally in evidence.tallies.values():
+        seen, expected, count = float(tally.seen.sum()), float(tally.expected.sum()), tally.count
+        spread = np.sqrt(2 * expected * (1 + 1 / tally.draws))
         sure = seen > expected + _SURE * spread and seen > _RATIO * expected
-        count = len(group.square)
         sure &= seen > count + _BEYOND_NOISE * np.sqrt(2 * count)
         if expected < _LEAST_EXPECTED or not sure:
             continue
-        first, last = _when(solution, group)
+        first, last = _when(tally, evidence)
         yield Contradiction(
-            source=group.source, axis=group.axis, from_s=first, to_s=last,
+            source=tally.source, axis=tally.axis, from_s=first, to_s=last,
             statistic=float(np.sqrt(seen / expected)), test=Disagreement.RESIDUALS,
         )  # fmt: skip
 
 
-def _when(solution: Solution, group: Group) -> tuple[float, float]:
+def _when(tally: Tally, evidence: Evidence) -> tuple[float, float]:
     """Return the first and last time of the windows in which the residuals are too large."""
-    t = solution.graph.problem.t_s
-    width = max(_WINDOW_S, _LEAST_FRAMES * float(np.median(np.diff(t))))
-    window = ((group.t_s - t[0]) / width).astype(np.int64).clip(0)
-    seen = np.bincount(window, group.square)
-    expected = np.bincount(window, group.expected.mean(-1))
+    (begin, end), width = evidence.times_s, evidence.window_s
+    seen, expected = tally.seen, tally.expected
     off = seen > np.maximum(_RATIO * expected, expected + _WINDOW_SURE * np.sqrt(2 * expected))
     which = np.flatnonzero(off) if off.any() else np.arange(len(seen))
-    end = min(t[0] + width * (which[-1] + 1), t[-1])
-    return float(t[0] + width * which[0]), float(end)
-
-
-def groups(solution: Solution, draws: Draws) -> list[Group]:
-    """Return the tested residuals: pixels of bubbles and marks by axis, and the encoder's."""
-    graph, problem = solution.graph, solution.graph.problem
-    parts: dict[tuple[str, str], list[tuple[Array, Array, Array]]] = {}
-    for source, obs, residual, weight, expected in (
-        (BUBBLES, problem.observations, solution.residuals[0], solution.weights[0], draws.pixels),
-        (MARKS, problem.references, solution.residuals[1], solution.weights[1], draws.marks),
-    ):
-        for camera in np.unique(obs.camera).tolist():
-            mine = obs.camera == camera
-            t, square = problem.t_s[obs.frame[mine]], residual[mine] ** 2 * weight[mine, None]
-            for row in range(2):
-                direction = problem.cameras[camera].camera_from_rig.rotation[row]
-                axis = AXES[int(np.abs(direction).argmax())]
-                both = (t, square[:, row], expected[mine, row] ** 2)
-                parts.setdefault((source, axis), []).append(both)
-    for linear in encoder(graph, solution.state):
-        t = graph.nodes.t_s[np.asarray(linear.keys[0])]
-        parts[ENCODER, ""] = [(t, linear.rhs[:, 0] ** 2, draws.encoder**2)]
-    return [
-        Group(source, axis, *(np.concatenate(p) for p in zip(*mine)))
-        for (source, axis), mine in parts.items()
-    ]
+    return float(begin + width * which[0]), float(min(begin + width * (which[-1] + 1), end))
 
 
 def _without(problem: SmoothingProblem) -> Iterator[tuple[tuple[str, ...], SmoothingProblem]]:
     """Yield the problem without one accelerometer, without the marks, without all of the former."""
+    problem = replace(problem, known=())
     sensors = problem.accelerometers
     for one in sensors:
         rest = tuple(a for a in sensors if a is not one)
@@ -259,8 +206,9 @@ def _blamed(
             other = solve(rest, model, Options(draws=True))
         except CalibrationError:
             continue
-        misfit = residual_contradictions(other, drawn(other))
-        off = sum(f.statistic for f in [*_outliers(other), *_constants(other), *misfit])
+        sums = Evidence.of(other, drawn(other))
+        misfit = [*_outliers(sums), *_constants(other, sums), *residual_contradictions(sums)]
+        off = sum(f.statistic for f in misfit)
         if off < best[0]:
             best = off, names, other
         if not off:

@@ -24,6 +24,7 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
 )
 from telerig.estimator.smoothing.problem.window import Window, cut_out
+from telerig.estimator.smoothing.verdict.evidence import Shake
 from telerig.factors.motion import start
 from telerig.io.results.smoothing import AXES, Flag, Verdict
 
@@ -56,15 +57,18 @@ class AxisVerdict:
         return tuple(line for line in self.lines if line.owner == "rig" and line.ambiguous)
 
 
-def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
-    """Return the verdict of each axis; {} without bubbles or covariances."""
+def verdicts(solution: Solution, shake: Shake | None) -> dict[str, AxisVerdict]:
+    """Return the verdict of each axis; {} without bubbles or covariances.
+
+    shake : of the run; None without a shake in the model.
+    """
     if solution.covariances is None or not solution.graph.problem.bubbles:
         return {}
     window = window_of(solution)
     if not window.problem.bubbles:
         return {}
     sigma, known = _sigmas(solution, window)
-    eta, rms = shake_share(solution), shake_rms(solution)
+    eta, rms = shake_share(solution, shake), shake_rms(solution, shake)
     resolved = all(e is not None and e >= RESOLVED_ETA for e in eta)
     lines = [] if resolved else _lines(window.problem, solution.graph.model)
     out = {}
@@ -115,7 +119,7 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
 
 def without_sensors(problem: SmoothingProblem) -> SmoothingProblem:
     """Return the problem with the images of the bubbles and the encoder alone."""
-    return replace(problem, accelerometers=(), marks=(), references=Observations.none())
+    return replace(problem, accelerometers=(), marks=(), references=Observations.none(), known=())
 
 
 def _inner_rows(window: Window) -> Ints:
@@ -134,51 +138,35 @@ def _position_sigma(solution: Solution, rows: Ints) -> Array:
     return np.asarray(np.sqrt(np.einsum("id,nde,ie->ni", at, covariance, at, optimize=True)))
 
 
-def shake_share(solution: Solution) -> list[float | None]:
+def shake_share(solution: Solution, shake: Shake | None) -> list[float | None]:
     """Return eta by axis: the least over the directions near the axis that a camera sees."""
-    graph, found = solution.graph, solution.covariances
-    assert found is not None
+    graph = solution.graph
     least: list[float | None] = [None, None, None]
-    if not graph.shake.size:
+    if shake is None:
         return least
     before, _ = start(graph.shake.components)
-    inner = _inner_frames(solution)
     for camera, seen in enumerate(graph.shake.seen):
-        for direction in seen:
+        for direction, variance in zip(seen, shake.variance[camera]):
             row = direction @ graph.shake.offset[camera]
             prior = float(row @ before @ row)
             if prior <= 0:
                 continue
-            after = float(np.mean(np.einsum("d,fde,e->f", row, found.shake[inner], row)))
             for axis in np.flatnonzero(direction**2 > _SEEN):
-                eta, known = 1 - after / prior, least[axis]
+                eta, known = 1 - float(variance) / shake.frames / prior, least[axis]
                 least[axis] = eta if known is None else min(known, eta)
     return least
 
 
-def shake_rms(solution: Solution) -> Array:
+def shake_rms(solution: Solution, shake: Shake | None) -> Array:
     """Return the RMS (3,) of the offsets, uncertainty included, of the camera that shakes most."""
-    graph, found = solution.graph, solution.covariances
-    assert found is not None
     out = np.zeros(3)
-    if not graph.shake.size:
+    if shake is None:
         return out
-    inner = _inner_frames(solution)
-    states = solution.state.shake[graph.nodes.of_frame[inner]]
-    for camera, seen in enumerate(graph.shake.seen):
-        for direction in seen:
-            row = direction @ graph.shake.offset[camera]
-            variance = np.einsum("d,fde,e->f", row, found.shake[inner], row)
-            rms = float(np.sqrt(np.mean((states @ row) ** 2 + variance)))
+    for seen, squares in zip(solution.graph.shake.seen, shake.square):
+        for direction, square in zip(seen, squares):
             near = direction**2 > _SEEN
-            out[near] = np.maximum(out[near], rms)
+            out[near] = np.maximum(out[near], float(np.sqrt(square / shake.frames)))
     return out
-
-
-def _inner_frames(solution: Solution) -> Ints:
-    count = len(solution.graph.problem.t_s)
-    edge = int(_EDGE * count)
-    return np.arange(edge, count - edge)
 
 
 def _lines(

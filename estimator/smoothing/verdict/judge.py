@@ -14,6 +14,7 @@ import numpy as np
 from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.contradiction import contradictions
+from telerig.estimator.smoothing.verdict.evidence import Evidence
 from telerig.estimator.smoothing.verdict.identifiability import (
     RESOLVED_Q,
     AxisVerdict,
@@ -33,16 +34,24 @@ from telerig.io.results.verdict_words import (
 )
 
 
-def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> dict[str, Any]:
+def judge(
+    problem: SmoothingProblem,
+    model: ShakeModel,
+    solution: Solution,
+    evidence: Evidence | None = None,
+) -> dict[str, Any]:
     """Return the verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ...
 
     Without covariances it is empty; without bubbles only the modes are listed.
+    evidence : of a run of which this is the piece in the middle; None for one that is solved as a
+        whole.
     """
     if solution.covariances is None:
         return {}
     draws = drawn(solution)
-    disagree = contradictions(solution, draws)
-    found = verdicts(solution) if problem.bubbles else {}
+    evidence = evidence or Evidence.of(solution, draws)
+    disagree = contradictions(solution, evidence)
+    found = verdicts(solution, evidence.shake) if problem.bubbles else {}
     modes = [_mode_json(mode) for mode in shake_modes(solution)]
     out: dict[str, Any] = {"modes": modes}
     if disagree.found:

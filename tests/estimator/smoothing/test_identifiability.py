@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from shake_learning_data import ARM_HZ, COMMON_HZ, run, true_model
 
-from telerig.estimator.smoothing.graph.solve import Options, solve
+from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.problem.problem import Accelerometer, BroadBand, ShakeModel, Stage
+from telerig.estimator.smoothing.verdict.evidence import shake_of
 from telerig.estimator.smoothing.verdict.identifiability import (
+    AxisVerdict,
     shake_share,
     verdicts,
     window_of,
@@ -26,6 +28,10 @@ QUIET = Options(robust=False)
 BANDS = replace(
     true_model(), modes=(), broad_bands=tuple(BroadBand((0.02, 0.2, 0.02), j) for j in (0, 1))
 )
+
+
+def verdict_of(solution: Solution) -> dict[str, AxisVerdict]:
+    return verdicts(solution, shake_of(solution))
 
 
 def verdict(problem: object, model: ShakeModel) -> dict[str, object]:
@@ -51,11 +57,11 @@ def test_one_bubble_cannot_be_told_from_the_rig() -> None:
 
 def test_several_bubbles_decide_the_label_but_not_the_amplitude() -> None:
     problem, _, _ = run(np.random.default_rng(1), bubbles=5)
-    y = verdicts(solve(problem, true_model(), QUIET))["y"]
+    y = verdict_of(solve(problem, true_model(), QUIET))["y"]
     assert "LABEL_AMBIGUOUS" not in y.flags
     assert all(line.log_likelihood_ratio > 5 for line in y.lines)
     alone, _, _ = run(np.random.default_rng(1))
-    assert y.q < verdicts(solve(alone, true_model(), QUIET))["y"].q
+    assert y.q < verdict_of(solve(alone, true_model(), QUIET))["y"].q
 
 
 def test_marks_fixed_to_the_tank_resolve_it() -> None:
@@ -98,8 +104,8 @@ def test_shake_far_below_the_noise_is_called_so() -> None:
 def test_a_model_without_shake_has_nothing_to_share() -> None:
     problem, _, _ = run(np.random.default_rng(4), shake_mm=0.0)
     solution = solve(problem, true_model().without_shake(), QUIET)
-    assert shake_share(solution) == [None, None, None]
-    y = verdicts(solution)["y"]
+    assert shake_share(solution, shake_of(solution)) == [None, None, None]
+    y = verdict_of(solution)["y"]
     assert y.q == pytest.approx(1, abs=1e-6)
     assert y.shake_rms_mm == 0
 
@@ -112,7 +118,7 @@ def test_q_is_the_ratio_to_the_same_run_without_shake() -> None:
     row = solution.graph.bubble.position[1]
     each = [np.einsum("d,nde,e->n", row, s.covariances.bubbles, row) for s in (solution, still)]  # type: ignore[union-attr]
     ratio = np.sqrt(each[0] / each[1])[12:-12]
-    assert verdicts(solution)["y"].q == pytest.approx(np.median(ratio), rel=1e-3)
+    assert verdict_of(solution)["y"].q == pytest.approx(np.median(ratio), rel=1e-3)
 
 
 def test_eta_follows_from_the_prior_and_what_is_left() -> None:
@@ -124,7 +130,8 @@ def test_eta_follows_from_the_prior_and_what_is_left() -> None:
         row = solution.graph.shake.offset[camera][1]
         inner = solution.covariances.shake[12:-12]
         left.append(np.einsum("d,fde,e->f", row, inner, row).mean())
-    assert shake_share(solution)[1] == pytest.approx(1 - max(left) / 0.04, rel=1e-6)
+    eta = shake_share(solution, shake_of(solution))[1]
+    assert eta == pytest.approx(1 - max(left) / 0.04, rel=1e-6)
 
 
 def test_only_the_window_is_looked_at_and_keeps_its_pixels() -> None:

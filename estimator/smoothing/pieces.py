@@ -1,0 +1,324 @@
+"""A long run is smoothed in pieces: which frames each is solved with, and what they share.
+
+Each piece is solved with more frames on both sides, which are not taken from its solution: three
+times as long as the slowest process remembers. What is constant along the run (biases, delays and
+scales of sensors, the encoder's scale, the calibration, marks) is known to a piece from all others:
+a first round, of pieces without margins, collects the information of each on them
+(docs/decisions/032). A run that fits into one piece is solved as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from telerig.arrays import Array, Ints
+from telerig.estimator.smoothing.graph.layout import (
+    GraphLayout,
+    clocks_of,
+    shake_layout,
+)
+from telerig.estimator.smoothing.graph.linear import constant_priors, constant_values
+from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
+from telerig.estimator.smoothing.problem.problem import (
+    ConstantFamily,
+    Known,
+    ShakeModel,
+    SmoothingProblem,
+)
+from telerig.estimator.smoothing.problem.window import Window, all_of
+
+MOST_ROWS, MOST_FRAMES = 120_000, 12_000
+"""Frames of all bubbles together, and frames, that are solved in one piece."""
+_ROWS, _FRAMES = 100_000, 10_000
+"""Of a piece of a run that has more."""
+_DECAY_TIMES = 3.0
+_CONSTANT = 1e-6
+Sizes = dict[ConstantFamily, tuple[int, int]]
+_FAMILIES: tuple[ConstantFamily, ...] = ("sensors", "constants", "marks", "clocks")
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Hold which frames a piece's results are taken for, and which it is solved with.
+
+    first, end : its own frames, from ``first`` to before ``end``.
+    low, high : those that it is solved with.
+    """
+
+    first: int
+    end: int
+    low: int
+    high: int
+
+    @property
+    def own(self) -> range:
+        """Its own frames as they count in its solution."""
+        return range(self.first - self.low, self.end - self.low)
+
+    def without_margin(self) -> Piece:
+        """Return the piece that is solved with its own frames alone."""
+        return Piece(self.first, self.end, self.first, self.end)
+
+    def cut(self, problem: SmoothingProblem) -> Window:
+        """Return the part of the run with which it is solved; all of it is the run itself."""
+        if (self.low, self.high) == (0, len(problem.t_s)):
+            return Window(problem, 0, np.arange(len(problem.bubbles)))
+        return all_of(problem, self.low, self.high)
+
+
+def pieces_of(
+    problem: SmoothingProblem, model: ShakeModel, frames: int | None = None
+) -> list[Piece]:
+    """Return the pieces of a run, equally long; a single one for a run that fits into memory.
+
+    frames : of a piece, without its margins; None for as many as memory allows.
+    """
+    count, rows = len(problem.t_s), sum(len(b) for b in problem.bubbles)
+    if frames is None:
+        fits = rows <= MOST_ROWS and count <= MOST_FRAMES
+        frames = count if fits else min(_FRAMES, max(int(_ROWS * count / max(rows, 1)), 2))
+    number = -(-count // frames)
+    edges = np.linspace(0, count, number + 1).round().astype(int).tolist()
+    margin = margin_s(problem, model) if number > 1 else 0.0
+    out = []
+    for first, end in pairwise(edges):
+        t = problem.t_s[[first, end - 1]] + np.array([-margin, margin])
+        low, high = np.searchsorted(problem.t_s, t, side="right").tolist()
+        # a margin longer than the piece itself would cost more than one piece for all
+        low, high = max(low, 2 * first - end, 0), min(high, 2 * end - first, count)
+        out.append(Piece(first, end, min(low, first), max(high, end)))
+    return out
+
+
+def margin_s(problem: SmoothingProblem, model: ShakeModel) -> float:
+    """Return three times as long as the slowest process of the rig remembers, or a bubble's speed.
+
+    Other processes of a bubble are seen in every frame, and those of the rig by all bubbles.
+    """
+    drifts = [part.drift for part in shake_layout(problem, model).components if part.drift.size]
+    rates = np.concatenate([[0.0], *(-np.linalg.eigvals(drift).real for drift in drifts)])
+    slowest = 1 / float(np.min(rates[rates > _CONSTANT], initial=np.inf))
+    return _DECAY_TIMES * max(slowest, model.bubble.velocity_tau_s)
+
+
+def solved_pieces(
+    problem: SmoothingProblem,
+    model: ShakeModel,
+    pieces: Sequence[Piece],
+    options: Options,
+    progress: Progress,
+    constants: Constants | None,
+    chosen: Sequence[int] | None = None,
+) -> Iterator[tuple[Piece, Window, Solution]]:
+    """Yield the solution of each piece of a run, one after the other.
+
+    constants : what the run tells of them; None where there are none.
+    chosen : which pieces; None for all.
+    """
+    for number in range(len(pieces)) if chosen is None else chosen:
+        piece = pieces[number]
+        progress(f"piece {number + 1} of {len(pieces)}", number / len(pieces))
+        window = piece.cut(problem)
+        known = (
+            replace(window.problem, known=())
+            if constants is None
+            else constants.given(window.problem, model, number)
+        )
+        yield piece, replace(window, problem=known), solve(known, model, options)
+
+
+@dataclass(frozen=True)
+class Constants:
+    """Hold what each of P pieces of a run tells of its C constants.
+
+    problem : of the run.  pieces : as they are solved at last.
+    prior : (C,) information of the priors, and prior_mean : (C,).
+    information, side : (P, C, C) and (P, C), Lambda and Lambda c of the pieces without margins.
+    """
+
+    problem: SmoothingProblem
+    pieces: tuple[Piece, ...]
+    prior: Array
+    prior_mean: Array
+    information: Array
+    side: Array
+
+    @classmethod
+    def of(
+        cls,
+        problem: SmoothingProblem,
+        model: ShakeModel,
+        pieces: Sequence[Piece],
+        options: Options,
+        progress: Progress,
+    ) -> Constants | None:
+        """Return the information of all pieces; None where nothing is constant along the run.
+
+        options : their covariances are not computed.
+        """
+        sizes = _sizes(problem, model)
+        count = sum(n * d for n, d in sizes.values())
+        if not count:
+            return None
+        prior, mean = np.ones(count), np.zeros(count)
+        information, side = np.zeros((len(pieces), count, count)), np.zeros((len(pieces), count))
+        options = replace(options, covariances=False, draws=False, constants=True)
+        own = [piece.without_margin() for piece in pieces]
+        for number, (_, _, solution) in enumerate(
+            solved_pieces(problem, model, own, options, progress, None)
+        ):
+            graph, state, joint = solution.graph, solution.state, solution.constants
+            assert joint is not None
+            at = _places(graph, problem, sizes)
+            values = _flat(constant_values(graph, state))
+            before, below = np.zeros(len(at)), 0
+            for linear in constant_priors(graph, state):
+                sigma = np.diagonal(linear.blocks[0], axis1=1, axis2=2)
+                mine = slice(below, below + sigma.size)
+                before[mine] = sigma.ravel() ** 2
+                mean[at[mine]] = values[mine] + (linear.rhs / sigma).ravel()
+                below = mine.stop
+            prior[at] = before
+            whole = np.linalg.inv(joint)
+            information[number][np.ix_(at, at)] = whole - np.diag(before)
+            side[number][at] = whole @ values - before * mean[at]
+        return cls(problem, tuple(pieces), prior, mean, information, side)
+
+    @property
+    def mean(self) -> Array:
+        """(C,) what all pieces together tell."""
+        side = self.side.sum(0) + self.prior * self.prior_mean
+        return np.asarray(np.linalg.solve(self.total, side))
+
+    @property
+    def total(self) -> Array:
+        """(C, C) information of all pieces and of the priors."""
+        return np.asarray(self.information.sum(0) + np.diag(self.prior))
+
+    def given(self, problem: SmoothingProblem, model: ShakeModel, number: int) -> SmoothingProblem:
+        """Return the problem of a piece with what the others tell.
+
+        The share of its neighbours that its margins hold is not told twice. GTSAM's factors take
+        three keys, so that each constant is known by those of encoder and calibration and by the
+        one before it, in the order of keys; marks are in the order in which they are passed.
+        """
+        rest, side = self.information.sum(0), self.side.sum(0)
+        for other, share in self._shares(number).items():
+            rest = rest - share * self.information[other]
+            side = side - share * self.side[other]
+        covariance = np.linalg.inv(rest + np.diag(self.prior))
+        mean = covariance @ (side + self.prior * self.prior_mean)
+        here = _here(problem, self.problem, _sizes(self.problem, model))
+        shared: _Constant = (("constants", 0), here["constants"][0])
+        before: _Constant | None = None
+        known = list[Known]()
+        if len(shared[1]):
+            at = shared[1]
+            information = np.linalg.inv(covariance[np.ix_(at, at)]) - np.diag(self.prior[at])
+            told = np.linalg.solve(covariance[np.ix_(at, at)], mean[at])
+            told -= self.prior[at] * self.prior_mean[at]
+            root = _root(information)
+            place = np.linalg.lstsq(information, told, rcond=1e-12)[0]
+            known.append(Known((shared[0],), (root,), root @ place))
+        for family, index, at in _in_turn(here, problem):
+            given = [one for one in (shared, before) if one is not None and len(one[1])]
+            known.append(_conditional(((family, index), at), given, mean, covariance))
+            before = ((family, index), at)
+        return replace(problem, known=tuple(known))
+
+    def _shares(self, number: int) -> dict[int, float]:
+        """Of each piece, the share of its own frames that one is solved with."""
+        low, high = self.pieces[number].low, self.pieces[number].high
+        both = np.array([min(high, p.end) - max(low, p.first) for p in self.pieces])
+        length = np.array([p.end - p.first for p in self.pieces])
+        return {int(i): float(both[i] / length[i]) for i in np.flatnonzero(both > 0)}
+
+
+_Constant = tuple[tuple[ConstantFamily, int], Ints]
+"""Key of a constant, and its (n,) places among those of the run."""
+
+
+def _in_turn(
+    here: Mapping[ConstantFamily, Ints], problem: SmoothingProblem
+) -> Iterator[tuple[ConstantFamily, int, Ints]]:
+    """Yield family, number and places of all constants but those of encoder and calibration."""
+    passed = np.full(len(problem.marks), len(problem.t_s))
+    np.minimum.at(passed, problem.references.item, problem.references.frame)
+    for family, places in here.items():
+        if family != "constants" and places.size:
+            order = np.argsort(passed, kind="stable") if family == "marks" else range(len(places))
+            yield from ((family, int(index), places[index]) for index in order)
+
+
+def _conditional(
+    one: _Constant, given: Sequence[_Constant], mean: Array, covariance: Array
+) -> Known:
+    """What is known of one constant where others are given, from the (C, C) covariance of all."""
+    key, at = one
+    others = np.concatenate([np.zeros(0, np.int64), *(places for _, places in given)])
+    cross = covariance[np.ix_(at, others)]
+    gain = cross @ np.linalg.pinv(covariance[np.ix_(others, others)], hermitian=True)
+    left = covariance[np.ix_(at, at)] - gain @ cross.T
+    root = _root(np.linalg.inv(left))
+    gains = np.split(gain, np.cumsum([len(places) for _, places in given])[:-1], axis=1)
+    return Known(
+        (key, *(k for k, _ in given)), (root, *(-root @ g for g in gains if given)),
+        root @ (mean[at] - gain @ mean[others]),
+    )  # fmt: skip
+
+
+def _root(information: Array) -> Array:
+    """(n, n) R with R^T R."""
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    return np.asarray(np.sqrt(values.clip(0))[:, None] * vectors.T)
+
+
+def _flat(values: Mapping[str, Array]) -> Array:
+    return np.concatenate([values[family].ravel() for family in _FAMILIES])
+
+
+def _sizes(problem: SmoothingProblem, model: ShakeModel) -> Sizes:
+    """Number and dimension of the run's constants by family."""
+    read, share = problem.stage is not None, problem.calibration
+    encoder = read * ((model.encoder_scale_sigma > 0) + (model.encoder_delay_sigma_s > 0))
+    directions = 0 if share is None else share.root.shape[1]
+    clocks = int(clocks_of(problem).max(initial=-1)) + 1
+    return {
+        "sensors": (len(problem.accelerometers), 3 + (model.accelerometer_scale_sigma > 0)),
+        "constants": (1, encoder + directions),
+        "marks": (len(problem.marks), 3),
+        "clocks": (clocks, int(model.accelerometer_delay_sigma_s > 0)),
+    }
+
+
+def _here(
+    problem: SmoothingProblem, whole: SmoothingProblem, sizes: Sizes
+) -> dict[ConstantFamily, Ints]:
+    """(N, n) places of a piece's constants among those of the run, by family."""
+    names = [a.name for a in whole.accelerometers]
+    sensors = [names.index(a.name) for a in problem.accelerometers]
+    clocks = clocks_of(whole)[sensors].tolist()
+    marks = [m.name for m in whole.marks]
+    chosen: dict[ConstantFamily, list[int]] = {
+        "sensors": sensors,
+        "constants": [0],
+        "marks": [marks.index(m.name) for m in problem.marks],
+        "clocks": list(dict.fromkeys(clocks)),
+    }
+    out, begin = dict[ConstantFamily, Ints](), 0
+    for family in _FAMILIES:
+        number, size = sizes[family]
+        rows = np.array(chosen[family], np.int64).reshape(-1, 1)
+        out[family] = begin + rows * size + np.arange(size)
+        begin += number * size
+    return out
+
+
+def _places(graph: GraphLayout, whole: SmoothingProblem, sizes: Sizes) -> Ints:
+    """(c,) places of a piece's constants, in the order of its keys, among those of the run."""
+    here = _here(graph.problem, whole, sizes)
+    return np.concatenate([here[family].ravel() for family in _FAMILIES])

@@ -1,0 +1,248 @@
+"""results.h5: the tables of a smoothed run, its states and their covariances, piece by piece."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from telerig.arrays import Array
+from telerig.errors import InputError
+from telerig.estimator.smoothing.verdict.evidence import AXES
+from telerig.io.files.csv_table import append_table, write_table
+from telerig.io.files.hdf5 import hdf5_file, read_arrays
+
+if TYPE_CHECKING:
+    import h5py
+    import pandas as pd
+
+NAME = "results.h5"
+TABLES = ("trajectories", "shake")
+_ROWS_AT_ONCE = 50_000
+_SAMPLED = 20_000
+
+
+class ResultsFile:
+    """Append the tables and states of pieces of a run to an open HDF5 file.
+
+    The file's attribute ``rows`` explains how positions and velocities follow from the states. The
+    covariances are those of the solution; the attribute ``inflation`` holds the factors of the
+    standard deviations along x, y and z by which contradicting measurements widen the tables'.
+    """
+
+    def __init__(self, file: h5py.File) -> None:
+        self.file = file
+        self.rows = list[int]()
+
+    def append(
+        self,
+        trajectories: pd.DataFrame,
+        shake: pd.DataFrame,
+        states: Mapping[str, Array],
+        bodies: pd.DataFrame | None = None,
+    ) -> None:
+        """Append rows of the tables and the states that belong to them.
+
+        bodies : columns that are kept beside those of the trajectories, row by row; None for none.
+        """
+        for name, table in zip(TABLES, (trajectories, shake)):
+            self._table(name, table)
+        if bodies is not None:
+            self._table("bodies", bodies)
+        for name, array in states.items():
+            if not name.endswith("_rows") or f"states/{name}" not in self.file:
+                self._add(f"states/{name}", array)
+        self.rows.append(len(trajectories))
+
+    def _table(self, name: str, table: pd.DataFrame) -> None:
+        if name not in self.file:
+            self.file.create_group(name, track_order=True)
+        for column in table.columns:
+            self._add(f"{name}/{column}", table[column].to_numpy())
+
+    def _add(self, name: str, values: Array) -> None:
+        if name in self.file:
+            data = self.file[name]
+            count = len(data)
+            data.resize(count + len(values), axis=0)
+            data[count:] = values
+            return
+        # level 1 of shuffled bytes is three times as fast as the default, and not larger
+        self.file.create_dataset(
+            name, data=values, maxshape=(None, *values.shape[1:]), chunks=True,
+            compression="gzip", compression_opts=1, shuffle=True,
+        )  # fmt: skip
+
+    def finish(self, inflation: Sequence[float]) -> None:
+        """Write the attributes, with the number of rows of each piece."""
+        from telerig.io.results.smoothing import SmoothingFile
+
+        self.file.attrs["schema"] = SmoothingFile.SCHEMA
+        self.file.attrs["rows_of_pieces"] = self.rows
+        self.file.attrs["inflation"] = tuple(inflation)
+        self.file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"
+
+    def widen(self, inflation: Sequence[float]) -> None:
+        """Multiply the standard deviations of the tables by factors (3,) along each axis."""
+        for name in TABLES:
+            for column, data in self.file.get(name, {}).items():
+                factor = _factor(column, inflation)
+                for first in range(0, len(data) * (factor != 1), _ROWS_AT_ONCE):
+                    mine = slice(first, first + _ROWS_AT_ONCE)
+                    data[mine] = data[mine] * factor
+
+
+def _factor(column: str, inflation: Sequence[float]) -> float:
+    """The factor for a column of a table: that of its axis for a standard deviation, else 1."""
+    for axis, factor in zip(AXES, inflation):
+        if column[:1] == "s" and column.endswith((f"{axis}_mm", f"{axis}_mm_s", f"{axis}_mm_s2")):
+            return float(factor)
+    return 1.0
+
+
+@contextmanager
+def results_file(folder: Path) -> Iterator[ResultsFile]:
+    """Yield the file results.h5 of a folder, which appears when it is complete."""
+    with hdf5_file(folder / NAME) as file:
+        yield ResultsFile(file)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Hold the tables of a run in memory; `Smoothing` describes them."""
+
+    trajectories: pd.DataFrame
+    shake: pd.DataFrame
+    states: Mapping[str, Array] = field(default_factory=dict)
+    bodies: pd.DataFrame | None = None
+
+    def typical(self, columns: Sequence[str]) -> pd.DataFrame:
+        """Return the columns that the trajectories have."""
+        return self.trajectories[[name for name in columns if name in self.trajectories]]
+
+    def sizes(self) -> tuple[int, int]:
+        """Return the number of bubbles and of frames."""
+        return int(self.trajectories["particle"].nunique()), len(self.shake)
+
+    def write(self, out: Path, inflation: Sequence[float]) -> None:
+        """Write trajectories.csv, shake.csv and results.h5 into a folder."""
+        write_table(self.trajectories, out / "trajectories.csv")
+        write_table(self.shake, out / "shake.csv")
+        with results_file(out) as file:
+            file.append(self.trajectories, self.shake, self.states)
+            file.finish(inflation)
+
+    def parts(self) -> Iterator[Tables]:
+        """Yield the rows some at a time: all."""
+        yield self
+
+
+@dataclass(frozen=True)
+class StoredTables:
+    """Hold the tables of a run that was smoothed in pieces: in a folder, and read when asked for.
+
+    Their rows are by piece, then by bubble and frame.
+
+    folder : which holds results.h5.  keep : a temporary folder that lives as long as the tables.
+    """
+
+    folder: Path
+    keep: TemporaryDirectory[str] | None = field(default=None, repr=False)
+
+    @cached_property
+    def trajectories(self) -> pd.DataFrame:
+        """The whole table."""
+        return self._table("trajectories")
+
+    @cached_property
+    def shake(self) -> pd.DataFrame:
+        """The whole table."""
+        return self._table("shake")
+
+    @cached_property
+    def states(self) -> Mapping[str, Array]:
+        """All states."""
+        return read_arrays(self.folder / NAME, "states")
+
+    @property
+    def bodies(self) -> pd.DataFrame | None:
+        """The whole table; None without bodies."""
+        import pandas as pd
+
+        found = [part.bodies for part in self.parts() if part.bodies is not None]
+        return pd.concat(found, ignore_index=True) if found else None
+
+    def sizes(self) -> tuple[int, int]:
+        """Return the number of bubbles and of frames."""
+        with self._open() as file:
+            return len(np.unique(file["trajectories/particle"][()])), len(file["shake/frame"])
+
+    def typical(self, columns: Sequence[str]) -> pd.DataFrame:
+        """Return some 20,000 rows, evenly spread, of the columns that the trajectories have."""
+        import pandas as pd
+
+        with self._open() as file:
+            table = file["trajectories"]
+            step = max(1, len(table["frame"]) // _SAMPLED)
+            return pd.DataFrame({n: table[n][()][::step] for n in columns if n in table})
+
+    def parts(self) -> Iterator[Tables]:
+        """Yield the trajectories piece by piece, and the bodies."""
+        import pandas as pd
+
+        with self._open() as file:
+            first = 0
+            for count in file.attrs["rows_of_pieces"]:
+                mine = slice(first, first + int(count))
+                first = mine.stop
+                paths = pd.DataFrame({n: d[mine] for n, d in file["trajectories"].items()})
+                bodies = None
+                if "bodies" in file:
+                    columns = {n: d[mine] for n, d in file["bodies"].items()}
+                    bodies = pd.DataFrame({n: paths[n] for n in ("frame", "particle")} | columns)
+                    bodies = bodies[bodies["d_eq_mm"].notna()].reset_index(drop=True)
+                yield Tables(paths, pd.DataFrame(), {}, bodies)
+
+    def write(self, out: Path, inflation: Sequence[float]) -> None:
+        """Write trajectories.csv and shake.csv into a folder, and results.h5 if it is not there.
+
+        inflation : is in the tables already.
+        """
+        import pandas as pd
+
+        if out.resolve() != self.folder.resolve():
+            shutil.copyfile(self.folder / NAME, out / NAME)
+        for part in self.parts():
+            append_table(part.trajectories, out / "trajectories.csv")
+        with self._open() as file:
+            for first in range(0, len(file["shake/frame"]), _ROWS_AT_ONCE):
+                mine = slice(first, first + _ROWS_AT_ONCE)
+                rows = pd.DataFrame({name: data[mine] for name, data in file["shake"].items()})
+                append_table(rows, out / "shake.csv")
+
+    def _table(self, name: str) -> pd.DataFrame:
+        import pandas as pd
+
+        with self._open() as file:
+            return pd.DataFrame({column: data[()] for column, data in file[name].items()})
+
+    @contextmanager
+    def _open(self) -> Iterator[h5py.File]:
+        import h5py
+
+        path = self.folder / NAME
+        try:
+            file = h5py.File(path, "r")
+        except OSError as error:
+            raise InputError(
+                f"cannot be read: {error}", where=str(path), todo="smooth the run again"
+            ) from error
+        with file:
+            yield file

@@ -1,0 +1,328 @@
+"""What the verdict and the summary need of a solution, as sums over its frames.
+
+Those of several pieces of a run add up to those of the run, so that no two solutions are in memory
+at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from telerig.arrays import Array, Bools, Ints
+from telerig.estimator.smoothing.graph.draws import Draws
+from telerig.estimator.smoothing.graph.linear import encoder
+from telerig.estimator.smoothing.graph.solve import Solution
+
+AXES = ("x", "y", "z")
+BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
+_WINDOW_S, _LEAST_FRAMES = 0.1, 10
+_EDGE = 0.1
+_SEEN = 0.25
+_SAMPLED = 20_000
+_USED = 0.5
+
+
+@dataclass(frozen=True)
+class Span:
+    """Name the frames of a solution that count.
+
+    own : as they count in the solution.  first : the run's frame that is the solution's frame 0.
+    t_s : (F,) times of all frames of the run.
+    """
+
+    own: range
+    first: int
+    t_s: Array
+
+    @classmethod
+    def whole(cls, solution: Solution) -> Span:
+        """Return all frames of a solution that is the run's."""
+        t_s = solution.graph.problem.t_s
+        return cls(range(len(t_s)), 0, t_s)
+
+    def holds(self, frame: Ints) -> Bools:
+        """(n,) whether frames (n,) of the solution count."""
+        return np.asarray((frame >= self.own.start) & (frame < self.own.stop))
+
+    def spans(self, t_s: Array) -> Bools:
+        """(n,) whether times (n,) are nearer to its frames than to those of other pieces."""
+        first, last = self.first + self.own.start, self.first + self.own.stop - 1
+        low = self.t_s[first] if first else -np.inf
+        high = self.t_s[last + 1] if last + 1 < len(self.t_s) else np.inf
+        return np.asarray((t_s >= low) & (t_s < high))
+
+    @property
+    def window_s(self) -> float:
+        """Length of the windows of time in which residuals are added up."""
+        return max(_WINDOW_S, _LEAST_FRAMES * float(np.median(np.diff(self.t_s))))
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Add up the squared residuals of one source along one axis.
+
+    seen, expected : (n,) those of the solution, and of draws from the model, in windows of time
+        from the run's first frame on.  count : their number.  draws : from which is expected.
+    """
+
+    source: str
+    axis: str
+    seen: Array
+    expected: Array
+    count: int
+    draws: int
+
+    def __add__(self, other: Tally) -> Tally:
+        return replace(
+            self,
+            seen=_padded_sum(self.seen, other.seen),
+            expected=_padded_sum(self.expected, other.expected),
+            count=self.count + other.count,
+            draws=min(self.draws, other.draws),
+        )
+
+
+def _padded_sum(one: Array, other: Array) -> Array:
+    out = np.zeros(max(len(one), len(other)))
+    out[: len(one)] += one
+    out[: len(other)] += other
+    return out
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Add up the pixels of one source.
+
+    count, lost : how many there are, and how many of them have lost their weight.
+    from_s, to_s : the first and the last time of these.  total : sum of the others' squared
+    residuals.  some : up to 20,000 of these squares.
+    """
+
+    source: str
+    count: int
+    lost: int
+    from_s: float
+    to_s: float
+    total: float
+    some: Array
+
+    def __add__(self, other: Pixels) -> Pixels:
+        return Pixels(
+            self.source, self.count + other.count, self.lost + other.lost,
+            min(self.from_s, other.from_s), max(self.to_s, other.to_s), self.total + other.total,
+            np.concatenate([self.some, other.some]),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Shake:
+    """Add up the cameras' offsets over frames away from the run's ends.
+
+    variance, square : by camera and by direction that it sees, the sum of the posterior variances,
+    and that of the squared estimates with these (mm^2).
+    """
+
+    frames: int
+    variance: tuple[Array, ...]
+    square: tuple[Array, ...]
+
+    def __add__(self, other: Shake) -> Shake:
+        return Shake(
+            self.frames + other.frames,
+            tuple(a + b for a, b in zip(self.variance, other.variance)),
+            tuple(a + b for a, b in zip(self.square, other.square)),
+        )
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Add up the samples of an accelerometer: all, those not used (masked), and the times (n,) of
+    those that the other measurements contradict."""
+
+    samples: int
+    masked: int
+    t_s: Array
+
+    def __add__(self, other: Lost) -> Lost:
+        return Lost(
+            self.samples + other.samples, self.masked + other.masked,
+            np.concatenate([self.t_s, other.t_s]),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Hold the mean velocity of a bubble (3,) mm/s, its sd, and in how many frames it was seen."""
+
+    frames: int
+    velocity_mm_s: Array
+    sigma_mm_s: Array | None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Hold the sums of one solution, or of all pieces of a run.
+
+    times_s : of the run's first and last frame.  window_s : of the windows of time of `Tally`.
+    tallies, pixels, lost, means : by source and axis, source, sensor, bubble.
+    """
+
+    times_s: tuple[float, float]
+    window_s: float
+    tallies: Mapping[tuple[str, str], Tally]
+    pixels: Mapping[str, Pixels]
+    lost: Mapping[str, Lost]
+    means: Mapping[int, Mean]
+    shake: Shake | None
+    nodes: int
+    passes: int
+
+    @classmethod
+    def of(cls, solution: Solution, draws: Draws, span: Span | None = None) -> Evidence:
+        """Return the sums over some frames of a solution; None for all frames of a run's.
+
+        draws : at the solution.
+        """
+        span = span or Span.whole(solution)
+        tallies = {(t.source, t.axis): t for t in _tallies(solution, draws, span)}
+        nodes = solution.graph.nodes
+        return cls(
+            (float(span.t_s[0]), float(span.t_s[-1])), span.window_s, tallies,
+            _pixels(solution, span), _lost(solution, span), _means(solution, span),
+            shake_of(solution, span), int(np.count_nonzero(span.spans(nodes.t_s))), solution.passes,
+        )  # fmt: skip
+
+    def __add__(self, other: Evidence) -> Evidence:
+        means = dict(self.means)
+        for particle, mean in other.means.items():
+            if particle not in means or mean.frames > means[particle].frames:
+                means[particle] = mean
+        shake = [s for s in (self.shake, other.shake) if s is not None]
+        return replace(
+            self,
+            tallies=_added(self.tallies, other.tallies),
+            pixels=_added(self.pixels, other.pixels),
+            lost=_added(self.lost, other.lost),
+            means=means,
+            shake=reduce(Shake.__add__, shake) if shake else None,
+            nodes=self.nodes + other.nodes,
+            passes=max(self.passes, other.passes),
+        )
+
+    @property
+    def mean_velocities(self) -> Array:
+        """(K, 3) of all bubbles, mm/s."""
+        return np.array([m.velocity_mm_s for m in self.means.values()]).reshape(-1, 3)
+
+
+def _added(one: Mapping[Any, Any], other: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The sums of what both have, and what one of them has."""
+    both = {key: value + other[key] for key, value in one.items() if key in other}
+    return {**one, **other, **both}
+
+
+def _tallies(solution: Solution, draws: Draws, span: Span) -> Iterator[Tally]:
+    """Yield the sums for pixels of bubbles and marks by axis, and for the encoder's readings."""
+    graph, problem = solution.graph, solution.graph.problem
+    parts: dict[tuple[str, str], list[tuple[Array, Array, Array]]] = {}
+    for source, obs, residual, weight, expected in (
+        (BUBBLES, problem.observations, solution.residuals[0], solution.weights[0], draws.pixels),
+        (MARKS, problem.references, solution.residuals[1], solution.weights[1], draws.marks),
+    ):
+        for camera in np.unique(obs.camera).tolist():
+            mine = (obs.camera == camera) & span.holds(obs.frame)
+            t, square = problem.t_s[obs.frame[mine]], residual[mine] ** 2 * weight[mine, None]
+            for row in range(2):
+                direction = problem.cameras[camera].camera_from_rig.rotation[row]
+                axis = AXES[int(np.abs(direction).argmax())]
+                both = (t, square[:, row], expected[mine, row] ** 2)
+                parts.setdefault((source, axis), []).append(both)
+    for linear in encoder(graph, solution.state):
+        t = graph.nodes.t_s[np.asarray(linear.keys[0])]
+        mine = span.spans(t)
+        parts[ENCODER, ""] = [(t[mine], linear.rhs[mine, 0] ** 2, draws.encoder[mine] ** 2)]
+    for (source, axis), found in parts.items():
+        t, square, drawn = (np.concatenate(p) for p in zip(*found))
+        window = ((t - span.t_s[0]) / span.window_s).astype(np.int64).clip(0)
+        yield Tally(
+            source, axis, np.asarray(np.bincount(window, square), np.float64),
+            np.asarray(np.bincount(window, drawn.mean(-1)), np.float64), len(square),
+            drawn.shape[-1],
+        )  # fmt: skip
+
+
+def _pixels(solution: Solution, span: Span) -> dict[str, Pixels]:
+    problem, out = solution.graph.problem, {}
+    for i, (source, obs) in enumerate(
+        ((BUBBLES, problem.observations), (MARKS, problem.references))
+    ):
+        mine = span.holds(obs.frame)
+        lost = solution.weights[i][mine] <= _USED
+        when = problem.t_s[obs.frame[mine][lost]]
+        square = (solution.residuals[i][mine][~lost] ** 2).sum(-1)
+        whole = len(span.own) == len(span.t_s)
+        step = 1 if whole else -(-len(square) // _SAMPLED) or 1
+        out[source] = Pixels(
+            source, int(np.count_nonzero(mine)), len(when), float(when.min(initial=np.inf)),
+            float(when.max(initial=-np.inf)), float(square.sum()), square[::step],
+        )  # fmt: skip
+    return out
+
+
+def _lost(solution: Solution, span: Span) -> dict[str, Lost]:
+    """Of each accelerometer."""
+    out = {}
+    for i, sensor in enumerate(solution.graph.problem.accelerometers):
+        mine = span.spans(sensor.t_s)
+        weight = solution.sample_weights[i] if solution.sample_weights else None
+        given = np.ones(len(mine), bool) if sensor.kept is None else sensor.kept
+        used = given if weight is None else weight >= _USED
+        gone = given & ~used & mine
+        masked = np.count_nonzero(mine & ~used)
+        out[sensor.name] = Lost(int(mine.sum()), int(masked), sensor.t_s[gone])
+    return out
+
+
+def _means(solution: Solution, span: Span) -> dict[int, Mean]:
+    """Of each bubble that has own frames."""
+    found, out = solution.covariances, {}
+    for i, bubble in enumerate(solution.graph.problem.bubbles):
+        if bubble.last < span.own.start or bubble.first >= span.own.stop:
+            continue
+        sigma = None if found is None else np.sqrt(np.diagonal(found.means[i]))
+        out[bubble.particle] = Mean(len(bubble), solution.state.means[i], sigma)
+    return out
+
+
+def shake_of(solution: Solution, span: Span | None = None) -> Shake | None:
+    """Return the sums for the shake; None without a shake in the model, or without covariances.
+
+    span : as for `Evidence.of`.
+    """
+    span = span or Span.whole(solution)
+    graph, found = solution.graph, solution.covariances
+    if found is None or not graph.shake.size:
+        return None
+    count = len(span.t_s)
+    edge = int(_EDGE * count)
+    inner = np.arange(
+        max(span.own.start, edge - span.first), min(span.own.stop, count - edge - span.first)
+    )
+    states = solution.state.shake[graph.nodes.of_frame[inner]]
+    variances, squares = [], []
+    for camera, seen in enumerate(graph.shake.seen):
+        rows = seen @ graph.shake.offset[camera]
+        variance = np.einsum("kd,fde,ke->k", rows, found.shake[inner], rows, optimize=True)
+        variances.append(variance)
+        squares.append(((states @ rows.T) ** 2).sum(0) + variance)
+    return Shake(len(inner), tuple(variances), tuple(squares))
+
+
+def evidence_of(parts: Sequence[Evidence]) -> Evidence:
+    """Return the sum."""
+    return reduce(Evidence.__add__, parts)

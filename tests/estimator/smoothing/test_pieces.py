@@ -1,0 +1,179 @@
+"""A run smoothed in pieces, against the joint solution of the same run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import shake_problem
+from numpy.typing import NDArray
+from shake_cases import SCENARIOS, generate
+from shake_learning_data import run, true_model, with_comings_and_goings
+
+import telerig
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
+from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
+from telerig.estimator.smoothing.pieces import Constants, pieces_of, solved_pieces
+from telerig.estimator.smoothing.problem.problem import (
+    CalibrationShare,
+    ShakeModel,
+    SmoothingProblem,
+)
+from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
+
+Array = NDArray[np.float64]
+PLAIN = Options(robust=False, draws=True)
+AXES = "xyz"
+
+
+def with_calibration(problem: SmoothingProblem) -> SmoothingProblem:
+    """The cameras' scales and the pose between them are known to some 1e-3."""
+    free = (("scale_px_per_mm",), ("scale_px_per_mm",))
+    root = 1e-3 * np.eye(8)
+    return replace(problem, calibration=CalibrationShare(root, free, root @ root.T))
+
+
+def crowded() -> tuple[SmoothingProblem, ShakeModel]:
+    problem, *_ = run(np.random.default_rng(3), bubbles=3, seconds=3.0)
+    cut = with_comings_and_goings(problem, np.random.default_rng(4), 200)
+    return with_calibration(cut), true_model()
+
+
+def sensed(information: str) -> tuple[SmoothingProblem, ShakeModel]:
+    scenario = replace(SCENARIOS["S2"], frames=900 if information == "references" else 600)
+    runs = generate(scenario, 1, np.random.default_rng(5))
+    model = shake_problem.true_model(scenario, information)
+    return shake_problem.problem(scenario, information, runs), model
+
+
+def silent(_what: str, _share: float) -> None:
+    """Report nothing."""
+
+
+def sigma(solution: Solution, rows: Array) -> Array:
+    found = solution.covariances
+    assert found is not None
+    return np.asarray(np.sqrt(np.einsum("id,nde,ie->ni", rows, found.bubbles, rows)))
+
+
+@pytest.mark.parametrize(
+    "made", [crowded, lambda: sensed("references"), lambda: sensed("arms")],
+    ids=["calibration", "marks", "accelerometers"],
+)  # fmt: skip
+def test_paths_and_sums_are_those_of_the_joint_solution(
+    made: Callable[[], tuple[SmoothingProblem, ShakeModel]],
+) -> None:
+    problem, model = made()
+    joint = solve(problem, model, PLAIN)
+    pieces = pieces_of(problem, model, -(-len(problem.t_s) // 3))
+    assert len(pieces) == 3
+    constants = Constants.of(problem, model, pieces, PLAIN, silent)
+    graph, at = joint.graph, joint.graph.bubble.position
+    seen, parts = np.zeros(graph.rows, bool), []
+    for piece, window, solution in solved_pieces(problem, model, pieces, PLAIN, silent, constants):
+        span = Span(piece.own, piece.low, problem.t_s)
+        mine = np.flatnonzero(span.holds(solution.graph.frame_of_row))
+        here = solution.graph
+        rows = graph.row(
+            window.bubbles[here.bubble_of_row[mine]], here.frame_of_row[mine] + piece.low
+        )
+        assert not seen[rows].any()
+        seen[rows] = True
+        off = (solution.state.bubbles[mine] - joint.state.bubbles[rows]) @ at.T
+        stated = sigma(joint, at)[rows]
+        assert np.sqrt(np.mean((off / stated) ** 2)) < 0.04
+        np.testing.assert_allclose(sigma(solution, at)[mine] / stated, 1, atol=0.02)
+        parts.append(Evidence.of(solution, drawn(solution), span))
+    assert seen.all()
+    total, whole = evidence_of(parts), Evidence.of(joint, drawn(joint))
+    assert total.nodes == whole.nodes
+    assert set(total.means) == set(whole.means)
+    assert total.pixels["bubbles"].count == whole.pixels["bubbles"].count
+    assert total.pixels["bubbles"].total == pytest.approx(whole.pixels["bubbles"].total, rel=5e-3)
+    for key, tally in whole.tallies.items():
+        assert total.tallies[key].count == tally.count
+        assert abs(total.tallies[key].seen.sum() - tally.seen.sum()) < 0.01 * tally.count
+    assert total.shake is not None and whole.shake is not None
+    assert total.shake.frames == whole.shake.frames
+    for one, other in zip(total.shake.square, whole.shake.square):
+        np.testing.assert_allclose(one, other, rtol=0.01)
+
+
+def test_what_all_pieces_tell_of_the_calibration_is_what_the_joint_solution_knows() -> None:
+    problem, model = crowded()
+    pieces = pieces_of(problem, model, 200)
+    constants = Constants.of(problem, model, pieces, PLAIN, silent)
+    joint = solve(problem, model, replace(PLAIN, constants=True))
+    assert constants is not None and joint.constants is not None
+    spread = np.sqrt(np.diag(joint.constants))
+    assert np.max(np.abs(constants.mean - joint.state.calibration) / spread) < 0.05
+    # without their margins, pieces tell a little less than the run does
+    known = np.sqrt(np.diag(np.linalg.inv(constants.total)))
+    np.testing.assert_allclose(known / spread, 1, atol=0.05)
+
+
+def test_a_run_that_fits_into_memory_is_one_piece() -> None:
+    problem, model = crowded()
+    (piece,) = pieces_of(problem, model)
+    assert (piece.first, piece.end, piece.low, piece.high) == (0, 600, 0, 600)
+    assert piece.cut(problem).problem is problem
+
+
+def tracks_of(problem: SmoothingProblem) -> pd.DataFrame:
+    """The pixels of a problem whose bubbles are seen in all of their frames, as tracks."""
+    table = pd.concat(
+        pd.DataFrame({"frame": np.arange(b.first, b.last + 1), "particle": b.particle})
+        for b in problem.bubbles
+    ).reset_index(drop=True)
+    table["t_s"] = problem.t_s[table["frame"]]
+    table[["x_mm", "y_mm", "z_mm"]] = np.concatenate([b.guess_mm for b in problem.bubbles])
+    particle = np.array([b.particle for b in problem.bubbles])
+    for index, camera in enumerate(problem.cameras):
+        seen = problem.observations.of(problem.observations.camera == index)
+        pixels = {"frame": seen.frame, "particle": particle[seen.item]}
+        pixels |= {f"{camera.name}_{n}_px": seen.uv_px[:, i] for i, n in enumerate("uv")}
+        for name, i, j in (("suu", 0, 0), ("suv", 0, 1), ("svv", 1, 1)):
+            pixels[f"{camera.name}_{name}_px2"] = seen.covariance_px2[:, i, j]
+        table = table.merge(pd.DataFrame(pixels), on=["frame", "particle"])
+    table["d_eq_mm"] = table["sd_eq_mm"] = 1.5
+    return table.sort_values(["frame", "particle"], ignore_index=True)
+
+
+def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
+    problem, _ = crowded()
+    calibration = calibration_from_cameras(list(problem.cameras), name="truth")
+    whole, parts = (
+        telerig.smooth(
+            tracks_of(problem), calibration, model="default", t_s=problem.t_s,
+            options=Options(frames=n),
+        )
+        for n in (None, 300)
+    )  # fmt: skip
+    assert parts.verdict["verdict"] == whole.verdict["verdict"]
+    assert parts.summary["bubbles"] == whole.summary["bubbles"]
+    assert whole.facts()["bubbles"] == parts.facts()["bubbles"]
+    key = ["particle", "frame"]
+    one, other = (s.trajectories.sort_values(key, ignore_index=True) for s in (whole, parts))
+    assert list(one) == list(other)
+    pd.testing.assert_frame_equal(one[[*key, "t_s"]], other[[*key, "t_s"]])
+    for axis in AXES:
+        off = (one[f"{axis}_mm"] - other[f"{axis}_mm"]) / one[f"s{axis}_mm"]
+        assert np.sqrt(np.mean(off**2)) < 0.05
+    assert list(whole.shake) == list(parts.shake)
+    np.testing.assert_array_equal(whole.shake["frame"], parts.shake["frame"])
+    assert parts.solution is None
+    for found, place in ((whole, tmp_path / "whole"), (parts, tmp_path / "parts")):
+        found.save(place)
+    again = telerig.load_smoothing(tmp_path / "parts")
+    np.testing.assert_array_equal(again.trajectories["x_mm"], parts.trajectories["x_mm"])
+    assert set(again.states) == set(whole.states)
+    np.testing.assert_array_equal(again.states["bubbles"], parts.states["bubbles"])
+    for name in ("bubbles", "bubble_summary"):
+        one, other = (pd.read_csv(tmp_path / p / f"{name}.csv") for p in ("whole", "parts"))
+        assert list(one) == list(other)
+        assert len(one) == len(other)
+        np.testing.assert_allclose(other["d_eq_mm"], 1.5)

@@ -82,9 +82,10 @@ def test_texts_of_results_without_rows(chain: Chain) -> None:
         "none", chain.tracks.detections[:0], chain.tracks.table[:0], chain.tracks.events[:0]
     )
     assert "0 tracks" in repr(empty) and len(empty.to_xarray()["rowSize"]) == 0
-    smoothing = replace(
-        chain.smoothing, trajectories=chain.smoothing.trajectories[:0], verdict={}, states={}
-    )
+    none = replace(
+        chain.smoothing.tables, trajectories=chain.smoothing.trajectories[:0], states={}
+    )  # fmt: skip
+    smoothing = replace(chain.smoothing, tables=none, verdict={})
     assert "not judged" in repr(smoothing) and "0 bubbles" in repr(smoothing)
     nothing = Triangulation(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, 3, 3)))
     assert repr(nothing) == "Triangulation of 0 points" and nothing.to_pandas().empty
@@ -148,7 +149,8 @@ def test_rows_are_sorted_with_their_covariance(chain: Chain) -> None:
     turned = chain.smoothing.trajectories[::-1].reset_index(drop=True)
     states = dict(chain.smoothing.states)
     states["bubble_covariance"] = states["bubble_covariance"][::-1]
-    swapped = replace(chain.smoothing, trajectories=turned, states=states)
+    tables = replace(chain.smoothing.tables, trajectories=turned, states=states)
+    swapped = replace(chain.smoothing, tables=tables)
     assert swapped.to_xarray().equals(chain.smoothing.to_xarray())
 
 

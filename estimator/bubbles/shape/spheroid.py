@@ -15,12 +15,14 @@ same variance v, and g0 half of it; modes of degree 4 of the body do nearly the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array
 from telerig.estimator.bubbles.shape.volume_centroid import Outlines, outlines_from_table
 from telerig.rig import silhouette
 from telerig.rig.camera import Camera
@@ -36,7 +38,8 @@ _LEAST_EXCESS = 3e-4
 _LEAST_FOR_LEARNING = 8
 _TRIM, _TRIMMED = 0.02, 0.873
 """Share of squares that is left out, and the mean of the others for normal errors."""
-_STEPS = 12
+_STEPS, _SMALL_STEP = 15, 1e-5
+_MOST_FOR_LEARNING, _PIECE = 4_000, 20_000
 _PROLATE_COST = 8.0
 _UPRIGHT_RAD = 0.4
 _LOG_ASPECT = 0.5
@@ -119,24 +122,31 @@ def fit_spheroids(
     views; the one that is expected of a rising bubble is taken.
     deviations : None to learn them from these outlines.
     """
-    good = outlines[0].entire & outlines[1].entire & np.isfinite(points_mm).all(-1)
-    pair = (outlines[0].rows(good), outlines[1].rows(good))
-    _, jacobian = stacked_jacobian(cameras, points_mm[good])
-    views = _Views.of(pair, (jacobian[:, :2], jacobian[:, 2:]))
-    known = learn_deviations(views, up) if deviations is None else deviations
-    found = _best(views, known, up)
-    return _scattered(found, good), known
+    good = np.flatnonzero(outlines[0].entire & outlines[1].entire & np.isfinite(points_mm).all(-1))
+
+    def views_of(rows: NDArray[Any]) -> _Views:
+        pair = (outlines[0].rows(rows), outlines[1].rows(rows))
+        _, jacobian = stacked_jacobian(cameras, points_mm[rows])
+        return _Views.of(pair, (jacobian[:, :2], jacobian[:, 2:]))
+
+    if deviations is None:
+        some = np.linspace(0, len(good) - 1, min(len(good), _MOST_FOR_LEARNING)).astype(int)
+        deviations = learn_deviations(views_of(good[some]), up)
+    pieces = np.array_split(good, max(1, -(-len(good) // _PIECE)))
+    found = [_best(views_of(piece), deviations, up) for piece in pieces]
+    return _scattered(found, good, len(points_mm)), deviations
 
 
 @dataclass(frozen=True)
 class _Views:
     """M pairs of outlines.
 
-    whitening : two (M, 2, 3), from the rig to the unit circle of each outline. noise : two (M,),
-    variance of the circle's cos 2 phi. ellipses : the pair in mm.
+    measure : (M, 6, 9) linear map from the nine moments A A^T of a body to g0, g1, g2 of its first
+    outline and of its second, in the unit circles of the measured ones. noise : two (M,), variance
+    of g1. ellipses : the pair in mm.
     """
 
-    whitening: tuple[Array, Array]
+    measure: Array
     noise: tuple[Array, Array]
     ellipses: silhouette.EllipsePair
 
@@ -146,9 +156,14 @@ class _Views:
         noise = [
             np.einsum("mij,mjk,mik->m", a, o.covariance_px2, a) / 2 for a, o in zip(inverse, pair)
         ]
-        first, second = (a @ j for a, j in zip(inverse, jacobians))
+        parts = []
+        for a, j in zip(inverse, jacobians):
+            u, v = np.moveaxis(a @ j, -2, 0)
+            uu, vv, uv = (p[:, :, None] * q[:, None, :] for p, q in ((u, u), (v, v), (u, v)))
+            parts += [(uu + vv) / 4, (uu - vv) / 4, uv / 2]
+        measure = np.stack(parts, 1).reshape(-1, 6, 9)
         ellipses = silhouette.ellipse_pair(jacobians, (pair[0].axes_px, pair[1].axes_px))
-        return _Views((first, second), (noise[0], noise[1]), ellipses)
+        return _Views(measure, (noise[0], noise[1]), ellipses)
 
     def precision(self, deviations: Deviations) -> Array:
         """(M, 6) inverse variances of the deviations g of both outlines."""
@@ -157,19 +172,11 @@ class _Views:
         return np.concatenate(each, -1)
 
     def deviation(self, moments: Array) -> Array:
-        """(M, 6) g of both outlines for bodies of these moments A A^T (M, 3, 3), or changes of
-        them, linear in them."""
-        seen = [w @ moments @ w.mT / 2 for w in self.whitening]
-        parts = [
-            part
-            for s in seen
-            for part in (
-                (s[:, 0, 0] + s[:, 1, 1]) / 2,
-                (s[:, 0, 0] - s[:, 1, 1]) / 2,
-                s[:, 0, 1],
-            )
-        ]
-        return np.stack(parts, -1)
+        """(M, 6) g of both outlines for bodies of these moments A A^T (M, 3, 3), or (M, 6, k) for k
+        changes of them (M, k, 3, 3)."""
+        if moments.ndim == 3:
+            return np.asarray((self.measure @ moments.reshape(-1, 9, 1))[..., 0])
+        return np.asarray(self.measure @ moments.reshape(*moments.shape[:2], 9).mT)
 
 
 _ROUND = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0])
@@ -234,21 +241,26 @@ def _fit(views: _Views, start: tuple[Array, Array, Array], deviations: Deviation
     weight = views.precision(deviations)
     prior = np.concatenate([_LOOSE, np.full(2, deviations.triaxial**-2)])
     covariance = np.zeros((len(pole), 6, 6))
+    live = np.arange(len(pole))
     for _ in range(_STEPS):
-        moments = _moments(frame, value)
-        miss = _ROUND - views.deviation(moments)
-        changes = _tangents(frame, moments)
-        slope = np.stack([views.deviation(changes[:, i]) for i in range(6)], -1)
-        normal = slope.mT @ (weight[..., None] * slope) + np.diag(prior)
-        covariance = np.asarray(np.linalg.inv(normal))
-        right = (slope.mT @ (weight * miss)[..., None])[..., 0]
-        right[:, 1] -= prior[1] * value[:, 1]
-        right[:, 4:] -= prior[4:] * value[:, 2:]
-        step = np.clip((covariance @ right[..., None])[..., 0], -0.5, 0.5)
-        value = value + step[:, [0, 1, 4, 5]]
+        some = replace(views, measure=views.measure[live])
+        moments = _moments(frame[live], value[live])
+        miss, certain = _ROUND - some.deviation(moments), weight[live]
+        slope = some.deviation(_tangents(frame[live], moments))
+        normal = slope.mT @ (certain[..., None] * slope) + np.diag(prior)
+        covariance[live] = np.linalg.inv(normal)
+        right = (slope.mT @ (certain * miss)[..., None])[..., 0]
+        right[:, 1] -= prior[1] * value[live, 1]
+        right[:, 4:] -= prior[4:] * value[live, 2:]
+        step = np.clip((covariance[live] @ right[..., None])[..., 0], -0.5, 0.5)
+        value[live] += step[:, [0, 1, 4, 5]]
         lean = np.concatenate([step[:, 2:4], np.ones((len(step), 1))], -1)
-        leaned = (frame @ lean[..., None])[..., 0]
-        frame = _carried(frame, leaned / np.linalg.norm(leaned, axis=-1, keepdims=True))
+        leaned = (frame[live] @ lean[..., None])[..., 0]
+        leaned /= np.linalg.norm(leaned, axis=-1, keepdims=True)
+        frame[live] = _carried(frame[live], leaned)
+        live = live[np.abs(step).max(-1) > _SMALL_STEP]
+        if not len(live):
+            break
     miss = _ROUND - views.deviation(_moments(frame, value))
     cost = (weight * miss**2).sum(-1) + (prior[4:] * value[:, 2:] ** 2).sum(-1)
     return _Fit(frame, value, covariance, cost)
@@ -323,7 +335,7 @@ def _spheroid_misfit(views: _Views, fit: _Fit, deviations: Deviations) -> tuple[
     moments = _moments(fit.frame, value)
     miss = _ROUND - views.deviation(moments)
     changes = _tangents(fit.frame, moments)
-    slope = np.stack([views.deviation(changes[:, i]) for i in range(6)], -1)
+    slope = views.deviation(changes)
     body, odd = slope[..., :4], slope[..., 4:]
     normal = np.linalg.inv(body.mT @ (weight[..., None] * body) + np.diag(_LOOSE))
 
@@ -375,12 +387,12 @@ def _excess_variance(squares: Array, expected: Array, gain: Array) -> float:
     return excess
 
 
-def _scattered(found: Spheroids, good: Bools) -> Spheroids:
-    """Rows of the good outlines among all, NaN for the others."""
+def _scattered(found: list[Spheroids], rows: NDArray[Any], count: int) -> Spheroids:
+    """Bodies in their rows among all, NaN in the others."""
     parts = []
     for name in Spheroids.__annotations__:
-        values = getattr(found, name)
-        out = np.full((len(good), *values.shape[1:]), np.nan)
-        out[good] = values
+        values = np.concatenate([getattr(piece, name) for piece in found])
+        out = np.full((count, *values.shape[1:]), np.nan)
+        out[rows] = values
         parts.append(out)
     return Spheroids(*parts)

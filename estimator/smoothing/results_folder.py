@@ -15,7 +15,7 @@ from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.smoothing.results_file import StoredTables
 from telerig.estimator.smoothing.smooth import smooth
-from telerig.estimator.tracking.tracks import StoredTracks, Tracks, open_tracks, read_track_table
+from telerig.estimator.tracking.tracks import StoredTracks, Tracks, open_track_table, open_tracks
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import reading, replaced_results
@@ -145,7 +145,7 @@ def read_tracks(path: Path, run: Path) -> tuple[Tracks | StoredTracks | Any, Pat
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), todo="give tracks.csv")
     with reading(path.parent, [path.name]):
-        return read_track_table(path), path
+        return open_track_table(path), path
 
 
 def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list[Path]]:

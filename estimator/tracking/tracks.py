@@ -149,6 +149,12 @@ def open_tracks(folder: str | Path) -> Tracks | StoredTracks:
     return StoredTracks(str(summary.get("run", place.name)), table, detections, summary, references)
 
 
+def open_track_table(file: Path) -> pd.DataFrame | StoredTracks:
+    """Read a table as `read_track_table` does; a large one stays on disk."""
+    table = FrameTable.of(file, partial(_read_part, file, TRACK_COLUMNS), _unseen)
+    return read_track_table(file) if table is None else StoredTracks("", table, None)
+
+
 def _unseen(_part: pd.DataFrame) -> None:
     """Look at nothing."""
 

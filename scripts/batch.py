@@ -47,6 +47,7 @@ def batch(
     shake: options.ShakeModel = None,
     refine_rig: options.RefineRig = False,
     accept: options.AcceptedFaults = None,
+    cluster: options.Cluster = None,
     tracks: options.TracksOfRuns = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
@@ -88,7 +89,8 @@ def batch(
     check_options(calibration, model, medium)
     jobs = jobs_of(
         datasets, calibration=calibration, model=model, medium=medium, shake=shake,
-        refine_rig=refine_rig, accept=accept or (), tracks=tracks, report=report, only=only or (),
+        refine_rig=refine_rig, accept=accept or (), cluster=cluster, tracks=tracks, report=report,
+        only=only or (),
     )  # fmt: skip
     mine = share_of(jobs, index, of)
     places = {job.dataset for job in mine}

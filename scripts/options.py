@@ -85,6 +85,10 @@ AcceptedFaults = Annotated[
         help="Code of a fault of a sensor that is to be used as it is. The refusal names it.",
     ),
 ]
+Cluster = Annotated[
+    str | None,
+    typer.Option(help="Detect bubbles on a Dask cluster; its scheduler, tcp://host:port."),
+]
 Report = Annotated[bool, typer.Option(help="Write report.html.")]
 Quiet = Annotated[bool, typer.Option(help="Print the summary only.")]
 

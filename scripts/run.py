@@ -31,6 +31,7 @@ def run(
     shake: options.ShakeModel = None,
     refine_rig: options.RefineRig = False,
     accept: options.AcceptedFaults = None,
+    cluster: options.Cluster = None,
     tracks: options.TracksOfRuns = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
@@ -50,8 +51,8 @@ def run(
     check_options(calibration, model, medium)
     jobs = jobs_of(
         [dataset], calibration=calibration, only=only or (), model=model, medium=medium,
-        shake=shake, refine_rig=refine_rig, accept=accept or (), tracks=tracks, report=report,
-        strict=True,
+        shake=shake, refine_rig=refine_rig, accept=accept or (), cluster=cluster, tracks=tracks,
+        report=report, strict=True,
     )  # fmt: skip
     records: dict[str, dict[str, Any]] = {}
     for job in jobs:

@@ -41,10 +41,7 @@ def track(
         str | None,
         typer.Option(help="Track only the first frames, for a first look: 0:500 [all]."),
     ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(help="Detect bubbles on a Dask cluster; its scheduler, tcp://host:port."),
-    ] = None,
+    cluster: options.Cluster = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:

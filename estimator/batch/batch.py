@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from graphlib import TopologicalSorter
@@ -203,10 +203,12 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
         "command": "run", "options": {"min_diameter_px": options.min_diameter_px}, "inputs": files,
         "again": job.command,
     }  # fmt: skip
-    summary = write_tracking(
-        load_run(run), calibration, job.results, options=options, record=record,
-        report=job.report, stage=stage,
-    )  # fmt: skip
+    chosen = dask_executor(job.cluster, "--cluster") if job.cluster else nullcontext()
+    with chosen as executor:
+        summary = write_tracking(
+            load_run(run), calibration, job.results, options=options, record=record,
+            report=job.report, stage=stage, executor=executor,
+        )  # fmt: skip
     figures = {name: summary[name] for name in ("frames", "detections", "points", "tracks")}
     words = tracking_words(summary, time.perf_counter() - begun)
     return {"status": DONE, "words": words, "figures": figures}

@@ -32,6 +32,7 @@ class Job:
 
     run : "" for a calibration. calibration : file for all runs; "" for the dataset's own. model,
     medium : of a calibration. shake, refine_rig, accept : of a smoothing, see `telerig.smooth`.
+    cluster : address of the Dask scheduler whose workers detect bubbles; "" for this computer.
     tracks : tracks.csv or its folder; "" for the results folder. report : write report.html.
     only_report : do nothing else. needs : names of jobs to be done before.
     """
@@ -45,6 +46,7 @@ class Job:
     shake: str = "auto"
     refine_rig: bool = False
     accept: tuple[str, ...] = ()
+    cluster: str = ""
     tracks: str = ""
     report: bool = True
     only_report: bool = False
@@ -85,6 +87,8 @@ class Job:
             words += ["--calibration", self.calibration]
         if self.kind == "calibrate":
             words += [f"--model={self.model}", f"--medium={self.medium}"]
+        if self.kind == "track" and self.cluster:
+            words += ["--cluster", self.cluster]
         if self.kind == "smooth":
             words += self._smoothing_options()
         return shlex.join(words if self.report else [*words, "--no-report"])
@@ -115,6 +119,7 @@ def jobs_of(
     shake: str = "auto",
     refine_rig: bool = False,
     accept: Sequence[str] = (),
+    cluster: str | None = None,
     tracks: Path | None = None,
     report: bool = True,
     only: Sequence[str] = (),
@@ -140,6 +145,7 @@ def jobs_of(
         "shake": shake,
         "refine_rig": refine_rig,
         "accept": tuple(accept),
+        "cluster": cluster or "",
         "report": report,
     }
     jobs: list[Job] = []
@@ -286,12 +292,12 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
 
 
 def fingerprint(job: Job) -> str:
-    """Return a hash of what the result of a job depends on, its report aside: version, options,
+    """Return a hash of what the result of a job depends on, not its report: version, options,
     inputs.
 
     Recorded files enter by size and time of change, calibrations and tracks by their content.
     """
-    stated = replace(job, report=True, only_report=False)
+    stated = replace(job, report=True, only_report=False, cluster="")
     hashed = hashlib.sha256(f"{VERSION} {stated.as_json()}".encode())
     place = Path(job.dataset)
     listed = [place / "rig.toml"]

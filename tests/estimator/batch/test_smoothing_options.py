@@ -140,3 +140,17 @@ def test_one_folder_for_two_runs_is_refused(tracked: Path, tmp_path: Path) -> No
     said = command(f"telerig batch {tracked} --tracks {tmp_path} --out {tmp_path}/b", code=2)
     assert "add --only smooth" in said
     assert not list(tmp_path.iterdir())
+
+
+def test_a_cluster_is_named_where_runs_are_tracked(data: Path) -> None:
+    from telerig.estimator.batch.batch import do_job
+    from telerig.estimator.batch.jobs import fingerprint
+
+    address = "tcp://127.0.0.1:1"
+    here, there = (jobs_of([data], only=["track"], cluster=c) for c in (None, address))
+    assert all(job.command.endswith(f"--cluster {address}") for job in there)
+    assert [fingerprint(job) for job in here] == [fingerprint(job) for job in there]
+    assert Job.from_json(there[0].as_json()) == there[0]
+    with pytest.raises(InputError, match="Dask"):
+        do_job(there[0], None)
+    command(f"telerig run {data} --only track --cluster {address} --quiet", code=1)

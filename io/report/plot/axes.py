@@ -48,10 +48,13 @@ def finite(*columns: Array) -> list[Array]:
 
 
 def height_and_sides(table: pd.DataFrame, pattern: str, y_up: bool) -> list[tuple[str, Array]]:
-    """(name, values) of three components for drawing: both horizontal ones, then the vertical.
+    """(name, values) of three components for drawing: both horizontal ones, then the vertical, in
+    an order that is right-handed, so that helices keep their sense.
 
     pattern : of the columns' names, like "{}_mm". y_up : the vertical is the height, -y, which is
     positive upwards; otherwise y, which points down in the frame of a camera that stands upright.
     """
     x, y, z = columns_of(table, *(pattern.format(a) for a in "xyz"), made_by="trajectories")
-    return [("x", x), ("z", z), ("height" if y_up else "y", -y if y_up else y)]
+    if y_up:
+        return [("x", x), ("z", z), ("height", -y)]
+    return [("z", z), ("x", x), ("y", y)]

@@ -70,6 +70,8 @@ def path(
     for side, (name, _) in zip("xyz", named):
         getattr(axes, f"set_{side}label")(f"{name} / mm")
     axes.set_aspect("equal")
+    for side in "xy":
+        axes.locator_params(axis=side, nbins=4)
     return axes
 
 
@@ -195,7 +197,7 @@ def spectra(
     y_up : the vertical is called height. Raises InputError for tracks below 32 frames.
     """
     found = velocity_density(trajectories, kind)
-    axes = axes_of(axes, xlabel="Hz", ylabel="(mm/s)²/Hz", yscale="log")
+    axes = axes_of(axes, xlabel="frequency / Hz", ylabel="(mm/s)²/Hz", yscale="log")
     for i, name in enumerate(("x", "height" if y_up else "y", "z")):
         axes.plot(found[0][1:], found[1][1:, i], color=COLOURS[i], linewidth=1.0, label=name)
     return axes

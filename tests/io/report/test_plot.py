@@ -54,6 +54,12 @@ def test_a_path_rises_on_the_screen() -> None:
     assert axes.get_zlabel() == "height / mm"
     down = telerig.plot.path(frames(), y_up=False)
     assert np.allclose(down.get_lines()[0].get_data_3d()[2], frames()["y_mm"])
+    for chosen in (axes, down):  # a right-handed helix stays one
+        names = [getattr(chosen, f"get_{side}label")().split()[0] for side in "xyz"]
+        turned = [
+            {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "height": (0, -1, 0)}[n] for n in names
+        ]
+        assert np.linalg.det(turned) == pytest.approx(1)
     assert len(telerig.plot.path(frames(), particles=[9]).get_lines()) == 0
     coloured = telerig.plot.path(frames(), colour_by="slip_mm_s")
     assert coloured.figure.axes[-1].get_ylabel() == "slip_mm_s"

@@ -61,6 +61,7 @@ def drag_picture(results: SmoothingResults) -> Picture | None:
         return None
     with drawing(3.4) as sheet:
         plot.drag(results.bubble_summary, results.file.fluid or None, axes=sheet.axes)
+        sheet.axes.locator_params(axis="x", nbins=5, prune="upper")
         _legend_below(sheet)
     caption = (
         "Drag coefficient from the balance of buoyancy, added mass and acceleration; lines: "
@@ -127,7 +128,7 @@ def swarm_figures(results: SmoothingResults) -> list[Figure]:
     where = f"{number(1e-3 * swarm['volume_mm3'], 3)} cm³, mean of {frames} frames"
     return [
         Figure("Void fraction", f"{value('void_fraction', 100)} %", f"gas per volume; {where}"),
-        Figure("Bubbles", f"{value('number_per_cm3')} per cm³", "number density"),
+        Figure("Number density", value("number_per_cm3"), "bubbles per cm³"),
         Figure("Sauter mean", f"{value('d32_mm')} mm",
                f"volume over surface; mean diameter {value('d10_mm')} mm"),
         Figure("Gas flux", f"{value('gas_flux_mm_s')} mm/s", "volume of gas upwards per area"),
@@ -135,11 +136,10 @@ def swarm_figures(results: SmoothingResults) -> list[Figure]:
 
 
 HEADS = [
-    "bubble", "frames", "d, mm", "aspect", "rise, mm/s", "zigzag, Hz", "zigzag, mm", "Re", "Eo",
-    "drag",
+    "bubble", "frames", "d, mm", "aspect", "rise, mm/s", "zigzag, Hz", "zigzag, mm", "Re", "drag",
 ]  # fmt: skip
 _COLUMNS = (
-    "d_eq_mm", "aspect", "rise_mm_s", "zigzag_hz", "zigzag_mm", "reynolds", "eotvos", "drag",
+    "d_eq_mm", "aspect", "rise_mm_s", "zigzag_hz", "zigzag_mm", "reynolds", "drag",
 )  # fmt: skip
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from typing import Any
@@ -30,6 +29,7 @@ from telerig.estimator.bubbles.outline.blobs import (
     noise_share,
     split_blobs,
 )
+from telerig.estimator.bubbles.outline.crowds import resolved, resolved_everywhere, settled
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     DETECTION_COLUMNS,
     HARMONIC_COLUMNS,
@@ -53,6 +53,8 @@ __all__ = [
 _MAX_AXIS_RATIO, _LEAST_AXIS_PX = 3.0, 1.0
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
+_DEFOCUS_SHARE = 0.15
+"""Against the radius, an edge narrower than this is sharp."""
 _SMALL_EDGES = 3.0
 _MOSTLY_SEEN = 0.6
 _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
@@ -68,8 +70,7 @@ class Bubbles:
         if it was not measured.
     reason : why there are no bubbles, in words; empty if there are some.
     field : (rows, columns) where bubbles were looked for; None for the whole image.
-    clusters : by row of ``accepted``, the outline (n, 2) in px of a dark region that is no ellipse
-        and could not be divided into bubbles.
+    clusters : outlines (n, 2) in px of dark regions that are no bubble and could not be divided.
     """
 
     accepted: pd.DataFrame
@@ -77,7 +78,7 @@ class Bubbles:
     noise: float
     reason: str
     field: Bools | None = None
-    clusters: Mapping[int, Array] = dataclass_field(default_factory=dict)
+    clusters: list[Array] = dataclass_field(default_factory=list)
 
     @property
     def rejected(self) -> pd.DataFrame:
@@ -122,11 +123,15 @@ def find_bubbles(
     field: Bools | None = None,
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
+    everywhere: bool = False,
 ) -> Bubbles:
     """Find all bubbles like :func:`detect_bubbles`, and return the rejected shadows as well.
 
     field : (rows, columns) where bubbles are looked for. Without it and without a background, a
         dark surround of the lit screen is found and left out.
+    everywhere : look for the rims of bubbles in the whole image, which takes some 2 s for a
+        megapixel, and not only in dark regions that are no single outline. This finds faint bubbles
+        and those in front of others; no row is then ``merged``.
 
     The other arguments and the errors are those of :func:`detect_bubbles`.
     """
@@ -139,7 +144,7 @@ def find_bubbles(
     if field is not None:
         background = screen_of_field(image, field) if background is None else background
         image = np.where(field, image, background).astype(image.dtype, copy=False)
-    found = _found(image, background, field, min_diameter_px, min_contrast)
+    found = _found(image, background, field, min_diameter_px, min_contrast, everywhere)
     return replace(found, field=field)
 
 
@@ -149,6 +154,7 @@ def _found(
     field: Bools | None,
     min_diameter_px: float,
     min_contrast: float,
+    everywhere: bool,
 ) -> Bubbles:
     ratio, clipped = normalised(image, background)
     sigma = max(noise_share(ratio, field), 1e-4)
@@ -156,13 +162,22 @@ def _found(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
     parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
-    parts, slender = _without_slender(parts)
+    look = resolved_everywhere if everywhere else resolved
+    crowds = look(
+        ratio, sigma, blobs, parts, min_diameter_px=min_diameter_px, min_contrast=min_contrast
+    )
+    blobs = crowds.blobs
+    parts, slender = _without_slender(crowds.parts)
     rejected += slender
     if not parts:
-        return _bubbles({}, rejected, sigma, "no shadow dark and large enough")
+        nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
+        return replace(nothing, clusters=crowds.clusters)
     dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
+    if crowds.rims is not None:
+        last = np.arange(len(parts) - len(crowds.rims), len(parts))
+        outlines = settled(outlines, crowds.rims, last)
     columns = _columns(outlines, parts, image.shape, field, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])
@@ -175,9 +190,7 @@ def _found(
     ]
     kept_columns = {name: values[kept] for name, values in columns.items()}
     reason = "" if np.any(kept) else "no shadow has a bubble's outline"
-    whole = [parts[i] for i in np.flatnonzero(kept)]
-    clusters = {i: blobs[p.blob].contour_px for i, p in enumerate(whole) if p.merged}
-    return replace(_bubbles(kept_columns, rejected, sigma, reason), clusters=clusters)
+    return replace(_bubbles(kept_columns, rejected, sigma, reason), clusters=crowds.clusters)
 
 
 def load_compiled_loops() -> None:
@@ -307,12 +320,15 @@ def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
     merged: Bools = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
     blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
     suspect = np.array([part.blob in blobs for part in parts])
-    return merged | (suspect & (outlines.coverage < _MOSTLY_SEEN))
+    merged |= suspect & (outlines.coverage < _MOSTLY_SEEN)
+    return np.asarray(merged & ~np.array([part.rim for part in parts]))
 
 
 def _defocused(outlines: Outlines) -> Bools:
     sharp = float(np.quantile(outlines.blur_px, 0.25))
-    return np.asarray(outlines.blur_px > max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX))
+    least = max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX)
+    radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
+    return np.asarray(outlines.blur_px > np.maximum(least, _DEFOCUS_SHARE * radius))
 
 
 def _reasons(

@@ -67,7 +67,7 @@ def write_bubbles(
         image = read_image(file)
         shape = (image.shape[0], image.shape[1])
         field = described_field(shape, region_px, mask, f"--region, {file.name}")
-        bubbles = find_bubbles(image, field=field, min_diameter_px=min_diameter_px)
+        bubbles = find_bubbles(image, field=field, min_diameter_px=min_diameter_px, everywhere=True)
         _draw(image, bubbles, folder / "overlays" / f"{file.stem}.jpg")
         found.append(_found(file.stem, bubbles))
         words.append(found[-1].words)
@@ -79,12 +79,11 @@ def write_bubbles(
 
 
 def _found(name: str, bubbles: Bubbles) -> Found:
-    rows, clusters = bubbles.accepted, bubbles.clusters
-    single = rows.drop(index=list(clusters))
+    single, clusters = bubbles.accepted.copy(), bubbles.clusters
     single.insert(0, "image", name)
     corners = [
         pd.DataFrame({"image": name, "cluster": number, "u_px": line[:, 0], "v_px": line[:, 1]})
-        for number, line in enumerate(_closed(outline) for outline in clusters.values())
+        for number, line in enumerate(_closed(outline) for outline in clusters)
     ]
     table = pd.concat(corners) if corners else pd.DataFrame(columns=list(CLUSTER_COLUMNS))
     words = f"{name}: {_count(len(single), 'bubble')}, {_count(len(clusters), 'cluster')}"
@@ -115,11 +114,13 @@ def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
     from telerig.io.report.overlays import draw_bubble_overlay
 
     outlines, words, colours = [], [], []
-    for index, row in bubbles.accepted.iterrows():
-        cluster = bubbles.clusters.get(int(str(index)))
-        outlines.append(outline_points(row, _OUTLINE_POINTS) if cluster is None else cluster)
-        words.append("" if cluster is None else "not resolved")
-        colours.append(_BUBBLE if cluster is None else _CLUSTER)
+    for _, row in bubbles.accepted.iterrows():
+        outlines.append(outline_points(row, _OUTLINE_POINTS))
+        words.append("")
+        colours.append(_BUBBLE)
+    outlines += bubbles.clusters
+    words += ["not resolved"] * len(bubbles.clusters)
+    colours += [_CLUSTER] * len(bubbles.clusters)
     places = bubbles.rejected[["u_px", "v_px", "radius_px"]].to_numpy(float).tolist()
     marks = [(u, v, r, str(why)) for (u, v, r), why in zip(places, bubbles.rejected["reason"])]
     if bubbles.field is not None:
@@ -129,7 +130,7 @@ def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
         outlines += [np.asarray(edge[:, 0], float) for edge in edges]
         words += ["the field"] * len(edges)
         colours += [(90, 160, 250)] * len(edges)
-    single, clusters = len(bubbles.accepted) - len(bubbles.clusters), len(bubbles.clusters)
+    single, clusters = len(bubbles.accepted), len(bubbles.clusters)
     found = f"{_count(single, 'bubble')}, {_count(clusters, 'cluster')}"
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks, found=found)
     path.parent.mkdir(parents=True, exist_ok=True)

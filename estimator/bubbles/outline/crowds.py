@@ -1,0 +1,261 @@
+"""Bubbles where dark regions are no single outlines, and what is left of these regions.
+
+In: the blobs of an image. Out: the bubbles that their rims show (`rims`), each as a blob of its
+own, and the outlines of what could not be divided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.arrays import Array, Bools, Float32
+from telerig.estimator.bubbles.outline.blobs import (
+    Blob,
+    Part,
+    contour_moments,
+    implausible_outlines,
+)
+from telerig.estimator.bubbles.outline.ellipse_geometry import Index
+from telerig.estimator.bubbles.outline.outline_fit import Outlines
+from telerig.estimator.bubbles.outline.rim_kernels import judged
+from telerig.estimator.bubbles.outline.rims import (
+    Rims,
+    are_bubbles,
+    find_rims,
+    refitted,
+    rim_covariance,
+    sole_owners,
+    typical_heart,
+)
+
+_LARGEST_SHARE = 6.0
+"""A bubble of a whole image is at most so many times smaller than it."""
+_MARGIN_PX = 8
+_OPENED, _LEFT_AREA = 0.75, 0.5
+_EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
+_NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
+_LEAST_COVERAGE = 0.3
+_DISAGREE = 1.0
+
+
+@dataclass(frozen=True)
+class Crowds:
+    """Hold the parts of an image's blobs after the rims were looked at.
+
+    blobs, parts : as before, with those that the rims showed behind them.
+    rims : what is known of the last parts, one for each.
+    clusters : outlines (n, 2) in px of dark regions that could not be divided.
+    """
+
+    blobs: list[Blob]
+    parts: list[Part]
+    rims: Rims | None
+    clusters: list[Array]
+
+
+def resolved_everywhere(
+    ratio: Float32,
+    sigma: float,
+    blobs: list[Blob],
+    parts: list[Part],
+    *,
+    min_diameter_px: float,
+    min_contrast: float,
+) -> Crowds:
+    """Look for rims in the whole image; blobs that show none are clusters unless they are single.
+
+    ratio : (rows, columns) grey levels divided by the background; sigma : noise of a pixel.
+    """
+    largest = min(ratio.shape) / _LARGEST_SHARE
+    rims = find_rims(ratio, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
+    rims = _chosen(rims, sigma, ratio, [], min_diameter_px, min_contrast)
+    clusters, explained = [], _explained(ratio.shape, rims.ellipse)
+    single = {part.blob for part in parts if not (part.merged or part.shared)}
+    for index, blob in enumerate(blobs):
+        if index not in single or np.any(_within(blob, rims)):
+            clusters += _left(ratio, blob, explained, min_diameter_px)
+    return Crowds(*_with_rims(blobs, [], rims), rims, clusters)
+
+
+def resolved(
+    ratio: Float32,
+    sigma: float,
+    blobs: list[Blob],
+    parts: list[Part],
+    *,
+    min_diameter_px: float,
+    min_contrast: float,
+) -> Crowds:
+    """Look for rims in the blobs that could not be split.
+
+    What is left of such a blob stays a merged part.
+    """
+    merged = [part.blob for part in parts if part.merged]
+    if not merged:
+        return Crowds(blobs, parts, None, [])
+    found = []
+    for index in merged:
+        x, y, width, height = blobs[index].box
+        left, top = max(x - _MARGIN_PX, 0), max(y - _MARGIN_PX, 0)
+        window = ratio[top : y + height + _MARGIN_PX, left : x + width + _MARGIN_PX]
+        rims = find_rims(
+            window, sigma, min_diameter_px=min_diameter_px,
+            largest_radius_px=0.5 * min(width, height),
+        )  # fmt: skip
+        rims = rims.shifted(left, top)
+        found.append(rims[_within(blobs[index], rims)])
+    whole = [part.ellipse for part in parts if not part.merged]
+    rims = _chosen(Rims.joined(found), sigma, ratio, whole, min_diameter_px, min_contrast)
+    kept, clusters, blobs = [part for part in parts if not part.merged], [], list(blobs)
+    explained = _explained(ratio.shape, rims.ellipse)
+    for part in parts:
+        if not part.merged:
+            continue
+        blob = blobs[part.blob]
+        left_over = [blob.contour_px]
+        if np.any(_within(blob, rims)):
+            left_over = _left(ratio, blob, explained, min_diameter_px)
+            if left_over:
+                largest_one = max(left_over, key=len)
+                blobs[part.blob] = Blob(
+                    largest_one, blob.inner, blob.blur_px, blob.box, blob.touches_border
+                )
+                part = Part(contour_moments([largest_one])[0][0], part.blob, merged=True)
+        if left_over:
+            kept.append(part)
+        clusters += left_over
+    return Crowds(*_with_rims(blobs, kept, rims), rims, clusters)
+
+
+def _chosen(
+    rims: Rims,
+    sigma: float,
+    ratio: Float32,
+    whole: list[Array],
+    min_diameter_px: float,
+    min_contrast: float,
+) -> Rims:
+    """The candidates that are bubbles. whole : ellipses (5,) of bubbles that are clear of others,
+    which tell with the candidates whether bubbles show bright hearts."""
+    rims = rims[sole_owners(rims)]
+    agreement, heart, ellipse = rims.agreement, rims.heart, rims.ellipse
+    if whole:
+        clear = judged(np.ascontiguousarray(ratio), np.stack(whole), sigma)
+        agreement = np.concatenate([agreement, np.mean(clear.agreement, axis=1)])
+        heart = np.concatenate([heart, clear.heart])
+        ellipse = np.concatenate([ellipse, np.stack(whole)])
+    radius = np.sqrt(ellipse[:, 2] * ellipse[:, 3])
+    typical = typical_heart(agreement, heart, radius, min_diameter_px)
+    return refitted(rims[are_bubbles(rims, typical, min_contrast)])
+
+
+def _within(blob: Blob, rims: Rims) -> Bools:
+    outline = _drawn(blob.contour_px)
+    if len(outline) < 3:
+        return np.zeros(len(rims), np.bool_)
+    inside = [
+        cv2.pointPolygonTest(outline, (float(u), float(v)), False) >= 0.0
+        for u, v in rims.ellipse[:, :2]
+    ]
+    return np.array(inside, dtype=np.bool_)
+
+
+def _drawn(contour: Array) -> NDArray[np.float32]:
+    known = contour[np.isfinite(contour[:, 0])]
+    return np.ascontiguousarray(known[:, None], np.float32)
+
+
+def _with_rims(blobs: list[Blob], parts: list[Part], rims: Rims) -> tuple[list[Blob], list[Part]]:
+    own = []
+    for k in range(len(rims)):
+        points = rims.points[k][rims.used[k]]
+        low = np.floor(points.min(axis=0)).astype(int)
+        size = np.ceil(points.max(axis=0)).astype(int) - low + 1
+        box = (max(int(low[0]), 0), max(int(low[1]), 0), int(size[0]), int(size[1]))
+        own.append(Blob(points, float(rims.inner[k]), float(rims.blur_px[k]), box, False))
+    first = len(blobs)
+    found = [Part(e, first + k, rim=True) for k, e in enumerate(rims.ellipse)]
+    return [*blobs, *own], [*parts, *found]
+
+
+def _explained(shape: tuple[int, ...], ellipses: Array) -> NDArray[np.uint8]:
+    """What ellipses (N, 5) and the surroundings of their rims cover of an image is not 0."""
+    covered = np.zeros(shape, np.uint8)
+    for u, v, a, b, angle in ellipses.tolist():
+        margin = _EXPLAINED_SHARE * (a * b) ** 0.5 + _EXPLAINED_PX
+        axes = (2.0 * (a + margin), 2.0 * (b + margin))
+        cv2.ellipse(covered, ((u, v), axes, float(np.rad2deg(angle))), 1, cv2.FILLED)
+    return covered
+
+
+def _left(
+    ratio: Float32, blob: Blob, explained: NDArray[np.uint8], min_diameter_px: float
+) -> list[Array]:
+    """Outlines (n, 2) of the dark parts of a blob that nothing explains."""
+    outline = _drawn(blob.contour_px)
+    if len(outline) < 3:
+        return []
+    x, y, width, height = blob.box
+    box = slice(y, y + height), slice(x, x + width)
+    filled = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(filled, [np.round(outline - [x, y]).astype(np.int32)], 1)
+    dark = (filled > 0) & (explained[box] == 0) & (ratio[box] < 0.5 * (1.0 + blob.inner))
+    disc = max(int(_OPENED * min_diameter_px) | 1, 3)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (disc, disc))
+    opened = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    outlines, _ = cv2.findContours(opened, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    least = _LEFT_AREA * np.pi / 4.0 * min_diameter_px**2
+    return [
+        line[:, 0].astype(np.float64) + [x, y]
+        for line in outlines
+        if cv2.contourArea(line) >= least
+    ]
+
+
+def settled(outlines: Outlines, rims: Rims, index: Index) -> Outlines:
+    """Return the outlines with those of rims corrected where neighbours have misled their fits.
+
+    index : (N,) positions of the N rims in ``outlines``.
+
+    A fit that ended far from its rim, misses it or saw little of it gives way to the ellipse along
+    the rim, with its covariance. Where both are sound but disagree by more than that allows, the
+    disagreement is added to the fit's covariance.
+    """
+    fitted = outlines.taken(index)
+    radius = np.sqrt(rims.ellipse[:, 2] * rims.ellipse[:, 3])
+    away = fitted.ellipse[:, :2] - rims.ellipse[:, :2]
+    growth = np.sqrt(np.abs(fitted.ellipse[:, 2] * fitted.ellipse[:, 3])) / radius
+    with np.errstate(divide="ignore", invalid="ignore"):
+        near = np.hypot(away[:, 0], away[:, 1]) < _NEAR_SHARE * radius + _NEAR_PX
+        near &= np.abs(np.log(growth)) < _GROWTH
+    covariance = rim_covariance(rims)
+    sound = near & (fitted.coverage > _LEAST_COVERAGE) & ~implausible_outlines(fitted)
+    distance = np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away)
+    apart = np.where((distance > _DISAGREE)[:, None, None], away[:, :, None] * away[:, None], 0.0)
+    many, missing = len(rims), np.full(len(rims), np.nan)
+    along = Outlines(
+        ellipse=rims.ellipse,
+        harmonics=np.zeros_like(fitted.harmonics),
+        resolved=np.zeros(many, np.bool_),
+        sigma_px=np.hypot(rims.blur_px, np.sqrt(1.0 / 12.0)),
+        outer=rims.outer,
+        inner=rims.inner,
+        centre_covariance_px2=covariance,
+        sigma_outline_px=missing,
+        chi2_dof=missing,
+        coverage=np.mean(rims.used, axis=1),
+        misfit_px=np.zeros(many),
+        shift_px=np.zeros(many),
+    )
+    result = {}
+    for field in fields(Outlines):
+        old, new = getattr(fitted, field.name), getattr(along, field.name)
+        if field.name == "centre_covariance_px2":
+            old = old + apart
+        keep = sound.reshape(-1, *(1,) * (old.ndim - 1))
+        result[field.name] = np.where(keep, old, new)
+    return outlines.updated(index, Outlines(**result))

@@ -29,7 +29,7 @@ from telerig.estimator.bubbles.outline.blobs import (
     noise_share,
     split_blobs,
 )
-from telerig.estimator.bubbles.outline.crowds import resolved, resolved_everywhere, settled
+from telerig.estimator.bubbles.outline.crowds import resolved_crowd, settled
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     DETECTION_COLUMNS,
     HARMONIC_COLUMNS,
@@ -53,8 +53,8 @@ __all__ = [
 _MAX_AXIS_RATIO, _LEAST_AXIS_PX = 3.0, 1.0
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
-_DEFOCUS_SHARE = 0.15
-"""Against the radius, an edge narrower than this is sharp."""
+_SHARP_SHARE = 0.15
+"""An edge narrower than this against the radius is sharp, in a crowd of bubbles of many sizes."""
 _SMALL_EDGES = 3.0
 _MOSTLY_SEEN = 0.6
 _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
@@ -71,6 +71,8 @@ class Bubbles:
     reason : why there are no bubbles, in words; empty if there are some.
     field : (rows, columns) where bubbles were looked for; None for the whole image.
     clusters : outlines (n, 2) in px of dark regions that are no bubble and could not be divided.
+    covered : share of the image, or of its field, that bubbles and clusters cover; where they
+        overlap it is counted twice.
     """
 
     accepted: pd.DataFrame
@@ -79,6 +81,7 @@ class Bubbles:
     reason: str
     field: Bools | None = None
     clusters: list[Array] = dataclass_field(default_factory=list)
+    covered: float = 0.0
 
     @property
     def rejected(self) -> pd.DataFrame:
@@ -93,6 +96,7 @@ def detect_bubbles(
     background: NDArray[Any] | None = None,
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
+    everywhere: bool = False,
 ) -> pd.DataFrame:
     """Find all bubbles in a backlit grey image.
 
@@ -101,6 +105,7 @@ def detect_bubbles(
         from the image itself, of which a dark surround of the screen is then left out.
     min_diameter_px : least equivalent diameter of a bubble, in px; at least 4.
     min_contrast : least depth of a bubble's shadow, as a share of the background.
+    everywhere : for crowds of bubbles, see :func:`find_bubbles`.
 
     Returns a table with a row for each bubble, in no particular order, and the columns
     DETECTION_COLUMNS. If there is no bubble, the table is empty and its ``attrs["reason"]`` says
@@ -113,6 +118,7 @@ def detect_bubbles(
         background=background,
         min_diameter_px=min_diameter_px,
         min_contrast=min_contrast,
+        everywhere=everywhere,
     ).accepted
 
 
@@ -129,9 +135,9 @@ def find_bubbles(
 
     field : (rows, columns) where bubbles are looked for. Without it and without a background, a
         dark surround of the lit screen is found and left out.
-    everywhere : look for the rims of bubbles in the whole image, which takes some 2 s for a
-        megapixel, and not only in dark regions that are no single outline. This finds faint bubbles
-        and those in front of others; no row is then ``merged``.
+    everywhere : look for the rims of bubbles in the whole image instead of for dark regions. This
+        takes some 2 s for a megapixel, and finds bubbles that touch, overlap, are faint or are in
+        front of others; no row is then ``merged``.
 
     The other arguments and the errors are those of :func:`detect_bubbles`.
     """
@@ -145,7 +151,11 @@ def find_bubbles(
         background = screen_of_field(image, field) if background is None else background
         image = np.where(field, image, background).astype(image.dtype, copy=False)
     found = _found(image, background, field, min_diameter_px, min_contrast, everywhere)
-    return replace(found, field=field)
+    area = float(found.accepted["area_px2"].sum())
+    if everywhere:
+        area += sum(cv2.contourArea(line.astype(np.float32)) for line in found.clusters)
+    looked_at = image.size if field is None else np.count_nonzero(field)
+    return replace(found, field=field, covered=min(area / max(looked_at, 1), 1.0))
 
 
 def _found(
@@ -162,23 +172,31 @@ def _found(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
     parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
-    look = resolved_everywhere if everywhere else resolved
-    crowds = look(
-        ratio, sigma, blobs, parts, min_diameter_px=min_diameter_px, min_contrast=min_contrast
-    )
-    blobs = crowds.blobs
-    parts, slender = _without_slender(crowds.parts)
-    rejected += slender
+    crowd = None
+    if everywhere:
+        crowd = resolved_crowd(
+            ratio, sigma, blobs, parts, min_diameter_px=min_diameter_px, min_contrast=min_contrast
+        )
+        blobs, parts = crowd.blobs, crowd.parts
+        rejected += crowd.rejected
+    else:
+        parts, slender = _without_slender(parts)
+        rejected += slender
+    clusters = crowd.clusters if crowd else [blobs[p.blob].contour_px for p in parts if p.merged]
     if not parts:
         nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
-        return replace(nothing, clusters=crowds.clusters)
+        return replace(nothing, clusters=clusters)
     dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
-    if crowds.rims is not None:
-        last = np.arange(len(parts) - len(crowds.rims), len(parts))
-        outlines = settled(outlines, crowds.rims, last)
-    columns = _columns(outlines, parts, image.shape, field, clipped)
+    if crowd:
+        outlines, merged = settled(outlines, crowd.rims), np.zeros(len(parts), np.bool_)
+    else:
+        merged = _merged(outlines, parts)
+    sharp_share = _SHARP_SHARE if crowd else 0.0
+    defocused = _defocused(outlines, sharp_share)
+    judged = {"defocus": defocused, "merged": merged}
+    columns = _columns(outlines, judged, image.shape, field, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])
     rejected += [
@@ -190,7 +208,7 @@ def _found(
     ]
     kept_columns = {name: values[kept] for name, values in columns.items()}
     reason = "" if np.any(kept) else "no shadow has a bubble's outline"
-    return replace(_bubbles(kept_columns, rejected, sigma, reason), clusters=crowds.clusters)
+    return replace(_bubbles(kept_columns, rejected, sigma, reason), clusters=clusters)
 
 
 def load_compiled_loops() -> None:
@@ -244,7 +262,7 @@ def _start(parts: list[Part], blobs: list[Blob], sigma: float, dark_sigma: float
 
 def _columns(
     outlines: Outlines,
-    parts: list[Part],
+    judged: dict[str, Bools],
     shape: tuple[int, ...],
     field: Bools | None,
     clipped: bool,
@@ -266,7 +284,7 @@ def _columns(
         "edge_px": outlines.blur_px,
         "chi2_dof": outlines.chi2_dof,
         "sigma_outline_px": np.where(outlines.resolved, outlines.sigma_outline_px, np.nan),
-        "flags": _flags(outlines, parts, shape, field, clipped),
+        "flags": _flags(outlines, judged, shape, field, clipped),
     }
     # A half turn of the axes changes the sign of the odd orders.
     turned = np.cos(ellipse[:, 4] - columns["angle_rad"]) < 0.0
@@ -279,7 +297,7 @@ def _columns(
 
 def _flags(
     outlines: Outlines,
-    parts: list[Part],
+    judged: dict[str, Bools],
     shape: tuple[int, ...],
     field: Bools | None,
     clipped: bool,
@@ -294,20 +312,20 @@ def _flags(
         within = cv2.erode(field.astype(np.uint8), np.ones((5, 5), np.uint8))
         beyond |= within[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)] == 0
     border = np.any(beyond, axis=1)
-    hidden = np.zeros(len(parts), dtype=np.bool_)
-    blur, own = outlines.blur_px, np.arange(len(parts))
+    hidden = np.zeros(len(ellipse), dtype=np.bool_)
+    blur, own = outlines.blur_px, np.arange(len(ellipse))
     for index, other in close_pairs(ellipse, ellipse, blur, blur, own):
         gap = rough_distance(ellipse[other], rim[index, :, 0], rim[index, :, 1])
         hidden[index] |= bool(np.any(gap < 0.0))
     words = {
         "border": border,
-        "defocus": _defocused(outlines),
+        "defocus": judged["defocus"],
         "overlap": hidden,
-        "merged": _merged(outlines, parts),
+        "merged": judged["merged"],
         "small": ellipse[:, 3] < _SMALL_EDGES * np.hypot(outlines.blur_px, 0.29),
-        "saturated": np.full(len(parts), clipped),
+        "saturated": np.full(len(ellipse), clipped),
     }
-    flags = ["|".join(word for word, on in words.items() if on[i]) for i in range(len(parts))]
+    flags = ["|".join(word for word, on in words.items() if on[i]) for i in range(len(ellipse))]
     return np.array(flags, dtype=object)
 
 
@@ -320,15 +338,15 @@ def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
     merged: Bools = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
     blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
     suspect = np.array([part.blob in blobs for part in parts])
-    merged |= suspect & (outlines.coverage < _MOSTLY_SEEN)
-    return np.asarray(merged & ~np.array([part.rim for part in parts]))
+    return merged | (suspect & (outlines.coverage < _MOSTLY_SEEN))
 
 
-def _defocused(outlines: Outlines) -> Bools:
+def _defocused(outlines: Outlines, sharp_share: float) -> Bools:
+    """sharp_share : an edge narrower than this, against the radius, is sharp."""
     sharp = float(np.quantile(outlines.blur_px, 0.25))
     least = max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX)
     radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
-    return np.asarray(outlines.blur_px > np.maximum(least, _DEFOCUS_SHARE * radius))
+    return np.asarray(outlines.blur_px > np.maximum(least, sharp_share * radius))
 
 
 def _reasons(

@@ -19,6 +19,8 @@ from telerig.io.files.csv_table import write_table
 from telerig.io.images.read import Image, read_image
 
 CLUSTER_COLUMNS = ("image", "cluster", "u_px", "v_px")
+COVERED_LIMIT = 0.2
+"""Share of an image that bubbles may cover: up to it four of five are found in rendered swarms."""
 _OUTLINE_POINTS = 64
 _BUBBLE, _CLUSTER = (90, 220, 90), (250, 160, 50)
 
@@ -89,8 +91,11 @@ def _found(name: str, bubbles: Bubbles) -> Found:
     words = f"{name}: {_count(len(single), 'bubble')}, {_count(len(clusters), 'cluster')}"
     if bubbles.reason and not len(single):
         words += f" ({bubbles.reason})"
-    if len(clusters) > len(single):
-        words += "; too dense: most dark regions cannot be divided into bubbles"
+    if bubbles.covered > COVERED_LIMIT:
+        words += (
+            f"; warning: {bubbles.covered:.0%} of the image is covered; beyond {COVERED_LIMIT:.0%} more "
+            "than one bubble in five is missed"
+        )
     if bubbles.field is not None:
         words += f"; {bubbles.field.mean():.0%} of the image is looked at"
     return Found(single[["image", *DETECTION_COLUMNS]], table, words)

@@ -383,13 +383,12 @@ _SHARPEST_ORDER, _WHOLE = 35.0, 0.9
 @dataclass(frozen=True)
 class Part:
     """One bubble of a blob: ``ellipse`` (5,), the blob's index, and whether the blob holds
-    others (``shared``), could not be split (``merged``), or is what a rim showed (``rim``)."""
+    others (``shared``) or could not be split (``merged``)."""
 
     ellipse: Array
     blob: int
     shared: bool = False
     merged: bool = False
-    rim: bool = False
 
 
 def split_blobs(blobs: list[Blob], shape: tuple[int, ...], *, min_diameter_px: float) -> list[Part]:

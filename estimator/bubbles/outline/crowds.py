@@ -1,7 +1,7 @@
-"""Bubbles where dark regions are no single outlines, and what is left of these regions.
+"""Bubbles of a whole image by their rims, and what is left of its dark regions.
 
-In: the blobs of an image. Out: the bubbles that their rims show (`rims`), each as a blob of its
-own, and the outlines of what could not be divided.
+In: an image and its blobs. Out: the bubbles that rims show (`rims`), each as a blob of its own, and
+the outlines of dark regions that could not be divided.
 """
 
 from __future__ import annotations
@@ -16,12 +16,10 @@ from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
-    contour_moments,
+    Rejected,
     implausible_outlines,
 )
-from telerig.estimator.bubbles.outline.ellipse_geometry import Index
 from telerig.estimator.bubbles.outline.outline_fit import Outlines
-from telerig.estimator.bubbles.outline.rim_kernels import judged
 from telerig.estimator.bubbles.outline.rims import (
     Rims,
     are_bubbles,
@@ -34,30 +32,31 @@ from telerig.estimator.bubbles.outline.rims import (
 
 _LARGEST_SHARE = 6.0
 """A bubble of a whole image is at most so many times smaller than it."""
-_MARGIN_PX = 8
 _OPENED, _LEFT_AREA = 0.75, 0.5
 _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
 _LEAST_COVERAGE = 0.3
 _DISAGREE = 1.0
+_UNLIKE = "its rim is unlike those of the sharp bubbles"
 
 
 @dataclass(frozen=True)
-class Crowds:
-    """Hold the parts of an image's blobs after the rims were looked at.
+class Crowd:
+    """Hold the bubbles of an image that were found by their rims.
 
-    blobs, parts : as before, with those that the rims showed behind them.
-    rims : what is known of the last parts, one for each.
+    blobs, parts, rims : one of each for every bubble.
     clusters : outlines (n, 2) in px of dark regions that could not be divided.
+    rejected : single dark regions that show no rim like those of the bubbles.
     """
 
     blobs: list[Blob]
     parts: list[Part]
-    rims: Rims | None
+    rims: Rims
     clusters: list[Array]
+    rejected: list[Rejected]
 
 
-def resolved_everywhere(
+def resolved_crowd(
     ratio: Float32,
     sigma: float,
     blobs: list[Blob],
@@ -65,92 +64,28 @@ def resolved_everywhere(
     *,
     min_diameter_px: float,
     min_contrast: float,
-) -> Crowds:
-    """Look for rims in the whole image; blobs that show none are clusters unless they are single.
+) -> Crowd:
+    """Look for rims in the whole image; dark regions that show none are clusters, unless single.
 
     ratio : (rows, columns) grey levels divided by the background; sigma : noise of a pixel.
+    blobs, parts : the dark regions, and what their outlines tell of the bubbles in them.
     """
     largest = min(ratio.shape) / _LARGEST_SHARE
     rims = find_rims(ratio, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
-    rims = _chosen(rims, sigma, ratio, [], min_diameter_px, min_contrast)
-    clusters, explained = [], _explained(ratio.shape, rims.ellipse)
-    single = {part.blob for part in parts if not (part.merged or part.shared)}
+    rims = rims[sole_owners(rims)]
+    heart = typical_heart(rims, min_diameter_px)
+    rims = refitted(rims[are_bubbles(rims, heart, min_contrast)])
+    clusters, rejected, explained = [], [], _explained(ratio.shape, rims.ellipse)
+    single = {part.blob: part.ellipse for part in parts if not (part.merged or part.shared)}
     for index, blob in enumerate(blobs):
         if index not in single or np.any(_within(blob, rims)):
             clusters += _left(ratio, blob, explained, min_diameter_px)
-    return Crowds(*_with_rims(blobs, [], rims), rims, clusters)
-
-
-def resolved(
-    ratio: Float32,
-    sigma: float,
-    blobs: list[Blob],
-    parts: list[Part],
-    *,
-    min_diameter_px: float,
-    min_contrast: float,
-) -> Crowds:
-    """Look for rims in the blobs that could not be split.
-
-    What is left of such a blob stays a merged part.
-    """
-    merged = [part.blob for part in parts if part.merged]
-    if not merged:
-        return Crowds(blobs, parts, None, [])
-    found = []
-    for index in merged:
-        x, y, width, height = blobs[index].box
-        left, top = max(x - _MARGIN_PX, 0), max(y - _MARGIN_PX, 0)
-        window = ratio[top : y + height + _MARGIN_PX, left : x + width + _MARGIN_PX]
-        rims = find_rims(
-            window, sigma, min_diameter_px=min_diameter_px,
-            largest_radius_px=0.5 * min(width, height),
-        )  # fmt: skip
-        rims = rims.shifted(left, top)
-        found.append(rims[_within(blobs[index], rims)])
-    whole = [part.ellipse for part in parts if not part.merged]
-    rims = _chosen(Rims.joined(found), sigma, ratio, whole, min_diameter_px, min_contrast)
-    kept, clusters, blobs = [part for part in parts if not part.merged], [], list(blobs)
-    explained = _explained(ratio.shape, rims.ellipse)
-    for part in parts:
-        if not part.merged:
-            continue
-        blob = blobs[part.blob]
-        left_over = [blob.contour_px]
-        if np.any(_within(blob, rims)):
-            left_over = _left(ratio, blob, explained, min_diameter_px)
-            if left_over:
-                largest_one = max(left_over, key=len)
-                blobs[part.blob] = Blob(
-                    largest_one, blob.inner, blob.blur_px, blob.box, blob.touches_border
-                )
-                part = Part(contour_moments([largest_one])[0][0], part.blob, merged=True)
-        if left_over:
-            kept.append(part)
-        clusters += left_over
-    return Crowds(*_with_rims(blobs, kept, rims), rims, clusters)
-
-
-def _chosen(
-    rims: Rims,
-    sigma: float,
-    ratio: Float32,
-    whole: list[Array],
-    min_diameter_px: float,
-    min_contrast: float,
-) -> Rims:
-    """The candidates that are bubbles. whole : ellipses (5,) of bubbles that are clear of others,
-    which tell with the candidates whether bubbles show bright hearts."""
-    rims = rims[sole_owners(rims)]
-    agreement, heart, ellipse = rims.agreement, rims.heart, rims.ellipse
-    if whole:
-        clear = judged(np.ascontiguousarray(ratio), np.stack(whole), sigma)
-        agreement = np.concatenate([agreement, np.mean(clear.agreement, axis=1)])
-        heart = np.concatenate([heart, clear.heart])
-        ellipse = np.concatenate([ellipse, np.stack(whole)])
-    radius = np.sqrt(ellipse[:, 2] * ellipse[:, 3])
-    typical = typical_heart(agreement, heart, radius, min_diameter_px)
-    return refitted(rims[are_bubbles(rims, typical, min_contrast)])
+        else:
+            u, v, a, b, _ = single[index].tolist()
+            rejected.append(Rejected(u, v, (a * b) ** 0.5, _UNLIKE))
+    own = [_blob(rims, k) for k in range(len(rims))]
+    found = [Part(ellipse, k) for k, ellipse in enumerate(rims.ellipse)]
+    return Crowd(own, found, rims, clusters, rejected)
 
 
 def _within(blob: Blob, rims: Rims) -> Bools:
@@ -169,17 +104,12 @@ def _drawn(contour: Array) -> NDArray[np.float32]:
     return np.ascontiguousarray(known[:, None], np.float32)
 
 
-def _with_rims(blobs: list[Blob], parts: list[Part], rims: Rims) -> tuple[list[Blob], list[Part]]:
-    own = []
-    for k in range(len(rims)):
-        points = rims.points[k][rims.used[k]]
-        low = np.floor(points.min(axis=0)).astype(int)
-        size = np.ceil(points.max(axis=0)).astype(int) - low + 1
-        box = (max(int(low[0]), 0), max(int(low[1]), 0), int(size[0]), int(size[1]))
-        own.append(Blob(points, float(rims.inner[k]), float(rims.blur_px[k]), box, False))
-    first = len(blobs)
-    found = [Part(e, first + k, rim=True) for k, e in enumerate(rims.ellipse)]
-    return [*blobs, *own], [*parts, *found]
+def _blob(rims: Rims, k: int) -> Blob:
+    points = rims.points[k][rims.used[k]]
+    low = np.maximum(np.floor(points.min(axis=0)), 0.0).astype(int)
+    width, height = (np.ceil(points.max(axis=0)).astype(int) - low + 1).tolist()
+    box = (int(low[0]), int(low[1]), width, height)
+    return Blob(points, float(rims.inner[k]), float(rims.blur_px[k]), box, False)
 
 
 def _explained(shape: tuple[int, ...], ellipses: Array) -> NDArray[np.uint8]:
@@ -216,16 +146,13 @@ def _left(
     ]
 
 
-def settled(outlines: Outlines, rims: Rims, index: Index) -> Outlines:
-    """Return the outlines with those of rims corrected where neighbours have misled their fits.
-
-    index : (N,) positions of the N rims in ``outlines``.
+def settled(fitted: Outlines, rims: Rims) -> Outlines:
+    """Return the fitted outlines of N rims, corrected where neighbours have misled the fits.
 
     A fit that ended far from its rim, misses it or saw little of it gives way to the ellipse along
     the rim, with its covariance. Where both are sound but disagree by more than that allows, the
     disagreement is added to the fit's covariance.
     """
-    fitted = outlines.taken(index)
     radius = np.sqrt(rims.ellipse[:, 2] * rims.ellipse[:, 3])
     away = fitted.ellipse[:, :2] - rims.ellipse[:, :2]
     growth = np.sqrt(np.abs(fitted.ellipse[:, 2] * fitted.ellipse[:, 3])) / radius
@@ -258,4 +185,4 @@ def settled(outlines: Outlines, rims: Rims, index: Index) -> Outlines:
             old = old + apart
         keep = sound.reshape(-1, *(1,) * (old.ndim - 1))
         result[field.name] = np.where(keep, old, new)
-    return outlines.updated(index, Outlines(**result))
+    return Outlines(**result)

@@ -26,7 +26,7 @@ class Judged(NamedTuple):
     """Hold what the image shows along the rims of N ellipses.
 
     agreement : (N, RAYS) largest cosine of the angle between gradient and outward normal near the
-        rim; small where the gradient is no larger than the noise.
+        rim; small where the gradient is no larger than the noise; NaN beyond the image.
     places : (N, RAYS, 2) where that is (px).
     fall : (N, RAYS) how much darker it is within the rim than outside, as a share of the latter.
     inner, outer : (N,) median grey level within the rim and outside.
@@ -176,7 +176,8 @@ def judged(image: Float32, ellipse: Array, floor: float) -> Judged:
                 if cosine > best:
                     best, place = cosine, away
                 steep[k] = max(steep[k], outwards)
-            agreement[n, k] = best
+            seen = -0.5 <= u <= image.shape[1] - 0.5 and -0.5 <= v <= image.shape[0] - 0.5
+            agreement[n, k] = best if seen else np.nan
             places[n, k, 0], places[n, k, 1] = u + place * normal_u, v + place * normal_v
             within[k], beyond[k] = 1e9, 0.0
             for i in range(1, _DEPTHS + 1):
@@ -212,12 +213,12 @@ def judged(image: Float32, ellipse: Array, floor: float) -> Judged:
 
 
 @compiled
-def owners(order: Ints, ellipse: Array, places: Array, strong: Bools, least: float) -> Bools:
+def owners(order: Ints, ellipse: Array, places: Array, strong: Bools, least: Array) -> Bools:
     """Choose ellipses one after the other; a place at a rim belongs to the first that has it.
 
     order : (N,) the best first; ellipse : (N, 5).
     places : (N, RAYS, 2) places at the rims (px); strong : (N, RAYS) where a rim is seen.
-    least : share of an ellipse's rim that has to be seen and to belong to no other.
+    least : (N,) number of places that have to be seen and to belong to no other.
 
     Returns (N,) which are chosen.
     """
@@ -225,7 +226,7 @@ def owners(order: Ints, ellipse: Array, places: Array, strong: Bools, least: flo
     before, many = np.empty(order.size, dtype=np.int64), 0
     for n in order:
         own = strong[n].copy()
-        if np.sum(own) < least * RAYS:
+        if np.sum(own) < least[n]:
             continue
         radius = np.sqrt(ellipse[n, 2] * ellipse[n, 3])
         for i in range(many):
@@ -243,7 +244,7 @@ def owners(order: Ints, ellipse: Array, places: Array, strong: Bools, least: flo
                     far = np.sqrt(x * x + y * y) + 1e-12
                     slope = np.sqrt((x / other[2]) ** 2 + (y / other[3]) ** 2) + 1e-12
                     own[k] = abs(far - 1.0) * far / slope >= reach
-        if np.sum(own) >= least * RAYS:
+        if np.sum(own) >= least[n]:
             chosen[n] = True
             before[many] = n
             many += 1

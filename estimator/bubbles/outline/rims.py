@@ -35,7 +35,7 @@ _PASSES = ((0, 0.45, 0.1), (0, 0.25, 0.1), (1, 0.15, 0.1), (2, 0.1, 0.02), (2, 0
 _SEEN_STRENGTH, _LEAST_SEEN = 0.33, 10
 _LONGEST, _LARGEST_CHANGE, _LARGEST_SHIFT = 2.0, 1.8, 0.6
 _STRONG, _LEAST_FALL = 0.6, 0.15
-_OWN_SHARE, _OWN_PX, _OWN_RADII = 0.5, 2.0, 0.15
+_OWN_SHARE, _OWN_PX, _OWN_RADII, _LEAST_INSIDE = 0.5, 2.0, 0.15, 0.5
 _WITH_HEARTS, _WITHOUT_HEARTS = 0.68, 0.85
 _HEART_WEIGHT, _UNEVEN_WEIGHT, _FULL_HEART = 0.5, 0.33, 0.6
 _LARGE_SHARE, _SURE, _SURE_SHARE, _HEARTS_SHOW = 0.75, 0.9, 0.8, 0.75
@@ -51,7 +51,8 @@ class Rims:
     points : (N, RAYS, 2) places on the rims (px); used : (N, RAYS) those the ellipse was fitted to.
     places : (N, RAYS, 2) where the gradient near the ellipse points outwards best (px).
     strong : (N, RAYS) whether a rim is seen there.
-    agreement : (N,) share of the rim that is seen, weighted with the cosine to the gradient.
+    inside : (N,) share of the rim that lies within the image.
+    agreement : (N,) share of that which is seen, weighted with the cosine to the gradient.
     depth : (N,) how much darker the ring is than what surrounds it, as a share of the latter.
     heart : (N,) how much brighter the middle is than the ring, as the same share.
     unevenness : (N,) departures of the ring's level, as a share of what it is darker.
@@ -63,6 +64,7 @@ class Rims:
     used: Bools
     places: Array
     strong: Bools
+    inside: Array
     agreement: Array
     depth: Array
     heart: Array
@@ -76,22 +78,6 @@ class Rims:
 
     def __getitem__(self, index: Index | Bools) -> Rims:
         return Rims(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    @staticmethod
-    def joined(parts: list[Rims]) -> Rims:
-        """Return the candidates of several lists in one."""
-        names = [field.name for field in fields(Rims)]
-        return Rims(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
-
-    def shifted(self, u_px: float, v_px: float) -> Rims:
-        """Return the candidates of a part of an image in pixels of the whole one."""
-        by = np.array([u_px, v_px])
-        return replace(
-            self,
-            ellipse=self.ellipse + np.concatenate([by, np.zeros(3)]),
-            points=self.points + by,
-            places=self.places + by,
-        )
 
 
 def find_rims(
@@ -204,36 +190,36 @@ def measured_rims(calm: Float32, sigma: float, ellipse: Array, points: Array, us
     """Return what an image, slightly blurred, shows along the rims of ellipses (N, 5)."""
     seen = rim_kernels.judged(calm, ellipse, _NOISE_SLOPE * sigma)
     strong = (seen.agreement > _STRONG) & (seen.fall > _LEAST_FALL)
+    inside = np.isfinite(seen.agreement)
+    agreement = np.sum(seen.agreement, axis=1, where=inside, initial=0.0)
+    agreement /= np.maximum(np.sum(inside, axis=1), 1)
     edge = (seen.outer - seen.inner) / (np.sqrt(2.0 * np.pi) * np.maximum(seen.slope, 1e-6))
     blur = np.sqrt(np.maximum(edge**2 - _CALM_CELLS**2 - 0.25, 0.1))
     return Rims(
-        *(ellipse, points, used, seen.places, strong, np.mean(seen.agreement, axis=1)),
+        *(ellipse, points, used, seen.places, strong, np.mean(inside, axis=1), agreement),
         *(seen.depth, seen.heart, seen.unevenness, seen.inner, seen.outer, blur),
     )
 
 
-def typical_heart(
-    agreement: Array, heart: Array, radius_px: Array, min_diameter_px: float
-) -> float:
+def typical_heart(rims: Rims, min_diameter_px: float) -> float:
     """Return how bright the hearts of an image's bubbles are, 0 where they show none.
-
-    agreement, heart, radius_px : (N,) of candidates, see `Rims`.
 
     It is the upper quartile among the surest candidates that are not the smallest: some of these
     are out of focus and have none.
     """
-    large = radius_px > _LARGE_SHARE * min_diameter_px
-    if not np.any(large):
+    radius = np.sqrt(rims.ellipse[:, 2] * rims.ellipse[:, 3])
+    large = rims[radius > _LARGE_SHARE * min_diameter_px]
+    if not len(large):
         return 0.0
-    agreement, heart = agreement[large], heart[large]
-    sure = agreement >= min(float(np.quantile(agreement, _SURE_SHARE)), _SURE)
-    return float(np.clip(np.quantile(heart[sure], _HEARTS_SHOW), 0.0, _FULL_HEART))
+    sure = large.agreement >= min(float(np.quantile(large.agreement, _SURE_SHARE)), _SURE)
+    return float(np.clip(np.quantile(large.heart[sure], _HEARTS_SHOW), 0.0, _FULL_HEART))
 
 
 def sole_owners(rims: Rims) -> Index:
     """Return the positions of candidates no two of which claim the same rim, the surest first."""
     order = np.argsort(-rims.agreement, kind="stable")
-    own = rim_kernels.owners(order, rims.ellipse, rims.places, rims.strong, _OWN_SHARE)
+    least = _OWN_SHARE * rim_kernels.RAYS * rims.inside
+    own = rim_kernels.owners(order, rims.ellipse, rims.places, rims.strong, least)
     return np.asarray(order[own[order]])
 
 
@@ -247,7 +233,8 @@ def are_bubbles(rims: Rims, heart: float, min_contrast: float) -> Bools:
     evidence = rims.agreement - _HEART_WEIGHT * np.maximum(heart - rims.heart, 0.0)
     evidence -= _UNEVEN_WEIGHT * np.minimum(rims.unevenness, 1.0)
     least = _WITHOUT_HEARTS + (_WITH_HEARTS - _WITHOUT_HEARTS) * heart / _FULL_HEART
-    return np.asarray((evidence >= least) & (rims.depth >= min_contrast))
+    seen = (rims.inside >= _LEAST_INSIDE) & (rims.depth >= min_contrast)
+    return np.asarray(seen & (evidence >= least))
 
 
 def refitted(rims: Rims) -> Rims:
@@ -288,6 +275,6 @@ def rim_covariance(rims: Rims) -> Array:
     )
     away = centres - np.mean(centres, axis=0)
     spread = np.einsum("sni,snj->nij", away, away) * (_SECTORS - 1.0) / _SECTORS
-    unseen = _UNSEEN_SHARE * np.clip(1.0 - rims.agreement, 0.0, 1.0)
+    unseen = _UNSEEN_SHARE * np.clip(1.0 - rims.agreement * rims.inside, 0.0, 1.0)
     along = unseen**2 * rims.ellipse[:, 2] * rims.ellipse[:, 3] + _LEAST_VARIANCE_PX2
     return np.asarray(_MISLED * spread + along[:, None, None] * np.eye(2))

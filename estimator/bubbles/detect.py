@@ -59,6 +59,10 @@ _SMALL_EDGES = 3.0
 _MOSTLY_SEEN = 0.6
 _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
 
+COVERED_LIMIT, COVERED_LIMIT_EVERYWHERE = 0.1, 0.2
+"""Share of an image that bubbles may cover: up to it four of five are found in rendered swarms, by
+dark regions and by rims (benchmarks/results/real_images.md)."""
+
 
 @dataclass(frozen=True)
 class Bubbles:
@@ -219,6 +223,23 @@ def load_compiled_loops() -> None:
         cv2.circle(image, (u, 32), 14, (20,), cv2.FILLED)
     blurred = cv2.GaussianBlur(image, (0, 0), 1.0)
     find_bubbles(blurred, background=np.full(image.shape, 200.0, np.float32))
+
+
+def is_crowded(covered: float, bubbles: float, limit: float) -> bool:
+    """Return whether bubbles hide each other more than a limit such as `COVERED_LIMIT` allows.
+
+    covered : share of the image that they cover; bubbles : their number. One bubble cannot hide
+        another, however large it is: its own share does not count.
+    """
+    return covered * (1.0 - 1.0 / max(bubbles, 1.0)) > limit
+
+
+def crowded_words(where: str, covered: float) -> str:
+    """Return what to say of a run whose images are crowded."""
+    return (
+        f"{where}: bubbles cover {covered:.0%} of the images; beyond {COVERED_LIMIT:.0%} more than "
+        "one in five is missed or merged with others"
+    )
 
 
 def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:

@@ -12,15 +12,19 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.bubbles.detect import Bubbles, find_bubbles, outline_points
+from telerig.estimator.bubbles.detect import (
+    COVERED_LIMIT_EVERYWHERE,
+    Bubbles,
+    find_bubbles,
+    is_crowded,
+    outline_points,
+)
 from telerig.estimator.bubbles.field import described_field
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.files.csv_table import write_table
 from telerig.io.images.read import Image, read_image
 
 CLUSTER_COLUMNS = ("image", "cluster", "u_px", "v_px")
-COVERED_LIMIT = 0.2
-"""Share of an image that bubbles may cover: up to it four of five are found in rendered swarms."""
 _OUTLINE_POINTS = 64
 _BUBBLE, _CLUSTER = (90, 220, 90), (250, 160, 50)
 
@@ -91,10 +95,11 @@ def _found(name: str, bubbles: Bubbles) -> Found:
     words = f"{name}: {_count(len(single), 'bubble')}, {_count(len(clusters), 'cluster')}"
     if bubbles.reason and not len(single):
         words += f" ({bubbles.reason})"
-    if bubbles.covered > COVERED_LIMIT:
+    found = len(single) + len(clusters)
+    if is_crowded(bubbles.covered, found, COVERED_LIMIT_EVERYWHERE):
         words += (
-            f"; warning: {bubbles.covered:.0%} of the image is covered; beyond {COVERED_LIMIT:.0%} more "
-            "than one bubble in five is missed"
+            f"; warning: bubbles cover {bubbles.covered:.0%} of the image, and beyond "
+            f"{COVERED_LIMIT_EVERYWHERE:.0%} more than one in five is missed"
         )
     if bubbles.field is not None:
         words += f"; {bubbles.field.mean():.0%} of the image is looked at"

@@ -255,8 +255,34 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
     cost = cost_words(run)
     if cost:
         yield Check(f"{what} time", "ok", cost)
+    if run.source == "images":
+        yield from _crowds(run, what)
     yield from _clocks(run, what)
     yield from _sensors(run, what)
+
+
+def _crowds(run: RunData, what: str) -> Iterator[Check]:
+    """Warn when bubbles cover more of a frame in the middle of the run than detection can take."""
+    from telerig.estimator.bubbles.detect import (
+        COVERED_LIMIT,
+        crowded_words,
+        find_bubbles,
+        is_crowded,
+    )
+    from telerig.estimator.tracking.detect_run import described_fields
+
+    try:
+        fields = described_fields(run)
+        for camera in run.cameras:
+            image = run.image(camera, run.frame_count // 2)
+            if image is None:
+                continue
+            found = find_bubbles(image, field=fields.get(camera))
+            if is_crowded(found.covered, len(found.accepted), COVERED_LIMIT):
+                words = crowded_words(f"camera {camera}", found.covered)
+                yield Check(f"{what} bubbles", "warning", words)
+    except TelerigError as error:
+        yield _failure(f"{what} images", error)
 
 
 def _clocks(run: RunData, what: str) -> Iterator[Check]:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.background import methods
+from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
@@ -82,6 +83,7 @@ class TrackingStream:
     marks : marks that were followed in the images; None without a strip of dots.
     linked : the rows, which are computed while they are read.
     detections, points, particles : numbers of detections and points, and ids of tracks, so far.
+    covered : for each camera, number of detections and the area that they cover (px^2), so far.
     """
 
     run: RunData
@@ -94,6 +96,7 @@ class TrackingStream:
     detections: int = 0
     points: int = 0
     particles: set[Any] = field(default_factory=set)
+    covered: dict[str, tuple[int, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._pairs = PairCollector(self.calibration)
@@ -111,6 +114,10 @@ class TrackingStream:
             self.points += len(part.tracks)
             self.particles |= set(part.tracks["particle"])
             self._pairs.add(part.tracks)
+            for camera, areas in part.detections.groupby("camera")["area_px2"]:
+                many, area = self.covered.get(str(camera), (0, 0.0))
+                many, area = many + int(areas.notna().sum()), area + float(areas.sum())
+                self.covered[str(camera)] = many, area
             yield part
 
     def summary(self) -> dict[str, Any]:
@@ -142,7 +149,7 @@ class TrackingStream:
             "shape_sigma": self.linker.shape_sigma,
             "covariance": "Of the measurement. The calibration's share, common to all points, is "
             "not in tracks.csv.",
-            "warnings": _window_warnings(run, self.calibration),
+            "warnings": [*_window_warnings(run, self.calibration), *self._crowded()],
             "notes": list(run.notes),
         }
         if change is not None:
@@ -150,6 +157,18 @@ class TrackingStream:
         if self.marks is not None:
             content["references"] = self.marks.summary
         return content
+
+    def _crowded(self) -> list[str]:
+        """A sentence on each camera in whose images bubbles cover more than detection can take."""
+        found, frames = [], self.run.frame_count
+        for camera, (many, area) in self.covered.items():
+            width, height = self.run.image_sizes_px[camera]
+            fields = self.scene.fields if self.scene is not None else {}
+            looked_at = fields[camera].sum() if camera in fields else width * height
+            share = area / (float(looked_at) * frames)
+            if is_crowded(share, many / frames, COVERED_LIMIT):
+                found.append(crowded_words(f"camera {camera}", share))
+        return found
 
 
 def _window_warnings(run: RunData, calibration: Calibration) -> list[str]:

@@ -228,6 +228,25 @@ def test_images_of_the_wrong_size_are_found(tmp_path):
     assert "6 views" in _of(checks, "views", "note")
 
 
+def test_a_run_with_crowded_images_is_warned_about(tmp_path):
+    """Nine discs cover 17 % of the left images, one large one as much of the right images."""
+    new_dataset(tmp_path / "tank", [NewCamera(n, (200, 200)) for n in ("left", "right")])
+    v, u = np.mgrid[:200, :200]
+    places = {"left": [(i, j) for i in (40, 100, 160) for j in (40, 100, 160)], "right": [(99, 99)]}
+    for camera, radius in (("left", 15.5), ("right", 46.5)):
+        grey = np.full((200, 200), 200.0)
+        for x, y in places[camera]:
+            grey[np.hypot(u - x, v - y) < radius] = 20.0
+        folder = tmp_path / "tank" / "runs" / "swarm" / camera
+        folder.mkdir(parents=True)
+        picture = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.uint8)
+        for frame in range(2):
+            cv2.imwrite(str(folder / f"{frame:06d}.png"), picture)
+    (tmp_path / "tank" / "runs" / "swarm" / "frames.csv").write_text("frame,t_s\n0,0.0\n1,0.01\n")
+    said = _of(list(check_dataset(tmp_path / "tank")), "run swarm bubbles", "warning")
+    assert "camera left: bubbles cover 17%" in said and "beyond 10%" in said
+
+
 def test_the_command_prints_json_and_its_exit_code_says_whether_all_is_well(data, tmp_path):
     good = _asked("doctor", str(data), "--json")
     assert good.exit_code == 0, good.output

@@ -30,8 +30,8 @@ from telerig.estimator.bubbles.outline.rims import (
     typical_heart,
 )
 
-_LARGEST_SHARE = 6.0
-"""A bubble of a whole image is at most so many times smaller than it."""
+_LARGEST_SHARE = 2.5
+"""The image is at least so many times as wide as the largest radius."""
 _OPENED, _LEFT_AREA = 0.75, 0.5
 _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15

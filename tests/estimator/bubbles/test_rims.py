@@ -11,7 +11,7 @@ import pytest
 from places import REAL, ROOT
 
 from telerig.arrays import Array
-from telerig.estimator.bubbles.detect import find_bubbles
+from telerig.estimator.bubbles.detect import find_bubbles, is_crowded
 from telerig.estimator.bubbles.outline.rim_kernels import RAYS, closed_rims, owners
 from telerig.estimator.bubbles.outline.rims import find_rims
 
@@ -139,6 +139,13 @@ def test_noise_is_no_bubble() -> None:
     image = crowd([], 150)
     found = find_bubbles(image, everywhere=True)
     assert found.accepted.empty and found.accepted.attrs["reason"] and not found.clusters
+
+
+def test_what_bubbles_cover_counts_when_they_can_hide_each_other() -> None:
+    one = Drawn((60.0, 60.0, 30.0, 30.0, 0.0), heart=0.4)
+    alone = find_bubbles(crowd([one], 120), everywhere=True)
+    assert abs(alone.covered - np.pi * 30**2 / 120**2) < 0.01
+    assert not is_crowded(alone.covered, 1, 0.1) and is_crowded(alone.covered, 20, 0.1)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real images are not here")

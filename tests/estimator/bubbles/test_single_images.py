@@ -108,6 +108,17 @@ def test_tables_clusters_and_overlays_are_written(tmp_path: Path) -> None:
         write_bubbles([files[0], tmp_path / "other" / "plain.tif"], tmp_path)
 
 
+def test_a_crowded_image_is_warned_about(tmp_path: Path) -> None:
+    image = np.full((240, 240), 200, np.uint8)
+    for u in range(30, 240, 45):
+        for v in range(30, 240, 45):
+            cv2.circle(image, (u, v), 15, 20, cv2.FILLED)
+    cv2.imwrite(str(tmp_path / "crowd.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
+    (words,) = write_bubbles([tmp_path / "crowd.png"], tmp_path / "out")
+    assert words.startswith("crowd: 25 bubbles, 0 clusters; warning: bubbles cover 3")
+    assert "beyond 20% more than one in five is missed" in words
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real images are not here")
 def test_real_bubbles_behind_a_window() -> None:
     """1,014 labelled bubbles; before, the frame around the window was taken for the only one."""

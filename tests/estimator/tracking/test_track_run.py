@@ -195,6 +195,26 @@ def test_a_single_frame_is_a_track_of_one_point(rise: Path, whole: Tracks) -> No
     assert np.allclose(table[names], expected[names], atol=0.05)
 
 
+def test_a_crowded_run_is_warned_about(rise: Path, whole: Tracks) -> None:
+    """Four bubbles in every image, each covering 5 % of it; one as large as all is no crowd."""
+    assert whole.summary["warnings"] == []
+    run = telerig.load_run(rise / "runs" / "rise")
+    width, height = run.image_sizes_px["left"]
+    copies = []
+    for k in range(4):
+        moved = whole.detections.assign(particle=k, area_px2=0.05 * width * height)
+        copies.append(moved.assign(v_px=moved["v_px"] + 40.0 * k))
+    for table, count in (
+        (pd.concat(copies), 2),
+        (copies[0].assign(area_px2=0.2 * width * height), 0),
+    ):
+        tracks = telerig.track(
+            replace(run, detections=table, source="detections"), truth_calibration()
+        )
+        said = [w for w in tracks.summary["warnings"] if "bubbles cover 20%" in w]
+        assert len(said) == count
+
+
 def test_a_run_without_any_bubble_says_so(rise: Path) -> None:
     run = telerig.load_run(rise / "runs" / "rise")
     table = pd.DataFrame({"frame": [0], "camera": ["left"], "u_px": [np.nan], "v_px": [np.nan]})

@@ -26,12 +26,13 @@ from telerig.estimator.bubbles.outline.rims import (
     find_rims,
     refitted,
     rim_covariance,
+    rims_along,
     sole_owners,
     typical_heart,
 )
 
-_LARGEST_SHARE = 2.5
-"""The image is at least so many times as wide as the largest radius."""
+_LARGEST_SHARE = 6.0
+"""The image is so many times as wide as the largest radius of a bubble in a crowd."""
 _OPENED, _LEFT_AREA = 0.75, 0.5
 _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
@@ -72,11 +73,14 @@ def resolved_crowd(
     """
     largest = min(ratio.shape) / _LARGEST_SHARE
     rims = find_rims(ratio, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
+    single = {part.blob: part.ellipse for part in parts if not (part.merged or part.shared)}
+    large = [ellipse for ellipse in single.values() if ellipse[2] * ellipse[3] > largest**2]
+    if large:
+        rims = rims.and_also(rims_along(ratio, sigma, np.stack(large)))
     rims = rims[sole_owners(rims)]
     heart = typical_heart(rims, min_diameter_px)
     rims = refitted(rims[are_bubbles(rims, heart, min_contrast)])
     clusters, rejected, explained = [], [], _explained(ratio.shape, rims.ellipse)
-    single = {part.blob: part.ellipse for part in parts if not (part.merged or part.shared)}
     for index, blob in enumerate(blobs):
         if index not in single or np.any(_within(blob, rims)):
             clusters += _left(ratio, blob, explained, min_diameter_px)

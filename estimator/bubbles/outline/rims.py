@@ -79,6 +79,11 @@ class Rims:
     def __getitem__(self, index: Index | Bools) -> Rims:
         return Rims(*(getattr(self, field.name)[index] for field in fields(self)))
 
+    def and_also(self, other: Rims) -> Rims:
+        """Return the candidates of both."""
+        names = [field.name for field in fields(Rims)]
+        return Rims(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+
 
 def find_rims(
     ratio: Float32, sigma: float, *, min_diameter_px: float, largest_radius_px: float
@@ -98,6 +103,8 @@ def find_rims(
     found = [_voted(image, floors[k], least) for k, image in enumerate(levels)]
     octave = np.repeat(np.arange(len(found)), [len(one) for one in found])
     circle = _from_octave(np.concatenate(found), octave)
+    small = circle[:, 2] < largest_radius_px
+    circle, octave = circle[small], octave[small]
     calm = [_blurred(image, _CALM_CELLS) for image in levels]
     ellipse = np.column_stack([circle[:, :3], circle[:, 2], np.zeros(len(circle))])
     points, used, alive = _followed(calm, floors, ellipse, octave)
@@ -184,6 +191,18 @@ def _followed(
             alive[own] = sound & (fitted[:, 2] < _LONGEST * fitted[:, 3])
             ellipse[own], points[own], used[own] = fitted, rim * size + offset, seen
     return points, used, alive
+
+
+def rims_along(ratio: Float32, sigma: float, ellipse: Array) -> Rims:
+    """Return candidates that were found in another way: the rims along ellipses (N, 5)."""
+    calm = _blurred(np.ascontiguousarray(ratio, np.float32), _CALM_CELLS)
+    _, window, stiffness = _PASSES[-1]
+    points, strength = rim_kernels.closed_rims(
+        calm, ellipse, window, _NOISE_SLOPE * sigma, stiffness
+    )
+    used = strength > _SEEN_STRENGTH
+    enough = used.sum(axis=1) >= _LEAST_SEEN
+    return measured_rims(calm, sigma, ellipse[enough], points[enough], used[enough])
 
 
 def measured_rims(calm: Float32, sigma: float, ellipse: Array, points: Array, used: Bools) -> Rims:

@@ -239,7 +239,7 @@ class TrackEvent:
     kind: str
     frame: int
     t_s: float
-    particles: tuple[int, ...]
+    particles: tuple[int | str, ...]
     reason: str
 
 

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 WORST_FRAMES = 8
 _OUTLINE_POINTS = 72
+_TABLES = ("frames.csv", "run.toml", "stage.csv", "references.csv", "corrections.csv")
 _RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "bubbles")
 """The tables of rig.toml on which tracking depends."""
 _GREEN, _ORANGE = (40, 200, 70), (255, 140, 40)
@@ -153,7 +154,7 @@ def _sources(run: RunData) -> list[Path | Source]:
     return [
         *([] if run.rig is None else [Source(rig, tables=_RIG_TABLES)]),
         *sorted(set(mask_files(run).values())),
-        *(run.path / name for name in ("frames.csv", "run.toml", "stage.csv", "references.csv")),
+        *(run.path / name for name in _TABLES),
         run.path / "detections.csv" if run.detections is not None else images,
     ]
 

@@ -25,6 +25,7 @@ from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
 from telerig.estimator.calibration.result.calibration import Calibration, pair_of_run
 from telerig.estimator.rig_drift import PairCollector, with_change
 from telerig.estimator.tracking.backtracking import Tables
+from telerig.estimator.tracking.corrections import Corrections, read_corrections
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     Progress,
@@ -93,6 +94,7 @@ class TrackingStream:
     scene: Scene | None
     marks: FollowedMarks | None
     linked: Iterator[Linked]
+    corrections: Corrections
     detections: int = 0
     points: int = 0
     particles: set[Any] = field(default_factory=set)
@@ -104,7 +106,7 @@ class TrackingStream:
     @property
     def events(self) -> list[TrackEvent]:
         """Events of the tracks so far."""
-        return self.linker.events
+        return [*self.linker.events, *self.corrections.events]
 
     @property
     def rows(self) -> Iterator[Linked]:
@@ -149,7 +151,11 @@ class TrackingStream:
             "shape_sigma": self.linker.shape_sigma,
             "covariance": "Of the measurement. The calibration's share, common to all points, is "
             "not in tracks.csv.",
-            "warnings": [*_window_warnings(run, self.calibration), *self._crowded()],
+            "warnings": [
+                *_window_warnings(run, self.calibration),
+                *self._crowded(),
+                *self.corrections.warnings,
+            ],
             "notes": list(run.notes),
         }
         if change is not None:
@@ -272,7 +278,9 @@ def tracking_stream(
     rows = _linked(run, cameras, batches(), linker, without, stage)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
-    return TrackingStream(run, calibration, linker, without, scene, marks, rows)
+    corrections = read_corrections(run.path, numbered=labels is None)
+    rows = corrections.applied(rows)
+    return TrackingStream(run, calibration, linker, without, scene, marks, rows, corrections)
 
 
 def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import cv2
 import docs_pages
 import numpy as np
 import pytest
@@ -27,7 +28,10 @@ PAGES = [
     for page in docs_pages.pages()
     if page not in docs_pages.ELSEWHERE and docs_pages.blocks_of(page)
 ]
-ALONE = ("docs/tutorial.md", "docs/tutorial-images.md", "docs/recording.md")
+ALONE = (
+    "docs/tutorial.md", "docs/tutorial-images.md", "docs/recording.md",
+    *(page for page in PAGES if page.startswith("docs/notebooks/")),
+)  # fmt: skip
 """Pages that begin in an empty folder."""
 QUICK = ("docs/tutorial.md",)
 """Pages that are run with all other tests."""
@@ -63,6 +67,17 @@ def own_sensors() -> dict[str, object]:
     }
 
 
+def write_bubbles(folder: Path) -> None:
+    """Two images of a bubble before a lit screen."""
+    rng, folder = np.random.default_rng(0), folder.absolute()
+    folder.mkdir()
+    for name in ("a", "b"):
+        image = np.full((800, 1000), 200.0)
+        cv2.circle(image, (500, 400), 40, 60.0, -1, cv2.LINE_AA)
+        noisy = cv2.GaussianBlur(image, (0, 0), 1.0) + rng.standard_normal(image.shape)
+        cv2.imwrite(str(folder / f"{name}.png"), noisy.astype(np.uint8))
+
+
 def measured_pixels(folder: Path) -> dict[str, object]:
     """The README's pixels of a few points."""
     calibration = telerig.load_calibration(folder / "tank" / "results" / "calibration")
@@ -84,6 +99,8 @@ def test_blocks_run(
     names: dict[str, object] = {}
     if page == "docs/smoothing.md":
         names = own_sensors()
+    if page == "docs/commands.md":
+        write_bubbles(Path("images"))
     if page == "README.md":
         shutil.copytree("tank", "tank-2")
         names = measured_pixels(tmp_path)
@@ -153,7 +170,7 @@ def test_numbers_of_the_tutorial_are_compared(page: str, printed: str, same: boo
 
 @pytest.mark.slow
 @pytest.mark.skipif(
-    find_spec("sphinx") is None or find_spec("myst_parser") is None or find_spec("furo") is None,
+    any(find_spec(name) is None for name in ("sphinx", "myst_nb", "furo", "xarray")),
     reason="the extra 'docs' is not installed: pip install 'telerig[docs]'",
 )
 def test_pages_build_without_a_warning(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from places import ROOT
 from telerig.io.dataset.new_dataset import new_dataset
 from telerig.io.rig_file.rig_file import description_from_toml
 
-LANGUAGES = ("sh", "python", "toml", "text", "{toctree}", "{eval-rst}")
+CELL = "{code-cell} ipython3"
+LANGUAGES = ("sh", "python", "toml", "text", CELL, "{toctree}", "{eval-rst}")
 
 NOT_RUN = {
     "cron": "needs a cron daemon and waits for the night; the script is run",
@@ -129,7 +130,7 @@ class PageRunner:
             return
         if block.language == "sh":
             self.said = self._bash(block)
-        elif block.language == "python":
+        elif block.language in ("python", CELL):
             self.said = self._python(block)
         elif block.language == "toml":
             check_toml(block)

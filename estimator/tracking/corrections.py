@@ -1,0 +1,174 @@
+"""Corrections of tracks by hand: `corrections.csv` in the folder of a run.
+
+A person who has looked at the report may drop, join, split and rename tracks there. Every tracking
+of the run applies the file, row by row in its order, to the finished rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from telerig.errors import InputError
+from telerig.estimator.tracking.filter import TrackEvent
+from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.io.files.csv_table import Column, read_table
+
+FILE = "corrections.csv"
+ACTIONS = ("drop", "join", "split", "rename")
+_COLUMNS = [
+    Column("action", "text"),
+    Column("particle", "name"),
+    Column("other", "name", required=False, blank=True),
+    Column("frame", "whole", required=False, blank=True),
+    Column("reason", "text"),
+]
+_TODO = {
+    "drop": "give particle, and in frame from which frame on it is dropped, or leave it blank",
+    "join": "give particle and other, the track that gets the id of particle",
+    "split": "give particle, frame (the first one of the new track) and other (the new id)",
+    "rename": "give particle and other, the new id",
+}
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Describe one row of the file. frame : the first one that it concerns; 0 for all."""
+
+    row: int
+    action: str
+    particle: str
+    other: str
+    frame: int
+    reason: str
+
+
+@dataclass
+class Corrections:
+    """Apply corrections to the rows of a run, and keep what was done.
+
+    used : by correction, the first frame and time in which it changed something.
+    """
+
+    file: Path
+    corrections: tuple[Correction, ...] = ()
+    used: dict[Correction, tuple[int, float]] = field(default_factory=dict)
+
+    @property
+    def events(self) -> list[TrackEvent]:
+        """Return an event for each correction that changed something."""
+        return [
+            TrackEvent("correction", frame, t_s, tuple(p for p in (c.particle, c.other) if p),
+                       f"{c.action}: {c.reason}")
+            for c, (frame, t_s) in self.used.items()
+        ]  # fmt: skip
+
+    @property
+    def warnings(self) -> list[str]:
+        """Return a sentence for each correction that changed nothing."""
+        return [
+            f"{FILE} row {c.row}: {c.action} changed nothing: there is no track "
+            f"{c.other if c.action == 'join' else c.particle}"
+            + (f" from frame {c.frame} on" if c.frame else "")
+            + "; the tracks may have other ids since the file was written"
+            for c in self.corrections
+            if c not in self.used
+        ]
+
+    def applied(self, parts: Iterator[Linked]) -> Iterator[Linked]:
+        """Yield the corrected rows. Raises InputError where two tracks would become one."""
+        for part in parts:
+            yield self._corrected(part) if self.corrections else part
+
+    def _corrected(self, part: Linked) -> Linked:
+        tracks = self._renamed(part.tracks, counts=True)
+        detections = self._renamed(part.detections, counts=False)
+        known = tracks["particle"].notna()
+        kind = part.tracks["particle"].dtype
+        tracks = tracks[known].astype({"particle": kind}).reset_index(drop=True)
+        twice = tracks.duplicated(["frame", "particle"])
+        if twice.any():
+            particle, frame = (tracks.loc[twice, name].iloc[0] for name in ("particle", "frame"))
+            raise InputError(
+                f"two tracks have the id {particle} in frame {frame}",
+                where=str(self.file),
+                todo="join tracks that follow each other in time, and give new ids to others",
+            )
+        return replace(part, tracks=tracks, detections=detections)
+
+    def _renamed(self, table: pd.DataFrame, *, counts: bool) -> pd.DataFrame:
+        """Return the table with new ids, NaN for dropped ones."""
+        ids, frames = _texts(table["particle"]), table["frame"].to_numpy(np.int64)
+        for one in self.corrections:
+            of = one.other if one.action == "join" else one.particle
+            hit = (ids == of) & (frames >= one.frame)
+            new = {"drop": "", "join": one.particle}.get(one.action, one.other)
+            if one.action in ("split", "rename") and (ids == new).any():
+                raise InputError(
+                    f"there is a track {new} already",
+                    where=f"{self.file} row {one.row}",
+                    todo="give another id, or join the tracks",
+                )
+            if counts and hit.any():
+                first = table.iloc[int(np.flatnonzero(hit)[0])]
+                self.used.setdefault(one, (int(first["frame"]), float(first["t_s"])))
+            ids = np.where(hit, new, ids)
+        return table.assign(particle=_ids(ids, table["particle"]))
+
+
+def _texts(particle: pd.Series[Any]) -> Any:
+    """Return ids as text: "3" for 3 and 3.0, "" for none."""
+    texts = particle.astype(object).where(particle.notna(), "")
+    return np.array([f"{p:.0f}" if isinstance(p, float) else str(p) for p in texts], object)
+
+
+def _ids(texts: Any, like: pd.Series[Any]) -> pd.Series[Any]:
+    """Return ids as numbers if those of ``like`` are numbers, else as text; NaN for none."""
+    known = pd.Series(texts, like.index, dtype=object).where(texts != "", np.nan)
+    if like.dtype == object or isinstance(like.dtype, pd.StringDtype):
+        return known
+    numbers = pd.to_numeric(known).astype(float)
+    return numbers.astype(like.dtype) if isinstance(like.dtype, pd.Int64Dtype) else numbers
+
+
+def read_corrections(run: Path, numbered: bool) -> Corrections:
+    """Read the corrections of a run; there are none if it has no such file.
+
+    numbered : whether the run's ids are whole numbers, so that new ones have to be.
+
+    Raises InputError for a file that cannot be read, an unknown action, and a row that lacks what
+    its action needs.
+    """
+    file = run / FILE
+    if not file.is_file():
+        return Corrections(file)
+    table = read_table(file, _COLUMNS, empty=True)
+    blank = pd.Series("", table.index)
+    others = table.get("other", blank).fillna("").astype(str)
+    frames = table.get("frame", pd.Series(np.nan, table.index))
+    out = []
+    for row, action, particle, other, frame, reason in zip(
+        table.index, table["action"], table["particle"].astype(str), others, frames, table["reason"]
+    ):
+        where = f"{file} row {row}"
+        if action not in ACTIONS:
+            todo = f"use one of: {', '.join(ACTIONS)}"
+            raise InputError(f"there is no action {action!r}", where=where, todo=todo)
+        lacks_other = (other == "") != (action == "drop") or other == particle
+        if lacks_other or (action == "split" and np.isnan(frame)):
+            what = f"{action} has particle {particle!r}, other {other!r}, frame {frame}"
+            raise InputError(what, where=where, todo=_TODO[action])
+        if numbered and not all(t.isascii() and t.isdecimal() for t in (particle, other or "0")):
+            what, todo = (
+                f"{particle!r} or {other!r} is no whole number",
+                "give numbers, as tracks.csv",
+            )
+            raise InputError(what, where=where, todo=todo)
+        start = 0 if np.isnan(frame) else int(frame)
+        out.append(Correction(int(row), action, particle, other, start, reason))
+    return Corrections(file, tuple(out))

@@ -1,0 +1,128 @@
+"""Corrections of tracks by hand: what each does, what is refused, and a whole run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import telerig
+from telerig.errors import InputError
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
+from telerig.estimator.tracking.corrections import Corrections, read_corrections
+from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.io.results.stale import stale
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.presets import run_preset
+from telerig.scripts.main import app
+
+HEAD = "action,particle,other,frame,reason\n"
+
+
+def parts(ids: list[list[float]]) -> Iterator[Linked]:
+    """One part per frame, with the ids of its tracks; detections have one more, without a track."""
+    for frame, here in enumerate(ids):
+        tracks = pd.DataFrame({"frame": frame, "particle": np.array(here, np.int64), "t_s": 0.1})
+        found = pd.DataFrame({"frame": frame, "particle": [*here, np.nan], "t_s": 0.1})
+        yield Linked(tracks, found)
+
+
+def read(folder: Path, rows: str) -> Corrections:
+    (folder / "corrections.csv").write_text(HEAD + rows)
+    return read_corrections(folder, numbered=True)
+
+
+def corrected(folder: Path, rows: str, ids: list[list[float]]) -> list[list[int]]:
+    done = list(read(folder, rows).applied(parts(ids)))
+    for part in done:
+        assert part.tracks["particle"].dtype == np.int64
+        seen = part.detections["particle"].dropna().astype(int).tolist()
+        assert seen == part.tracks["particle"].tolist()
+    return [part.tracks["particle"].tolist() for part in done]
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ("drop,1,,,a reflection\n", [[2], [2], [], []]),
+        ("drop,1,,1,lost\n", [[1, 2], [2], [], []]),
+        ("join,2,3,,the same bubble\n", [[1, 2], [1, 2], [1, 2], [1, 2]]),
+        ("split,1,9,2,two bubbles\n", [[1, 2], [1, 2], [9, 3], [9, 3]]),
+        ("rename,1,7,,as in the notebook\n", [[7, 2], [7, 2], [7, 3], [7, 3]]),
+        ("join,2,3,,same\nrename,2,5,,number\n", [[1, 5], [1, 5], [1, 5], [1, 5]]),
+        ("split,1,9,2,two\ndrop,9,,,noise\n", [[1, 2], [1, 2], [3], [3]]),
+        ("", [[1, 2], [1, 2], [1, 3], [1, 3]]),
+    ],
+)
+def test_each_action(tmp_path: Path, rows: str, expected: list[list[int]]) -> None:
+    ids = [[1, 2], [1, 2], [1, 3], [1, 3]]
+    if rows.startswith("drop,1"):
+        expected = [[*e, *([] if 2 in e else [3])] for e in expected]
+    assert corrected(tmp_path, rows, ids) == expected
+
+
+def test_what_was_done_and_what_changed_nothing_is_said(tmp_path: Path) -> None:
+    corrections = read(tmp_path, "drop,1,,,a speck\njoin,2,8,,gone\nsplit,2,5,40,late\n")
+    list(corrections.applied(parts([[1, 2], [1, 2]])))
+    (event,) = corrections.events
+    assert (event.kind, event.frame, event.reason) == ("correction", 0, "drop: a speck")
+    assert ["row 3" in corrections.warnings[0], "no track 8" in corrections.warnings[0]] == [1, 1]
+    assert "no track 2 from frame 40 on" in corrections.warnings[1]
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("kill,1,,,x\n", "no action 'kill'"),
+        ("join,1,,,x\n", "give particle and other"),
+        ("join,1,1,,x\n", "give particle and other"),
+        ("split,1,9,,x\n", "frame"),
+        ("rename,1,b,,x\n", "whole number"),
+        ("drop,1,2,,x\n", "drop has particle"),
+        ("drop,1,,,\n", "is blank"),
+        ("join,1,2,,x\n", "two tracks have the id 1 in frame 0"),
+        ("rename,1,2,,x\n", "row 2: there is a track 2 already"),
+        ("split,1,3,1,x\n", "there is a track 3 already"),
+    ],
+)
+def test_refusals(tmp_path: Path, rows: str, words: str) -> None:
+    with pytest.raises(InputError, match=r"corrections\.csv") as caught:
+        list(read(tmp_path, rows).applied(parts([[1, 2], [1, 2], [1, 3]])))
+    assert words in str(caught.value)
+
+
+def test_named_bubbles(tmp_path: Path) -> None:
+    (tmp_path / "corrections.csv").write_text(HEAD + "rename,a,left one,,label\n")
+    table = pd.DataFrame({"frame": 0, "particle": np.array(["a", "b"], object), "t_s": 0.0})
+    done = next(read_corrections(tmp_path, numbered=False).applied(iter([Linked(table, table)])))
+    assert done.tracks["particle"].tolist() == ["left one", "b"]
+
+
+def test_a_tracking_applies_them_and_tells_of_them(tmp_path: Path) -> None:
+    config = run_preset("rise", frames=14)
+    data = telerig.simulate(
+        config, rng=np.random.default_rng(1), out=tmp_path / "tank", images=False
+    )
+    cameras = list(true_cameras(config.calibration).values())
+    calibration_from_cameras(cameras).save(data.results / "calibration")
+    run, results = data.runs["rise"].path, data.results / "rise"
+    assert CliRunner().invoke(app, ["track", str(run), "--quiet", "--no-report"]).exit_code == 0
+    before = pd.read_csv(results / "tracks.csv")
+    assert not stale(results, ["tracks.csv"])
+    (run / "corrections.csv").write_text(HEAD + "split,0,5,6,it <hit> another bubble\n")
+    assert any("corrections.csv" in sentence for sentence in stale(results, ["tracks.csv"]))
+    done = CliRunner().invoke(app, ["track", str(run), "--quiet"])
+    assert done.exit_code == 0, done.output
+    after = pd.read_csv(results / "tracks.csv")
+    pd.testing.assert_frame_equal(after.drop(columns="particle"), before.drop(columns="particle"))
+    assert after["particle"].tolist() == [0] * 6 + [5] * 8
+    page = (results / "report.html").read_text(encoding="utf-8")
+    assert "split: it &lt;hit&gt; another bubble" in page and "2 tracks" in done.output
+    found = telerig.load_tracks(results)
+    assert found.events["kind"].tolist().count("correction") == 1
+    detections = found.detections
+    assert set(detections["particle"].dropna()) == {0, 5}

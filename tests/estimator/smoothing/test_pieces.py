@@ -177,3 +177,17 @@ def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
         assert list(one) == list(other)
         assert len(one) == len(other)
         np.testing.assert_allclose(other["d_eq_mm"], 1.5)
+
+
+def test_a_shake_without_bubbles_is_smoothed_in_pieces(tmp_path: Path) -> None:
+    problem, _ = crowded()
+    calibration = calibration_from_cameras(list(problem.cameras), name="truth")
+    stage = {"t_s": problem.t_s, "position_mm": 0 * problem.t_s}
+    found = telerig.smooth(
+        None, calibration, stage=stage, t_s=problem.t_s, model="default",
+        options=Options(frames=300),
+    )  # fmt: skip
+    assert len(found.shake) == 600
+    assert not len(found.trajectories)
+    found.save(tmp_path)
+    assert len(telerig.load_smoothing(tmp_path).shake) == 600

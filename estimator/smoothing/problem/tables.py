@@ -223,7 +223,7 @@ _SHARPEST_PX, _SOME, _FRAMES_AT_ONCE = 0.01, 200, 2000
 
 
 def frames_between(tracks: Any, first: int, end: int) -> Any:
-    """Return `Tracks`, a table of tracks, or None, in the frames from ``first`` to before ``end``."""
+    """Return `Tracks` or a table of tracks in the frames from ``first`` to before ``end``."""
     if tracks is None:
         return None
     if hasattr(tracks, "between"):

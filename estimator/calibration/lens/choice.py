@@ -137,10 +137,7 @@ def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
     problem, rich : the problem with the richest model, and its solution. models : for each camera
     "auto", or the name of a model that is kept.
     """
-    whole = tuple(
-        Lens(g for g, parameters in GROUPS.items() if set(parameters) <= set(free))
-        for free in problem.free
-    )
+    whole = tuple(_lens_of(free) for free in problem.free)
     allowed = [possible(lens) if m == AUTO else [lens] for lens, m in zip(whole, models)]
     simplest = tuple(min(options, key=len) for options in allowed)
     quadratic = QuadraticCost.of(problem, rich)
@@ -159,6 +156,10 @@ def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
     refused = [step for step in steps if not step.taken]
     steps += _not_taken(quadratic, chosen.lenses, allowed, refused)
     return Choice(tuple(steps), chosen, _words(problem, steps, chosen, others))
+
+
+def _lens_of(free: Sequence[str]) -> Lens:
+    return Lens(g for g, parameters in GROUPS.items() if set(parameters) <= set(free))
 
 
 def _determined(quadratic: QuadraticCost, allowed: list[list[Lens]]) -> Lenses:

@@ -109,6 +109,7 @@ def calibration_from_fit(
         model=_model(fit),
         diagnostics={
             "gauge": _gauge(problem),
+            "dots_hull_px": _hulls(residuals),
             "weak": weak,
             "tilts_deg": {
                 f"{problem.views[v]}/{problem.cameras[c].name}": t
@@ -123,6 +124,17 @@ def calibration_from_fit(
     )
     statistics |= _space(calibration, problem, state)
     return calibration
+
+
+def _hulls(residuals: pd.DataFrame) -> dict[str, Array]:
+    """Return for each camera the corners (n, 2) of the convex hull of its used dots, in px."""
+    import cv2
+
+    used = residuals[residuals["weight"] > 0]
+    return {
+        str(name): cv2.convexHull(mine[["u_px", "v_px"]].to_numpy(np.float32))[:, 0].astype(float)
+        for name, mine in used.groupby("camera", sort=False)
+    }
 
 
 def _gauge(problem: Problem) -> str:

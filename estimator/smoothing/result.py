@@ -11,6 +11,7 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
+from telerig.estimator.smoothing.graph.layout import points_in_rig
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     carriage,
@@ -31,6 +32,8 @@ from telerig.short_text import ShortText, counted, first_of
 if TYPE_CHECKING:
     import pandas as pd
     import xarray
+
+    from telerig.estimator.calibration.result.calibration import Calibration
 
 
 @dataclass(frozen=True, repr=False)
@@ -458,6 +461,7 @@ def trajectories(
     inflation: Sequence[float] = (1.0, 1.0, 1.0),
     *,
     rts: bool = True,
+    calibration: Calibration | None = None,
 ) -> pd.DataFrame:
     """Return the table of the bubbles' positions (mm), velocities (mm/s) and accelerations (mm/s^2)
     in the laboratory frame.
@@ -470,6 +474,7 @@ def trajectories(
         of a plain RTS smoother and the diameters are added; None to leave these columns out.
     inflation : (3,) factor of the standard deviations along each axis where measurements disagree.
     rts : whether the result of a plain RTS smoother is computed; otherwise it is NaN.
+    calibration : its share of the errors is stated in columns of its own; None to leave them out.
     """
     import pandas as pd
 
@@ -498,6 +503,8 @@ def trajectories(
     if found is not None:
         columns |= _named(found.value_mm_s2, "a{}_mm_s2")
         columns |= _named(found.sd_mm_s2 * inflation, "sa{}_mm_s2")
+    if calibration is not None:
+        columns |= calibration.share_columns(points_in_rig(graph, solution.state))
     return pd.DataFrame(columns)
 
 

@@ -177,7 +177,7 @@ def smooth(
             learned, more = learning_record(problem, chosen)
             warnings = [*warnings, *more]
     given, pieces = isinstance(model, ShakeModel), pieces_of(problem, chosen, options.frames)
-    run = _Run(problem, tracks, tracked, chosen, given, options, phases)
+    run = _Run(problem, calibration, tracks, tracked, chosen, given, options, phases)
     if len(pieces) == 1:
         done = run.smoothed()
     else:
@@ -230,6 +230,7 @@ class _Run:
     """
 
     problem: SmoothingProblem
+    calibration: Calibration
     tracks: Any
     tracked: Tracked | None
     model: ShakeModel
@@ -253,7 +254,7 @@ class _Run:
         with self.phases.phase("tables", "making the tables"):
             inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
             table = None if self.tracked is None else self.tracked.between(0, len(problem.t_s))
-            paths = trajectories(solution, table, inflation)
+            paths = trajectories(solution, table, inflation, calibration=self.calibration)
             offsets = shake_table(solution, inflation)
             tracks = self.tracks
             if hasattr(tracks, "between"):
@@ -354,7 +355,8 @@ class _Run:
             there = {bubble.particle for bubble in window.problem.bubbles}
             table = table[table["particle"].isin(there)]
             table = table.assign(frame=table["frame"] - piece.low)
-        every = trajectories(solution, table, rts=piece.first == 0), shake_table(solution)
+        rows = trajectories(solution, table, rts=piece.first == 0, calibration=self.calibration)
+        every = rows, shake_table(solution)
         own = (part[span.holds(part["frame"].to_numpy())] for part in every)
         paths, offsets = (part.assign(frame=part["frame"] + piece.low) for part in own)
         return paths, offsets

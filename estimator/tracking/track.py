@@ -44,6 +44,7 @@ from telerig.io.dataset.run import RunData
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.machine.parallel import cores
+from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, POINT
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
 from telerig.rig.camera import Camera
@@ -85,6 +86,8 @@ class TrackingStream:
     linked : the rows, which are computed while they are read.
     detections, points, particles : numbers of detections and points, and ids of tracks, so far.
     covered : for each camera, number of detections and the area that they cover (px^2), so far.
+    beyond : number of points beyond the dots of the calibration, so far.
+    common_mm2 : (3,) sums over the points of the variances by the calibration's errors, so far.
     """
 
     run: RunData
@@ -97,6 +100,8 @@ class TrackingStream:
     corrections: Corrections
     detections: int = 0
     points: int = 0
+    beyond: int = 0
+    common_mm2: Array = field(default_factory=lambda: np.zeros(3))
     particles: set[Any] = field(default_factory=set)
     covered: dict[str, tuple[int, float]] = field(default_factory=dict)
 
@@ -111,7 +116,7 @@ class TrackingStream:
     @property
     def rows(self) -> Iterator[Linked]:
         """Final rows of tracks.csv and detections.csv, some frames at a time."""
-        for part in self.linked:
+        for part in map(self._with_share, self.linked):
             self.detections += int(np.isfinite(part.detections["u_px"].to_numpy(float)).sum())
             self.points += len(part.tracks)
             self.particles |= set(part.tracks["particle"])
@@ -121,6 +126,14 @@ class TrackingStream:
                 many, area = many + int(areas.notna().sum()), area + float(areas.sum())
                 self.covered[str(camera)] = many, area
             yield part
+
+    def _with_share(self, part: Linked) -> Linked:
+        """Add the columns of the calibration's share, and count them."""
+        share = self.calibration.share_columns(part.tracks[[*POINT]].to_numpy(float))
+        tracks = part.tracks.assign(**share)
+        self.beyond += int(np.sum(share.get(EXTRAPOLATED, 0)))
+        self.common_mm2 += np.array([np.sum(share[name] ** 2) for name in CALIBRATION_SHARE])
+        return replace(part, tracks=tracks)
 
     def summary(self) -> dict[str, Any]:
         """Return the content of tracking.json. Raises InputError when no bubble was found."""
@@ -150,7 +163,7 @@ class TrackingStream:
             "pairs": with_change(model, change, self.calibration),
             "shape_sigma": self.linker.shape_sigma,
             "covariance": "Of the measurement. The calibration's share, common to all points, is "
-            "not in tracks.csv.",
+            "in calibration_sx_mm, calibration_sy_mm and calibration_sz_mm.",
             "warnings": [
                 *_window_warnings(run, self.calibration),
                 *self._crowded(),
@@ -158,6 +171,10 @@ class TrackingStream:
             ],
             "notes": list(run.notes),
         }
+        if self.points:
+            content["calibration_sd_mm"] = np.sqrt(self.common_mm2 / self.points).tolist()
+            if self.calibration.beyond_dots(np.zeros((0, 3))) is not None:
+                content["extrapolated"] = self.beyond / self.points
         if change is not None:
             content["rig_change"] = change.as_dict()
         if self.marks is not None:

@@ -15,7 +15,13 @@ from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_part, read_table
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.results.manifest import reading, replaced_results
-from telerig.io.results.tracking import EVENTS, POINT, REFERENCES, TrackingFile
+from telerig.io.results.tracking import (
+    EVENTS,
+    POINT,
+    REFERENCES,
+    TrackingFile,
+    share_words,
+)
 from telerig.short_text import ShortText, counted, first_of
 
 if TYPE_CHECKING:
@@ -264,6 +270,8 @@ def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") 
             f"  camera {camera}: {count} frames without a bubble: {reason}"
             for reason, count in reasons.items()
         ]
+    share = share_words(summary.get("calibration_sd_mm"), summary.get("extrapolated"))
+    lines += [f"  {word}" for word in share]
     kinds = {k: n for k, n in summary["events"].items() if k not in ("birth", "death")}
     if kinds:
         lines.append("  " + ", ".join(f"{n} x {kind}" for kind, n in kinds.items()))

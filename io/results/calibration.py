@@ -319,12 +319,14 @@ class Diagnostics(Part):
     """Hold further findings of a calibration, which the report shows.
 
     gauge : how origin, axes and scale were chosen. weak : names of badly determined quantities.
+    dots_hull_px : by camera, the corners of the convex hull of the dots that were used, in px.
     tilts_deg : tilts in degrees by name; None where one is not known.
     halves : the split-half check. structure : the structure in the residuals.
     next_view : the recommended next view of the target.
     """
 
     gauge: str = ""
+    dots_hull_px: dict[Name, tuple[tuple[float, float], ...]] = Field(default_factory=dict)
     weak: tuple[str, ...] = ()
     tilts_deg: dict[str, float | None] = Field(default_factory=dict)
     halves: Annotated[dict[str, Any], _checked(SplitHalves)] = Field(default_factory=dict)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from telerig.io.files.csv_table import Column
 from telerig.io.results.record import Name, Part, Record, Vector3
-from telerig.io.results.tracking import RigChange
+from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, RigChange
 
 AXES = ("x", "y", "z")
 POSITION, VELOCITY, ACCELERATION = "{}_mm", "v{}_mm_s", "a{}_mm_s2"
@@ -310,4 +310,5 @@ TRAJECTORIES = [
     *_optional([f"{kind}{name}" for kind in ("", "s", "naive_", "rts_") for name in STATE]),
     Column("observed", "whole", required=False),
     *_optional([prefix + ACCELERATION.format(axis) for prefix in ("", "s") for axis in AXES]),
+    *_optional([*CALIBRATION_SHARE, EXTRAPOLATED]),
 ]

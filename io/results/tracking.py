@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
+from telerig.arrays import Array
 from telerig.io.files.csv_table import Column
 from telerig.io.results.record import Name, Part, Record, Vector3
 
@@ -69,6 +70,8 @@ class TrackingFile(Record):
     events : number of events of each kind. pairs : statistics of the ray miss, or None.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
     up : (3,) unit vector against gravity in the rig frame; None where it is not known.
+    extrapolated : share of the points beyond the dots of the calibration; None if it is not known.
+    calibration_sd_mm : RMS over the points of the standard deviations (3,) by the calibration.
     """
 
     KIND: ClassVar[str] = "telerig tracks"
@@ -98,6 +101,36 @@ class TrackingFile(Record):
     references: dict[str, Any] | None = None
     worst_frames: tuple[WorstFrame, ...] = ()
     up: Vector3 | None = None
+    extrapolated: float | None = None
+    calibration_sd_mm: Vector3 | None = None
+
+
+CALIBRATION_SHARE = ("calibration_sx_mm", "calibration_sy_mm", "calibration_sz_mm")
+"""Columns of tracks.csv and trajectories.csv: standard deviation of a position by the errors of the
+calibration, which are common to the run."""
+EXTRAPOLATED = "extrapolated"
+"""Column of both tables: whether a position lies beyond the dots of the calibration (0/1)."""
+
+
+def share_words(sd_mm: Sequence[float] | Array | None, extrapolated: float | None) -> list[str]:
+    """Return sentences on the calibration's share of the errors, and on what lies beyond its dots.
+
+    sd_mm : (3,) as in `TrackingFile.calibration_sd_mm`. extrapolated : share of the positions.
+    """
+    words = []
+    if sd_mm is not None:
+        x, y, z = (f"{1e3 * sd:.2g}" for sd in sd_mm)
+        words.append(
+            f"The calibration adds errors of {x}, {y} and {z} µm in x, y and z (1 sd, RMS over the "
+            "positions), which are common to the run: calibration_sx_mm and the two beside it."
+        )
+    if extrapolated:
+        words.append(
+            f"{100 * extrapolated:.2g} % of the positions lie beyond the dots of the calibration "
+            "in an image, where the lens is extrapolated (extrapolated = 1). Views with the target "
+            "there would show how good it is."
+        )
+    return words
 
 
 def _numbers(names: Sequence[str], *, required: bool = True) -> list[Column]:
@@ -120,6 +153,7 @@ def tracks_columns(cameras: Sequence[str]) -> list[Column]:
         *_numbers([*POINT, *COVARIANCE, *per_camera, "ray_miss_mm", "d_eq_mm", "confidence"]),
         *_numbers(["sd_eq_mm", *SILHOUETTES], required=False),
         *(Column(name, "text", required=False, blank=True) for name in ("centre", "flags")),
+        *_numbers([*CALIBRATION_SHARE, EXTRAPOLATED], required=False),
     ]
 
 

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
     from telerig.io.results.calibration import CalibrationFile, CameraRecord
 
+_AT_ONCE = 8192
+
 
 @dataclass(frozen=True, repr=False)
 class Calibration(ShortText):
@@ -257,9 +259,64 @@ class Calibration(ShortText):
         for c in range(2):
             block = slice(2 * c, 2 * c + 2)
             information[..., block, block] = np.linalg.inv(pixel_covariance(sigmas[c], shape))
-        shift = point_shift_jacobian(pair, two.free, found.points_mm, information)
-        share = shift @ two.covariance @ np.swapaxes(shift, -1, -2)
+        share = two.common_covariance(found.points_mm, information)
         return replace(found, covariance_mm2=found.covariance_mm2 + share)
+
+    def common_covariance(
+        self, points_mm: ArrayLike, information_px: ArrayLike | None = None
+    ) -> Array:
+        """Return the calibration's share of the covariance of triangulated points, in mm^2.
+
+        points_mm : (..., 3) in the rig frame. information_px : (..., 2C, 2C) inverse covariance of
+        their pixels in the C cameras, 0 in those that do not see a point; None for equal noise.
+        Returns (..., 3, 3). The error that it describes is common to all points of a run.
+        """
+        points = np.asarray(points_mm, float)
+        size = 2 * len(self.cameras)
+        given = np.eye(size) if information_px is None else np.asarray(information_px, float)
+        flat, every = (
+            points.reshape(-1, 3),
+            np.broadcast_to(given, (*points.shape[:-1], size, size)).reshape(-1, size, size),
+        )
+        out = np.full((len(flat), 3, 3), np.nan)
+        placed = np.flatnonzero(np.isfinite(flat).all(-1))
+        for first in range(0, len(placed), _AT_ONCE):
+            some = placed[first : first + _AT_ONCE]
+            shift = point_shift_jacobian(self.cameras, self.free, flat[some], every[some])
+            out[some] = shift @ self.covariance @ np.swapaxes(shift, -1, -2)
+        return out.reshape(*points.shape, 3)
+
+    def share_columns(self, points_mm: ArrayLike) -> dict[str, NDArray[Any]]:
+        """Return the columns of a table of points (N, 3) that state the calibration's share.
+
+        They are `CALIBRATION_SHARE` in mm and, if the dots are known, `EXTRAPOLATED`
+        (`telerig.io.results.tracking`).
+        """
+        from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED
+
+        variance = np.diagonal(self.common_covariance(points_mm), axis1=-2, axis2=-1)
+        columns: dict[str, NDArray[Any]] = dict(zip(CALIBRATION_SHARE, np.sqrt(variance).T))
+        beyond = self.beyond_dots(points_mm)
+        return columns if beyond is None else columns | {EXTRAPOLATED: beyond.astype(np.int64)}
+
+    def beyond_dots(self, points_mm: ArrayLike) -> NDArray[np.bool_] | None:
+        """Return whether points (..., 3) lie beyond the dots of the calibration in any image.
+
+        There the lens is extrapolated. The dots of a camera end at the convex hull of those that
+        were used. Returns None if the dots are not known, as for an imported calibration.
+        """
+        hulls = self.diagnostics.get("dots_hull_px", {})
+        if not all(camera.name in hulls for camera in self.cameras):
+            return None
+        points = np.asarray(points_mm, float)
+        out = np.zeros(points.shape[:-1], bool)
+        for camera in self.cameras:
+            hull = np.asarray(hulls[camera.name], float)
+            edge = np.roll(hull, -1, 0) - hull
+            away = camera.project(points)[..., None, :] - hull
+            side = edge[:, 0] * away[..., 1] - edge[:, 1] * away[..., 0]
+            out |= ~((side >= 0).all(-1) | (side <= 0).all(-1))
+        return out
 
     def _triangulate_views(
         self, uv_px: Mapping[str, ArrayLike], sigma: Any, method: str, include_calibration: bool
@@ -296,8 +353,7 @@ class Calibration(ShortText):
             noise = seen_covariance(one, seen).reshape(-1, 2, 2)
             inverse = np.linalg.inv(noise) * seen.reshape(-1, 1, 1)
             information[:, block, block] = inverse
-        shift = point_shift_jacobian(self.cameras, self.free, points[placed], information[placed])
-        covariance[placed] += shift @ self.covariance @ np.swapaxes(shift, -1, -2)
+        covariance[placed] += self.common_covariance(points[placed], information[placed])
         return replace(found, covariance_mm2=covariance.reshape(found.covariance_mm2.shape))
 
     def pair(self, first: str | int, second: str | int) -> Calibration:

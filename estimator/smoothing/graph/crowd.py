@@ -32,13 +32,16 @@ from telerig.estimator.smoothing.graph.elimination import (
 from telerig.estimator.smoothing.graph.layout import (
     Families,
     GraphLayout,
+    State,
     first_guess,
     graph_layout,
+    points_in_rig,
 )
 from telerig.estimator.smoothing.graph.linear import priors_and_motion
 from telerig.estimator.smoothing.problem.problem import Bubble, Observations
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 from telerig.io.machine.parallel import give_back_freed_memory
+from telerig.rig.triangulation import point_shift_jacobian
 
 MOST_JOINT = 8
 """So many bubbles in sight are eliminated jointly."""
@@ -223,6 +226,32 @@ class EliminatedCrowd:
             cross = cross @ np.swapaxes(turn, -1, -2)
         blocks = [found.own[0], own, means, *found.own[3:]]
         return Blocks(blocks, cross, any_row, cross_of_row)
+
+
+def add_own_calibration(
+    graph: GraphLayout, state: State, bubbles: Array, calibration: Array
+) -> None:
+    """Add to covariances of bubbles (rows, D, D) what the mean bubble does not have of the
+    calibration.
+
+    Its errors move each point of the field differently, and the mean bubble by their mean.
+    calibration : (r, r) posterior covariance of its directions.
+    """
+    share = graph.problem.calibration
+    if share is None or not len(calibration):
+        return
+    places, cameras = points_in_rig(graph, state), graph.problem.cameras
+    equal = np.eye(2 * len(cameras))
+    moved = np.empty((graph.rows, 3, len(calibration)))
+    for first in range(0, graph.rows, _AT_ONCE):
+        mine = slice(first, first + _AT_ONCE)
+        moved[mine] = point_shift_jacobian(cameras, share.free, places[mine], equal) @ share.root
+    mean = np.zeros((len(graph.problem.t_s), *moved.shape[1:]))
+    np.add.at(mean, graph.frame_of_row, moved)
+    seen = np.bincount(graph.frame_of_row, minlength=len(mean))
+    moved -= (mean / np.maximum(seen, 1)[:, None, None])[graph.frame_of_row]
+    at = graph.bubble.path_position
+    bubbles[:, at[:, None], at] += moved @ calibration @ np.swapaxes(moved, -1, -2)
 
 
 def eliminate_crowd(

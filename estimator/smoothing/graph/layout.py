@@ -612,6 +612,15 @@ def moved(graph: GraphLayout, state: State, step: Array) -> State:
     )
 
 
+def points_in_rig(graph: GraphLayout, state: State) -> Array:
+    """(rows, 3) places of the bubbles in the rig frame, mm, the cameras' offsets at their mean."""
+    shake = graph.shake_at_frames(state.shake)
+    moved = shake @ graph.shake.offset[:-1].mean(0).T
+    travel = shake @ graph.shake.position / (1 + state.encoder_scale(graph))
+    moved += travel[:, None] * graph.problem.axis
+    return np.asarray(state.bubbles @ graph.bubble.position.T - moved[graph.frame_of_row])
+
+
 def times(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 

@@ -13,7 +13,11 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph.crowd import EliminatedCrowd, eliminated
+from telerig.estimator.smoothing.graph.crowd import (
+    EliminatedCrowd,
+    add_own_calibration,
+    eliminated,
+)
 from telerig.estimator.smoothing.graph.draws import Draws, draws_of
 from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph
 from telerig.estimator.smoothing.graph.layout import (
@@ -366,6 +370,8 @@ def _finish(
     if options.covariances:
         progress("covariances", 0.0)
         found = _covariances(graph, last.done.blocks())
+        if isinstance(last.done, EliminatedCrowd):
+            add_own_calibration(graph, state, found.bubbles, found.calibration)
     progress("smoothing", 1.0)
     return Solution(
         graph, state, found, *fitted, float(evidence), done, draws=draws, constants=constants

@@ -32,6 +32,7 @@ _WORDS = {
     "z_mm": "position along z, away from the first camera",
     "frame": "index of the frame, from 0",
     "observed": "1 where the bubble was detected in the frame",
+    "extrapolated": "1 where the position lies beyond the dots of the calibration",
 }
 
 

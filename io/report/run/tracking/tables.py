@@ -22,6 +22,7 @@ from telerig.io.report.run.tracking.results import (
     rms,
     track_lengths,
 )
+from telerig.io.results.tracking import share_words
 
 MOST_EVENTS = 60
 _MISS_TOO_LARGE = 3.0
@@ -50,7 +51,9 @@ def verdict(results: TrackResults) -> Headline:
         f"{_many(tracks, 'track')}, {_many(points, 'position')} in space, {_many(frames, 'frame')}"
     )
     warnings = _warnings(results)
-    sentences = (_matched_words(results), _precision_words(results), _miss_words(results))
+    common = share_words(results.file.calibration_sd_mm, results.file.extrapolated)
+    precision = (_precision_words(results), *common)
+    sentences = (_matched_words(results), *precision, _miss_words(results))
     return Headline(headline, "usable" if warnings else "good", sentences, warnings)
 
 
@@ -80,8 +83,8 @@ def _matched_words(results: TrackResults) -> str:
 def _precision_words(results: TrackResults) -> str:
     x, y, z = (number(median(column), 2) for column in results.sd_um.T)
     return (
-        f"A position is known to {x}, {y} and {z} µm in x, y and z (1 sd, median); the uncertainty "
-        "of the calibration is not included."
+        f"A position is known to {x}, {y} and {z} µm in x, y and z (1 sd, median), errors of the "
+        "calibration left out."
     )
 
 

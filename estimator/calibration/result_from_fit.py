@@ -126,15 +126,16 @@ def calibration_from_fit(
     return calibration
 
 
-def _hulls(residuals: pd.DataFrame) -> dict[str, Array]:
+def _hulls(residuals: pd.DataFrame) -> dict[str, tuple[tuple[float, float], ...]]:
     """Return for each camera the corners (n, 2) of the convex hull of its used dots, in px."""
     import cv2
 
     used = residuals[residuals["weight"] > 0]
-    return {
-        str(name): cv2.convexHull(mine[["u_px", "v_px"]].to_numpy(np.float32))[:, 0].astype(float)
+    corners = {
+        str(name): cv2.convexHull(mine[["u_px", "v_px"]].to_numpy(np.float32))[:, 0].tolist()
         for name, mine in used.groupby("camera", sort=False)
     }
+    return {name: tuple((u, v) for u, v in found) for name, found in corners.items()}
 
 
 def _gauge(problem: Problem) -> str:

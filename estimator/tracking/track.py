@@ -132,7 +132,7 @@ class TrackingStream:
         share = self.calibration.share_columns(part.tracks[[*POINT]].to_numpy(float))
         tracks = part.tracks.assign(**share)
         self.beyond += int(np.sum(share.get(EXTRAPOLATED, 0)))
-        self.common_mm2 += np.array([np.sum(share[name] ** 2) for name in CALIBRATION_SHARE])
+        self.common_mm2 += [np.sum(share.get(n, np.nan) ** 2) for n in CALIBRATION_SHARE]
         return replace(part, tracks=tracks)
 
     def summary(self) -> dict[str, Any]:
@@ -171,10 +171,10 @@ class TrackingStream:
             ],
             "notes": list(run.notes),
         }
-        if self.points:
+        if self.points and np.isfinite(self.common_mm2).all():
             content["calibration_sd_mm"] = np.sqrt(self.common_mm2 / self.points).tolist()
-            if self.calibration.beyond_dots(np.zeros((0, 3))) is not None:
-                content["extrapolated"] = self.beyond / self.points
+        if self.points and self.calibration.beyond_dots(np.zeros((0, 3))) is not None:
+            content["extrapolated"] = self.beyond / self.points
         if change is not None:
             content["rig_change"] = change.as_dict()
         if self.marks is not None:

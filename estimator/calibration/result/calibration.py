@@ -274,10 +274,8 @@ class Calibration(ShortText):
         points = np.asarray(points_mm, float)
         size = 2 * len(self.cameras)
         given = np.eye(size) if information_px is None else np.asarray(information_px, float)
-        flat, every = (
-            points.reshape(-1, 3),
-            np.broadcast_to(given, (*points.shape[:-1], size, size)).reshape(-1, size, size),
-        )
+        flat = points.reshape(-1, 3)
+        every = np.broadcast_to(given, (*points.shape[:-1], size, size)).reshape(-1, size, size)
         out = np.full((len(flat), 3, 3), np.nan)
         placed = np.flatnonzero(np.isfinite(flat).all(-1))
         for first in range(0, len(placed), _AT_ONCE):
@@ -289,13 +287,15 @@ class Calibration(ShortText):
     def share_columns(self, points_mm: ArrayLike) -> dict[str, NDArray[Any]]:
         """Return the columns of a table of points (N, 3) that state the calibration's share.
 
-        They are `CALIBRATION_SHARE` in mm and, if the dots are known, `EXTRAPOLATED`
-        (`telerig.io.results.tracking`).
+        They are `CALIBRATION_SHARE` in mm, if there is a covariance, and `EXTRAPOLATED`, if the
+        dots are known (`telerig.io.results.tracking`).
         """
         from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED
 
-        variance = np.diagonal(self.common_covariance(points_mm), axis1=-2, axis2=-1)
-        columns: dict[str, NDArray[Any]] = dict(zip(CALIBRATION_SHARE, np.sqrt(variance).T))
+        columns: dict[str, NDArray[Any]] = {}
+        if self.covariance.size:
+            variance = np.diagonal(self.common_covariance(points_mm), axis1=-2, axis2=-1)
+            columns |= dict(zip(CALIBRATION_SHARE, np.sqrt(variance.clip(0)).T))
         beyond = self.beyond_dots(points_mm)
         return columns if beyond is None else columns | {EXTRAPOLATED: beyond.astype(np.int64)}
 

@@ -72,13 +72,22 @@ def one_run(config: RunConfig, seed: int) -> tuple[np.ndarray, np.ndarray, str, 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--only", choices=SCENARIOS, help="one scenario")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     lines = []
     for name, frames in SCENARIOS.items():
+        if options.only not in (None, name):
+            continue
         for sensors in SENSORS:
             config = config_of(name, sensors, frames)
-            runs = [one_run(config, seed) for seed in range(options.seeds)]
+            runs, refused = [], 0
+            for seed in range(options.seeds):
+                try:
+                    runs.append(one_run(config, seed))
+                except telerig.SensorError as error:
+                    print(f"{name} {sensors} seed {seed}: refused: {error}", flush=True)
+                    refused += 1
             error = np.sqrt(np.mean([run[0] for run in runs], 0))
             expected = np.median([run[1] for run in runs], 0)
             ratio = expected / error
@@ -88,6 +97,7 @@ def main() -> None:
             ]
             verdicts = [run[2] for run in runs], [run[3] for run in runs]
             same = f"{verdicts[0][0]}; {verdicts[1].count(verdicts[0][0])} of {len(runs)}"
+            same += f", {refused} refused" if refused else ""
             lines.append(f"| {name} | {sensors} | " + " | ".join(cells) + f" | {same} |")
             print(lines[-1], flush=True)
     text = f"""# What `telerig plan` expects, and what runs reach

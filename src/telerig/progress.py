@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
+from telerig.errors import InputError
+
 P = ParamSpec("P")
 T = TypeVar("T")
 Progress = Callable[[str, float, int], None]
@@ -46,12 +48,20 @@ class Steps:
 def showing_progress(function: Callable[P, T]) -> Callable[P, T]:
     """Let the argument ``progress`` of a public function be True, to show how far it is.
 
-    The function itself then gets a `Progress`; False means that nobody wants to know.
+    The function itself then gets a `Progress`; False means that nobody wants to know. It raises
+    InputError for anything else.
     """
 
     @wraps(function)
     def showing(*arguments: P.args, **named: P.kwargs) -> T:
-        if named.get("progress") is not True:
+        wanted = named.get("progress")
+        if wanted is None:
+            named.pop("progress", None)
+        elif not (isinstance(wanted, bool) or callable(wanted)):
+            what = f"progress is {type(wanted).__name__}"
+            todo = "give True, False, or a function of (what, done, of)"
+            raise InputError(what, where=function.__name__, todo=todo)
+        if wanted is not True:
             return function(*arguments, **named)
         with steps_shown() as steps:
             named["progress"] = steps

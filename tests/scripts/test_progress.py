@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from telerig import progress
+from telerig.errors import InputError
 from telerig.scripts import console
 
 
@@ -60,4 +61,7 @@ def test_a_function_shows_how_far_it_is_if_asked(capsys: pytest.CaptureFixture[s
     assert work(2) == 2 and capsys.readouterr().err == ""
     assert work(3, progress=True) == 3 and capsys.readouterr().err == "work: 3 of 3\n"
     seen: list[tuple[str, float, int]] = []
+    assert work(1, progress=None) == 1  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="work: progress is int"):
+        work(1, progress=3)  # type: ignore[arg-type]
     assert work(4, progress=lambda *step: seen.append(step)) == 4 and seen == [("work", 4, 4)]

@@ -43,6 +43,7 @@ from telerig.estimator.calibration.solver.robust_least_squares import (
     Progress,
     RobustFit,
     Solution,
+    linearisation,
     robust_solve,
     solve,
 )
@@ -164,15 +165,32 @@ def _solved(
         notes=notes, model_words=fit.model_words + added,
     )  # fmt: skip
     own = joint_covariance(final, solution)
-    free, joint = considered_covariance(final, solution, own, fit.models, considered)
+    whitened = whitened_error(solution.state, final.observations(), final.rho_mm)
+    structure = residual_tests(final, whitened, own.leverage)
+    noisier, there, shared = _with_wider_noise(final, solution, own, structure["widening"])
+    free, joint = considered_covariance(noisier, there, shared, fit.models, considered)
     weak = checks.weak_parameters(final, own)
     found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
-    checked = _trust(fit.robust, joint, free)
-    scale_change = telecentricity(final, solution, fit.models)
+    checked = _trust(fit.robust, joint, free, structure)
+    scale_change = telecentricity(noisier, there, fit.models)
     return replace(
         found, diagnostics={**found.diagnostics, **checked},
         statistics={**found.statistics, "telecentricity": scale_change},
     )  # fmt: skip
+
+
+def _with_wider_noise(
+    problem: Problem, solution: Solution, own: JointCovariance, widening: float
+) -> tuple[Problem, Solution, JointCovariance]:
+    """Return the problem with wider noise of the dots, its equations there, and the covariance.
+
+    What priors and known distances determine stays as certain as they are.
+    """
+    if widening <= 1:
+        return problem, solution, own
+    noisier = replace(problem, covariance_px2=problem.covariance_px2 * widening**2)
+    there = replace(solution, equations=linearisation(noisier)[1](solution.state))
+    return noisier, there, joint_covariance(noisier, there, leverage=own.leverage)
 
 
 def _with_origin(problem: Problem, start: State) -> Problem:
@@ -218,15 +236,17 @@ def _nominal(
 
 
 def _trust(
-    fit: RobustFit, joint: JointCovariance, free: tuple[tuple[str, ...], ...]
+    fit: RobustFit,
+    joint: JointCovariance,
+    free: tuple[tuple[str, ...], ...],
+    structure: dict[str, Any],
 ) -> dict[str, Any]:
     """Whether the covariance can be believed (split halves, residuals), and what would lower it."""
     problem, state = fit.problem, fit.solution.state
-    whitened = whitened_error(state, problem.observations(), problem.rho_mm)
     advice = next_view(replace(problem, free=free), state, joint)
     return {
         "halves": split_half_check(problem, state),
-        "structure": residual_tests(problem, whitened, joint.leverage),
+        "structure": structure,
         "next_view": {} if advice is None else advice.as_dict(),
     }
 

@@ -280,6 +280,7 @@ class Structure(Part):
 
     words: tuple[str, ...] = ()
     sound: bool = True
+    widening: float = 1.0
 
 
 class NextPose(Part):

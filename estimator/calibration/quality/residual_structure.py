@@ -44,25 +44,42 @@ def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[s
     whitened : (M, 2) whitened residuals in the order of ``problem.observations()``. leverage : (M,
     2, 2) covariance of each whitened prediction, the share of the noise that the fit absorbs.
     Returns the content of `Calibration.diagnostics`, entry "structure": "sound" (whether no test
-    found anything), "words" (sentences) and "tests" (the fields of each `ResidualTest`).
+    found anything), "words" (sentences), "tests" (the fields of each `ResidualTest`) and "widening"
+    (of the standard deviations, see `_regions`; 1 without a pattern in the image).
     """
     obs = problem.observations()
     standardised = standardised_residuals(whitened, leverage)
     share = 1 - float(np.trace(leverage, axis1=-2, axis2=-1).mean()) / 2
     tests: list[ResidualTest] = []
+    widening = [1.0]
     for c, camera in enumerate(problem.cameras):
         mine = obs.camera == c
         if mine.sum() < 2 * LEAST_IN_CELL:
             continue
         values, uv = standardised[mine], obs.uv_px[mine]
-        tests.append(_regions(camera.name, values, uv, camera.image_size_px))
+        region, power = _regions(
+            camera.name, values, uv, camera.image_size_px, len(problem.free[c])
+        )
+        tests.append(region)
+        widening.append(power if region.p_value < UNLIKELY / len(problem.cameras) else 1.0)
         tests.append(_direction(camera.name, values, share))
         tests.append(_neighbours(camera.name, values, uv, obs.view[mine]))
         tests += _views(camera.name, values, obs.view[mine], problem.views)
     limit = UNLIKELY / max(len(tests), 1)
     found = [t for t in tests if t.p_value < limit]
     words = [t.words for t in found] or ["no structure is left in the residuals"]
-    return {"sound": not found, "words": words, "tests": [asdict(t) for t in tests]}
+    widest = float(np.sqrt(max(widening)))
+    if widest > 1:
+        words.append(
+            f"for this pattern in the images every standard deviation is {widest:.2g} times what "
+            "independent errors of the dots would give"
+        )
+    return {
+        "sound": not found,
+        "words": words,
+        "tests": [asdict(t) for t in tests],
+        "widening": widest,
+    }
 
 
 def standardised_residuals(whitened: Array, leverage: Array) -> Array:
@@ -76,15 +93,25 @@ def standardised_residuals(whitened: Array, leverage: Array) -> Array:
     return np.asarray(np.einsum("mij,mj,mkj,mk->mi", vectors, scale, vectors, whitened))
 
 
-def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int]) -> ResidualTest:
-    """Test whether residuals (M, 2) point the same way in a part of the image (lens model)."""
+def _regions(
+    camera: str, values: Array, uv_px: Array, size_px: tuple[int, int], parameters: int
+) -> tuple[ResidualTest, float]:
+    """Test whether residuals (M, 2) point the same way in a part of the image (lens model).
+
+    Also returns the design effect (Kish, Survey Sampling, 1965): the variance of the means over the
+    cells, over that of independent residuals. A smooth error of the lens model that has as much
+    power in the degrees of freedom that the lens ``parameters`` absorb shifts these by so much
+    more than independent errors of the dots would.
+    """
     cell = np.clip((uv_px + 0.5) / np.array(size_px) * CELLS, 0, CELLS - 1).astype(int)
     index = cell[:, 1] * CELLS + cell[:, 0]
     count = np.bincount(index, minlength=CELLS**2)
     sums = np.stack([np.bincount(index, v, minlength=CELLS**2) for v in values.T], -1)
     full = count >= LEAST_IN_CELL
     mean = sums[full] / count[full, None]
-    p = float(chdtrc(2 * full.sum(), (count[full, None] * mean**2).sum()))
+    squares = float((count[full, None] * mean**2).sum())
+    p = float(chdtrc(2 * full.sum(), squares))
+    effect = squares / max(2 * int(full.sum()) - parameters, 1)
     lengths = np.hypot(*mean.T)
     worst = np.flatnonzero(full)[int(lengths.argmax())]
     row, column = divmod(int(worst), CELLS)
@@ -94,7 +121,7 @@ def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int])
         f"{row + 1}, column {column + 1} of {CELLS} x {CELLS}, {lengths.max():.1f} sd), so the "
         "lens model lacks a term; try a richer --model"
     )
-    return ResidualTest("region", camera, size, p, words)
+    return ResidualTest("region", camera, size, p, words), max(effect, 1.0)
 
 
 def _direction(camera: str, values: Array, share: float) -> ResidualTest:

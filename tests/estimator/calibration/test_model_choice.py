@@ -94,7 +94,10 @@ def test_the_quadratic_is_what_fits_find(names: tuple[str, str], fitted: Any) ->
     problem, rich, quadratic = fitted
     model = problem.with_model(names)
     cost = solve(model, model_start(model, rich.state)).cost
-    lenses = tuple(Lens(model_choice._lens_of(free)) for free in model.free)
+    lenses = tuple(
+        Lens(g for g, parameters in GROUPS.items() if set(parameters) <= set(free))
+        for free in model.free
+    )
     promised = quadratic.rise(lenses)
     found = 2 * (cost - rich.cost) / quadratic.variance
     assert promised == pytest.approx(found, rel=2e-3, abs=0.02)

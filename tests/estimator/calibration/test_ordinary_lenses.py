@@ -30,9 +30,11 @@ TARGET = Target(
 CENTRES = np.array([[610.0, 530.0], [660.0, 490.0]])
 
 
-def calibrated(focal_px: float, angle_deg: float, base: float, seed: int = 0) -> Calibration:
+def calibrated(
+    focal_px: float, angle_deg: float, base: float, seed: int = 0, wave_px: float = 0.0
+) -> Calibration:
     """A rig whose axes cross at ``angle_deg``; ``base`` shifts the cameras apart, as a share of
-    their distance to the target."""
+    their distance to the target; ``wave_px`` is a lens error that no model has."""
     rng = np.random.default_rng(seed)
     away_mm = focal_px * 100.0 / SIZE[0]
     ids = TARGET.ids()
@@ -50,7 +52,8 @@ def calibrated(focal_px: float, angle_deg: float, base: float, seed: int = 0) ->
             matrix = np.diag([focal_px, focal_px, 1.0])
             matrix[:2, 2] = CENTRES[c]
             uv, _ = cv2.projectPoints(world, turn, place, matrix, np.zeros(4))
-            uv = uv[:, 0] + NOISE_PX * rng.standard_normal((len(ids), 2))
+            wave = np.sin(uv[:, 0] @ [[0.005, 0.002], [0.003, 0.006]] + [c, 2.0 - c])
+            uv = uv[:, 0] + wave_px * wave + NOISE_PX * rng.standard_normal((len(ids), 2))
             tables.append(pd.DataFrame({
                 "view": f"{v}", "camera": ("left", "right")[c], "dot": ids, "u_px": uv[:, 0],
                 "v_px": uv[:, 1], "suu_px2": NOISE_PX**2, "suv_px2": 0.0, "svv_px2": NOISE_PX**2,
@@ -85,6 +88,22 @@ def test_centres_and_angle_are_as_good_as_stated(
     assert "ordinary lenses, not telecentric" in first
     assert any("nearly parallel" in note for note in found.notes) == (angle_deg < 10)
     assert ("nearly parallel" in found.diagnostics["gauge"]) == (angle_deg < 10)
+
+
+def test_a_smooth_error_of_the_lens_model_widens_the_standard_deviations() -> None:
+    """Independent errors of the dots would give centres that are up to 20 of them off."""
+    squares = []
+    for seed in range(3):
+        found = calibrated(3000.0, 45.0, 0.0, seed, wave_px=0.15)
+        widening = found.diagnostics["structure"]["widening"]
+        assert 3.0 < widening < 8.0
+        assert f"{widening:.2g} times" in found.report()
+        for camera, centre in zip(found.cameras, CENTRES):
+            for name, truth in zip(("centre_u_px", "centre_v_px"), centre):
+                error = camera.intrinsics[INDEX[name]] - truth
+                squares.append((error / found.sd(f"{camera.name}.{name}")) ** 2)
+    assert max(squares) < 4.0**2
+    assert 0.1 < np.mean(squares) < 3.0
 
 
 def test_words_of_lenses_that_are_telecentric_and_not_quite() -> None:

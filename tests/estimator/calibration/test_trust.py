@@ -147,6 +147,7 @@ class _Dots:
         self.uv_px = rng.uniform(0, 511, (count, 2))
         self.views = tuple(f"v{i}" for i in range(12))
         self.cameras = [_Camera("left"), _Camera("right")]
+        self.free = (("k1",), ("k1",))
 
     def observations(self) -> Any:
         return self
@@ -166,6 +167,8 @@ def test_noise_has_no_structure() -> None:
         dots = _Dots(rng)
         found.append(_structure(dots, rng.standard_normal((960, 2))))
     assert sum(not f["sound"] for f in found) <= 1
+    assert np.median([f["widening"] for f in found]) == 1
+    assert max(f["widening"] for f in found) < 1.5
     chances = np.array([t["p_value"] for f in found for t in f["tests"] if t["name"] != "view"])
     assert 0.35 < np.mean(chances < 0.5) < 0.65
     assert np.mean(chances < 0.05) < 0.09
@@ -178,7 +181,10 @@ def test_each_structure_is_named() -> None:
     left = dots.camera == 0
 
     region = noise + 2.0 * ((dots.uv_px[:, :1] < 120) & left[:, None])
-    assert "row" in _only(_structure(dots, region), "region", "left")
+    found = _structure(dots, region)
+    assert "row" in _only(found, "region", "left")
+    assert 5 < found["widening"] < 8
+    assert f"{found['widening']:.2g} times" in found["words"][-1]
     direction = np.where(left[:, None], noise * [1.6, 1.0], noise)
     assert "along" in _only(_structure(dots, direction), "direction", "left")
     view = noise * np.where((dots.view == 4) & left, 2.0, 1.0)[:, None]

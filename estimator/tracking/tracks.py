@@ -128,10 +128,9 @@ class StoredTracks:
 
     def between(self, first: int, end: int) -> Tracks:
         """Return what there is in the frames from ``first`` to before ``end``."""
-        table = self.table.between(first, end)
-        detections = (
-            table.iloc[:0] if self.detections is None else self.detections.between(first, end)
-        )
+        table, detections = self.table.between(first, end), pd.DataFrame()
+        if self.detections is not None:
+            detections = self.detections.between(first, end)
         return Tracks(self.name, detections, table, pd.DataFrame(columns=EVENT_COLUMNS))
 
 

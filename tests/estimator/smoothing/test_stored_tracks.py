@@ -50,6 +50,11 @@ def test_a_run_is_tracked_and_smoothed_from_disk(
         pd.testing.assert_frame_equal(*both)
     pd.testing.assert_frame_equal(whole.trajectories, stored.trajectories)
     pd.testing.assert_frame_equal(whole.shake, stored.shake)
+    bare = smooth_run(
+        telerig.load_run(run), calibration, tmp_path / "stored" / "tracks.csv", tmp_path / "bare",
+        model="default", report=False,
+    )  # fmt: skip
+    assert set(bare.trajectories["particle"]) == set(whole.trajectories["particle"])
 
 
 def test_a_table_on_disk_has_the_rows_of_each_frame(

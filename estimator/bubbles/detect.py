@@ -56,7 +56,7 @@ _DEFOCUS_FLOOR_PX = 1.5
 _SHARP_SHARE = 0.15
 """An edge narrower than this against the radius is sharp, in a crowd of bubbles of many sizes."""
 _SMALL_EDGES = 3.0
-_MOSTLY_SEEN = 0.6
+_MOSTLY_SEEN, _KNOWN_COVERAGE = 0.6, 0.3
 _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
 
 COVERED_LIMIT, COVERED_LIMIT_EVERYWHERE = 0.1, 0.2
@@ -176,28 +176,45 @@ def _found(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
     parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
-    crowd = None
+    parts, slender = _without_slender(parts)
+    rejected += slender
+    clusters = [blobs[part.blob].contour_px for part in parts if part.merged]
+    if not (parts or everywhere):
+        return _bubbles({}, rejected, sigma, "no shadow dark and large enough")
+    dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
+    outlines, sharp_share, merged = None, 0.0, np.zeros(0, np.bool_)
+    known, ellipses = np.zeros(0, np.intp), np.zeros((0, 5))
+    if parts:
+        start = _start(parts, blobs, sigma, dark_sigma)
+        outlines = fit_outlines(ratio, start)
+        merged = _merged(outlines, parts)
+        known = np.flatnonzero(~merged & _known(outlines))
+        ellipses = outlines.ellipse[known]
     if everywhere:
         crowd = resolved_crowd(
-            ratio, sigma, blobs, parts, min_diameter_px=min_diameter_px, min_contrast=min_contrast
+            ratio,
+            sigma,
+            blobs,
+            parts,
+            ellipses,
+            min_diameter_px=min_diameter_px,
+            min_contrast=min_contrast,
         )
-        blobs, parts = crowd.blobs, crowd.parts
-        rejected += crowd.rejected
-    else:
-        parts, slender = _without_slender(parts)
-        rejected += slender
-    clusters = crowd.clusters if crowd else [blobs[p.blob].contour_px for p in parts if p.merged]
-    if not parts:
-        nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
-        return replace(nothing, clusters=clusters)
-    dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
-    start = _start(parts, blobs, sigma, dark_sigma)
-    outlines = fit_outlines(ratio, start)
-    if crowd:
-        outlines, merged = settled(outlines, crowd.rims), np.zeros(len(parts), np.bool_)
-    else:
-        merged = _merged(outlines, parts)
-    sharp_share = _SHARP_SHARE if crowd else 0.0
+        rejected, clusters = rejected + crowd.rejected, crowd.clusters
+        whole = [*blobs, *crowd.blobs]
+        parts = [*(parts[k] for k in known), *crowd.parts]
+        if not parts:
+            nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
+            return replace(nothing, clusters=clusters)
+        start = _start(parts, whole, sigma, dark_sigma)
+        every = fit_outlines(ratio, start)
+        last = np.arange(len(known), len(parts))
+        every = every.updated(last, settled(every.taken(last), crowd.rims))
+        if outlines is not None:
+            every = every.updated(np.arange(len(known)), outlines.taken(known))
+        outlines, merged = every, np.zeros(len(parts), np.bool_)
+        sharp_share = _SHARP_SHARE
+    assert outlines is not None
     defocused = _defocused(outlines, sharp_share)
     judged = {"defocus": defocused, "merged": merged}
     columns = _columns(outlines, judged, image.shape, field, clipped)
@@ -360,6 +377,12 @@ def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
     blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
     suspect = np.array([part.blob in blobs for part in parts])
     return merged | (suspect & (outlines.coverage < _MOSTLY_SEEN))
+
+
+def _known(outlines: Outlines) -> Bools:
+    """Return (B,) which fits are finite and saw enough to be kept in a crowd."""
+    finite = np.isfinite(outlines.ellipse).all(axis=1)
+    return np.asarray(finite & (outlines.coverage > _KNOWN_COVERAGE))
 
 
 def _defocused(outlines: Outlines, sharp_share: float) -> Bools:

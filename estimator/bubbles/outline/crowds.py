@@ -62,6 +62,7 @@ def resolved_crowd(
     sigma: float,
     blobs: list[Blob],
     parts: list[Part],
+    known: Array,
     *,
     min_diameter_px: float,
     min_contrast: float,
@@ -70,25 +71,32 @@ def resolved_crowd(
 
     ratio : (rows, columns) grey levels divided by the background; sigma : noise of a pixel.
     blobs, parts : the dark regions, and what their outlines tell of the bubbles in them.
+    known : (K, 5) ellipses of bubbles that are sure. Their rims belong to them; they are not
+        among the bubbles that are returned, the blobs of which follow ``blobs``.
     """
     largest = min(ratio.shape) / _LARGEST_SHARE
     rims = find_rims(ratio, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
     single = {part.blob: part.ellipse for part in parts if not (part.merged or part.shared)}
     large = [ellipse for ellipse in single.values() if ellipse[2] * ellipse[3] > largest**2]
+    sure = rims_along(ratio, sigma, known.reshape(-1, 5))
     if large:
         rims = rims.and_also(rims_along(ratio, sigma, np.stack(large)))
-    rims = rims[sole_owners(rims)]
-    heart = typical_heart(rims, min_diameter_px)
-    rims = refitted(rims[are_bubbles(rims, heart, min_contrast)])
-    clusters, rejected, explained = [], [], _explained(ratio.shape, rims.ellipse)
+    every = sure.and_also(rims)
+    order = sole_owners(every, len(sure))
+    heart = typical_heart(every[order], min_diameter_px)
+    every = every[np.sort(order)]
+    kept = are_bubbles(every, heart, min_contrast) | (np.arange(len(every)) < len(sure))
+    every = refitted(every[kept])
+    sure, rims = every[: len(sure)], every[len(sure) :]
+    clusters, rejected, explained = [], [], _explained(ratio.shape, every.ellipse)
     for index, blob in enumerate(blobs):
-        if index not in single or np.any(_within(blob, rims)):
+        if index not in single or np.any(_within(blob, every)):
             clusters += _left(ratio, blob, explained, min_diameter_px)
         else:
             u, v, a, b, _ = single[index].tolist()
             rejected.append(Rejected(u, v, (a * b) ** 0.5, _UNLIKE))
     own = [_blob(rims, k) for k in range(len(rims))]
-    found = [Part(ellipse, k) for k, ellipse in enumerate(rims.ellipse)]
+    found = [Part(ellipse, len(blobs) + k) for k, ellipse in enumerate(rims.ellipse)]
     return Crowd(own, found, rims, clusters, rejected)
 
 

@@ -211,6 +211,10 @@ class Outlines:
         every = (self.ellipse, self.harmonics, self.sigma_px, self.outer, self.inner)
         return RimState(*(values[index] for values in every))
 
+    def taken(self, index: Index) -> Outlines:
+        """Return the outlines at the positions ``index``."""
+        return Outlines(*(getattr(self, field.name)[index] for field in fields(self)))
+
     def updated(self, index: Index, other: Outlines) -> Outlines:
         """Return a copy with the outlines at the positions ``index`` replaced by ``other``."""
         changed = {}

@@ -76,7 +76,7 @@ class Rims:
     def __len__(self) -> int:
         return int(self.ellipse.shape[0])
 
-    def __getitem__(self, index: Index | Bools) -> Rims:
+    def __getitem__(self, index: Index | Bools | slice) -> Rims:
         return Rims(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def and_also(self, other: Rims) -> Rims:
@@ -201,8 +201,8 @@ def rims_along(ratio: Float32, sigma: float, ellipse: Array) -> Rims:
         calm, ellipse, window, _NOISE_SLOPE * sigma, stiffness
     )
     used = strength > _SEEN_STRENGTH
-    enough = used.sum(axis=1) >= _LEAST_SEEN
-    return measured_rims(calm, sigma, ellipse[enough], points[enough], used[enough])
+    used[used.sum(axis=1) < _LEAST_SEEN] = True
+    return measured_rims(calm, sigma, ellipse, points, used)
 
 
 def measured_rims(calm: Float32, sigma: float, ellipse: Array, points: Array, used: Bools) -> Rims:
@@ -234,10 +234,15 @@ def typical_heart(rims: Rims, min_diameter_px: float) -> float:
     return float(np.clip(np.quantile(large.heart[sure], _HEARTS_SHOW), 0.0, _FULL_HEART))
 
 
-def sole_owners(rims: Rims) -> Index:
-    """Return the positions of candidates no two of which claim the same rim, the surest first."""
-    order = np.argsort(-rims.agreement, kind="stable")
+def sole_owners(rims: Rims, sure: int = 0) -> Index:
+    """Return the positions of candidates no two of which claim the same rim, the surest first.
+
+    sure : number of candidates, the first ones, that are bubbles in any case.
+    """
+    rank = rims.agreement + np.where(np.arange(len(rims)) < sure, 2.0, 0.0)
+    order = np.argsort(-rank, kind="stable")
     least = _OWN_SHARE * rim_kernels.RAYS * rims.inside
+    least[:sure] = 0.0
     own = rim_kernels.owners(order, rims.ellipse, rims.places, rims.strong, least)
     return np.asarray(order[own[order]])
 

@@ -1,12 +1,14 @@
 """Sizes, shapes, forces and oscillations of simulated bubbles beside their truth.
 
-    python benchmarks/bubble_physics.py [--seeds 10] [--bubbles 6] [--frames 250]
+    python benchmarks/bubble_physics.py [--seeds 10] [--bubbles 6] [--frames 250] [--images 60]
 
 Bubbles of the preset "forces" obey an equation of motion with a known drag coefficient (Clift et
 al. 1978), added mass and lift, in a shaking rig with an encoder, an accelerometer on each arm and
 marks. Each run is calibrated, tracked (with given ids) and smoothed; bubbles.csv and
 bubble_summary.csv are compared with the truth. A second table gives the same numbers for motion
 that is the truth plus the stated errors, so that shape and forces are tested by themselves.
+
+With --images a run of so many frames is rendered, and its outlines are found in the images.
 
 For each number: root mean square error, median stated standard deviation, and NEES, the mean square
 of error over stated standard deviation: 1 where the statements are right.
@@ -17,6 +19,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +27,7 @@ import pandas as pd
 
 import telerig
 from telerig.arrays import Array
+from telerig.estimator.physics.bodies import bodies_table
 from telerig.estimator.physics.frames import frames_table
 from telerig.estimator.physics.oscillation import dominant_oscillation
 from telerig.estimator.physics.summary import summary_table
@@ -209,6 +213,34 @@ def case(config: RunConfig, seed: int) -> dict[str, list[tuple[str, str, Array, 
     }
 
 
+def from_images(config: RunConfig, seed: int) -> list[tuple[str, str, Array, Array, Array]]:
+    """Errors of the bodies whose outlines were found in rendered images."""
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = telerig.simulate(config, rng=np.random.default_rng(seed), out=Path(folder) / "d")
+        calibration, run = telerig.calibrate(dataset), dataset.runs[config.name].load()
+        tracks = telerig.track(run, calibration)
+    bodies, _ = bodies_table(tracks, calibration.cameras, UP)
+    keys = ["frame", "particle"]
+    found = bodies.merge(tracks.table[[*keys, "x_mm", "y_mm", "z_mm"]], on=keys)
+    found = found.assign(y_mm=found["y_mm"] - run.position_mm[found["frame"]])
+    parts = []
+    for frame, truth in true_table(config, seed).groupby("frame"):
+        mine = found[found["frame"] == frame]
+        places = [t[["x_mm", "y_mm", "z_mm"]].to_numpy() for t in (mine, truth)]
+        away = np.linalg.norm(places[0][:, None] - places[1], axis=-1)
+        true = truth.iloc[away.argmin(1)] if len(mine) else truth[:0]
+        parts.append(true.assign(particle=mine["particle"].to_numpy()))
+    both = found.merge(pd.concat(parts), on=keys, suffixes=("", "_true"))
+    out = []
+    for name in ("d_eq_mm", "aspect", "tilt_deg"):
+        error, sd = both[name] - both[f"{name}_true"], both[sd_of(name)]
+        good = np.isfinite(error) & (both[name] > 3 * sd)
+        out.append(
+            ("frame", name, *(c[good].to_numpy() for c in (error, sd, both[f"{name}_true"])))
+        )
+    return out
+
+
 def pooled(cases: list[dict[str, list[tuple[str, str, Array, Array, Array]]]]) -> pd.DataFrame:
     """One row per number: count, relative bias, RMS error, median sd, NEES."""
     rows = []
@@ -234,11 +266,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--bubbles", type=int, default=6)
     parser.add_argument("--frames", type=int, default=250)
+    parser.add_argument("--images", type=int, default=0)
     arguments = parser.parse_args()
     config = run_preset("forces", bubbles=arguments.bubbles, frames=arguments.frames)
     start, cases = time.process_time(), []
     for seed in range(arguments.seeds):
         cases.append(case(config, seed))
+        if arguments.images:
+            fewer = replace(config, frames=arguments.images)
+            cases[-1]["from images"] = from_images(fewer, seed)
     table = pooled(cases)
     print(f"{arguments.seeds} seeds, {time.process_time() - start:.0f} s of CPU\n")
     print(

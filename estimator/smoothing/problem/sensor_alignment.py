@@ -631,6 +631,11 @@ def _mountings(
             if apart < 0:
                 axes[worst] = next(s.axes for s in sensors if s.name == worst)
                 worst, axes[rival] = rival, judged[rival].axes
+        elif len(sensors) == 2 and np.isfinite(leads[worst]):
+            (other,) = (n for n in judged if n != worst)
+            doubtful = not np.allclose(axes[other], judged[other].axes)
+            if doubtful and lead_of_images(worst, judged) < CLEAR_NATS:
+                return [*findings, _one_of(worst, other, judged)]
         findings.append(_axes_finding(worst, judged[worst]))
     for name, found in judged.items():
         if found.wrong_gain and name not in measured:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from places import ROOT
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from shake_scene import Run, cases, simulate
 
-from telerig.estimator.sensors.findings import Finding
+from telerig.estimator.sensors.findings import Code, Finding
+from telerig.estimator.sensors.mounting import Mounting
+from telerig.estimator.smoothing.problem import sensor_alignment
 from telerig.estimator.smoothing.problem.problem import Accelerometer
 from telerig.estimator.smoothing.problem.sensor_alignment import aligned
 from telerig.estimator.smoothing.smooth import problem_of
@@ -126,3 +129,34 @@ def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
     (finding,) = [f for f in said if f.code is not None]
     assert finding.code == "ENCODER_SCALE"
     assert finding.fix == ({"encoder_factor": pytest.approx(4.0, rel=2e-3)} if known else {})
+
+
+@pytest.mark.parametrize(
+    ("of_images", "blamed"), [(0.5, "accelerometers right and left"), (20.0, "accelerometer right")]
+)
+def test_an_arm_is_blamed_only_by_what_the_images_show(
+    of_images: float, blamed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other arm's contradiction is not clear by itself, but it alone accuses this one."""
+    turned = {"left": np.diag([-1.0, 1, -1]), "right": np.diag([1.0, -1, -1])}
+    stated = {"left": np.eye(3), "right": 1.0 * np.eye(3)[:, ::-1]}
+    sensors = tuple(
+        SimpleNamespace(
+            name=name, axes=axes, confirmed=True, unused_axes=(), reading_mm_s2=np.zeros((9, 3))
+        )
+        for name, axes in stated.items()
+    )
+
+    def judged(axes: Any, *_: Any) -> Mounting:
+        name = next(n for n, one in stated.items() if one is axes)
+        clear, lead = (True, 12.0) if name == "right" else (False, 6.0)
+        return Mounting(turned[name], clear, lead, float("nan"), float("inf"))
+
+    monkeypatch.setattr(sensor_alignment, "mounting", judged)
+    monkeypatch.setattr(sensor_alignment, "lead_of_axes", lambda *_: of_images)
+    read = (np.zeros((9, 3)), np.ones(9, bool))
+    for name, value in (("_exchanged", None), ("_felt", []), ("_at_frames", read)):
+        monkeypatch.setattr(sensor_alignment, name, lambda *_, value=value: value)
+    problem: Any = SimpleNamespace(accelerometers=sensors, up=np.array([0.0, -1.0, 0.0]))
+    found = sensor_alignment._mountings(problem, None, ())  # type: ignore[arg-type]
+    assert [(one.where, one.code) for one in found] == [(blamed, Code.SENSOR_AXES)]

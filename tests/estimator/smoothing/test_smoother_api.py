@@ -371,7 +371,7 @@ def test_a_sensor_that_is_touched_for_ten_milliseconds_is_said(sharp: bool) -> N
         spoilt.tracks, spoilt.calibration, stage=spoilt.stage, accelerometers=sensors, rig=RIG
     )
     if not sharp:
-        assert found.verdict == "CONTRADICTED"
+        assert found.verdict["verdict"] == "CONTRADICTED"
         return
     assert rms_um(found.trajectories, spoilt.truth_mm) < 80
     said = [w for w in found.summary["warnings"] if "are shifted" in w]

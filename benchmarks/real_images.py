@@ -3,7 +3,8 @@
 python benchmarks/real_images.py FOLDER [--out benchmarks/results/real_images.md]
 
 FOLDER holds CalB-sys2-00NN_0.jpeg (left) and _1.jpeg (right), or dic_stereo_dots with these, and
-plates_discorpy and plates_boofcv, which `plates.real` measures.
+plates_discorpy and plates_boofcv, which `plates.real` measures, and the images of bubbles that
+`dense_bubbles` measures (more than half an hour).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from dense_bubbles import report as bubbles_report
 from plates import real
 
 import telerig
@@ -94,6 +96,7 @@ def main() -> None:
             print(lines[-1], flush=True)
     if whole:
         lines += ["", "Plates of other laboratories:", "", *real(options.folder)]
+        lines += ["", *bubbles_report(options.folder, 3)]
     text = "\n".join([*lines, ""])
     print(text)
     if options.out is not None:

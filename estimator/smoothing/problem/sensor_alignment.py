@@ -794,7 +794,8 @@ def _encoder(
         clear = _CLEAR_GAIN if finding.code == Code.ENCODER_SCALE else _CLEAR_UNIT
         if min(abs(gain), abs(gain - 1)) > clear * sd and not usual:
             return [finding]
-    if clock is not None and clock.clear and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
+    judged = clock is not None and clock.clear and len(problem.t_s) >= _LEAST_FRAMES
+    if clock is not None and judged and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
         return [
             Finding(
                 f"its clock is {clock.offset_s:+.4f} ± {clock.sd_s:.4f} s off that of the frames, "

@@ -173,7 +173,7 @@ def use_rows(results: SmoothingResults) -> list[Row]:
                 str(use.grade),
                 words_of_use(use),
                 use.axis,
-                f"{with_sd(use.value, use.sd)} {use.unit}",
+                f"{with_sd(use.value, use.sd)} {use.unit.replace('^2', '²')}",
                 ", ".join(use.assumes) or "-",
             ),
             strong=use.grade == Grade.NO,

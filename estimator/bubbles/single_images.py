@@ -25,6 +25,8 @@ from telerig.io.files.csv_table import write_table
 from telerig.io.images.read import Image, read_image
 
 CLUSTER_COLUMNS = ("image", "cluster", "u_px", "v_px")
+_MOST_NAMED = 12
+"""More clusters are only drawn: their words would hide the bubbles."""
 _OUTLINE_POINTS = 64
 _BUBBLE, _CLUSTER = (90, 220, 90), (250, 160, 50)
 
@@ -129,7 +131,8 @@ def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
         words.append("")
         colours.append(_BUBBLE)
     outlines += bubbles.clusters
-    words += ["not resolved"] * len(bubbles.clusters)
+    few = len(bubbles.clusters) <= _MOST_NAMED
+    words += ["not resolved" if few else ""] * len(bubbles.clusters)
     colours += [_CLUSTER] * len(bubbles.clusters)
     places = bubbles.rejected[["u_px", "v_px", "radius_px"]].to_numpy(float).tolist()
     marks = [(u, v, r, str(why)) for (u, v, r), why in zip(places, bubbles.rejected["reason"])]
@@ -141,7 +144,7 @@ def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
         words += ["the field"] * len(edges)
         colours += [(90, 160, 250)] * len(edges)
     single, clusters = len(bubbles.accepted), len(bubbles.clusters)
-    found = f"{_count(single, 'bubble')}, {_count(clusters, 'cluster')}"
+    found = f"{_count(single, 'bubble')}, {_count(clusters, 'cluster')} not resolved"
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks, found=found)
     path.parent.mkdir(parents=True, exist_ok=True)
     written, encoded = cv2.imencode(path.suffix, picture[..., ::-1])

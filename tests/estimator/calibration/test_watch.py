@@ -201,7 +201,7 @@ def test_a_bad_image_is_named_and_the_rest_goes_on(paper_images: Path, empty: Pa
         until(lambda: "4 complete views" in it.lines[-1], "the view to be left out again")
     run = it.result[1]
     assert any(
-        f"view {Path(names[3]).stem}, camera left left out" in n for n in run.calibration.notes
+        f"view {Path(names[3]).stem}, camera left is left out" in n for n in run.calibration.notes
     )
     assert run.calibration.statistics["views"] >= 4
 

@@ -191,7 +191,7 @@ def test_bad_input_is_told_in_words(dataset: Path, tmp_path: Path) -> None:
         ([tmp_path / "empty"], "holds no results"),
         ([tmp_path / "file"], "is a file, not a folder"),
         ([tmp_path / "none"], "there is no such folder"),
-        ([dataset / "results" / "batch", "--film"], "films are of runs"),
+        ([dataset / "results" / "batch", "--film"], "films are made of runs"),
     ):
         said = command(*arguments, code=2)
         assert words in said and "->" in said

@@ -376,9 +376,9 @@ def _summary(dots: Dots, axis: Array, travel_per_reading: float, joint: Array) -
     direction = ", ".join(f"{v:.6f}" for v in axis)
     scale_ppm = 1e6 * (1 / travel_per_reading - 1)
     return [
-        f"travel along ({direction}) +- {angle:.2g} deg, from {len(dots.views)} positions over "
+        f"travel along ({direction}) ± {angle:.2g} deg, from {len(dots.views)} positions over "
         f"{np.ptp(dots.reading_mm):.4g} mm",
-        f"the encoder reads {scale_ppm:+.0f} +- {1e6 * np.sqrt(joint[2, 2]):.0f} ppm "
+        f"the encoder reads {scale_ppm:+.0f} ± {1e6 * np.sqrt(joint[2, 2]):.0f} ppm "
         "more than the travel",
     ]
 

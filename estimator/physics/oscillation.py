@@ -50,7 +50,7 @@ def dominant_oscillation(
     the variances S / T of A and 3 S / (pi^2 A^2 T^3) of f, the Cramer-Rao bound for white noise of
     that density.
     None where the record is shorter than 1.5 periods or 16 samples, or where the amplitude is below
-    4 of its standard deviations.
+    6 of its standard deviations.
     """
     good = np.isfinite(values).all(-1)
     t, y = np.asarray(t_s, float)[good], np.asarray(values, float)[good]

@@ -13,10 +13,6 @@ from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillat
 from telerig.io.results.bubbles import SUMMARY_COLUMNS, WHOLE
 from telerig.rig.bubble_physics import Liquid
 
-_LEAST_COMMON = 0.02
-"""Share of the variance that frames have in common at the least: scatter over few correlated frames
-can look like all of it."""
-
 _ABOVE_ZIGZAG = 2.6
 """Shape oscillations are sought above the zigzag's second harmonic, with which the aspect ratio
 follows the bubble's speed."""
@@ -62,16 +58,16 @@ def _row(mine: pd.DataFrame, up: Array, liquid: Liquid | None) -> dict[str, Any]
 def mean_of_body(values: Array, sd: Array) -> tuple[float, float]:
     """Mean over a bubble's frames of a property of its body, with a standard deviation.
 
-    Of the stated variance, the part that is not seen as scatter is common to all frames; scatter
-    averages out over its correlation time.
+    The stated errors do not average out, because frames share how the body and its outline differ
+    from a spheroid and an ellipse. Scatter beyond them is the body's own motion, and averages out
+    over its correlation time.
     """
     good = np.isfinite(values) & np.isfinite(sd)
     if not good.any():
         return float("nan"), float("nan")
     x, variance = values[good], float((sd[good] ** 2).mean())
-    scatter = float(x.var())
-    common = max(variance - scatter, _LEAST_COMMON * variance)
-    return float(x.mean()), float(np.sqrt(common + scatter * _correlated_share(x)))
+    beyond = max(float(x.var()) - variance, 0.0)
+    return float(x.mean()), float(np.sqrt(variance + beyond * _correlated_share(x)))
 
 
 def _correlated_share(x: Array) -> float:

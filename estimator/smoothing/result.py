@@ -194,7 +194,8 @@ def bubble_table(smoothing: Smoothing, fluid: Any = None) -> pd.DataFrame:
         surface_tension_n_m, and if known velocity_mm_s, gas_density_kg_m3); None for the one of the
         run's rig.toml. Without one the dimensionless numbers are NaN.
 
-    Raises InputError for a fluid that lacks a key or has an impossible value.
+    Raises InputError for a fluid that lacks a key or has an impossible value, and for anything but
+    a Smoothing.
     """
     from telerig.estimator.physics.frames import frames_table
 
@@ -223,6 +224,11 @@ def bubble_summary(
 
 def _surroundings(smoothing: Smoothing, fluid: Any) -> tuple[Array, float, Any]:
     """The direction up (3,), gravity in m/s^2, and the liquid: the given one or that of the run."""
+    if not isinstance(smoothing, Smoothing):
+        raise InputError(
+            f"tables of bubbles are made from a Smoothing, not from {type(smoothing).__name__}",
+            todo="give what telerig.smooth or telerig.load_smoothing returns",
+        )
     summary = smoothing.summary
     up = np.asarray(summary.get("up") or (0.0, -1.0, 0.0), float)
     gravity = float(summary.get("gravity_m_s2") or STANDARD_GRAVITY_M_S2)

@@ -26,7 +26,7 @@ def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
         depth = lens["depth_mm"]
         change, sd = (100 * depth * lens[key] for key in ("change_per_mm", "sd_per_mm"))
         amount = (
-            f"its scale changes by {change:.2g} +- {sd:.1g} % over the views' {depth:.3g} mm of "
+            f"its scale changes by {change:.2g} ± {sd:.1g} % over the views' {depth:.3g} mm of "
             "depth"
         )
         if abs(change) < 100 * TELECENTRIC:

@@ -149,8 +149,8 @@ def test_output_is_compared() -> None:
 @pytest.mark.parametrize(
     ("page", "printed", "same"),
     [
-        ("scale 10.04 +- 0.02", "scale 10.049 +- 0.02 px", True),
-        ("scale 10.04 +- 0.02", "scale 10.06 +- 0.02 px", False),
+        ("scale 10.04 ± 0.02", "scale 10.049 ± 0.02 px", True),
+        ("scale 10.04 ± 0.02", "scale 10.06 ± 0.02 px", False),
         ("12 views, RMS 0.0091 px (3.1 s)", "12 views, RMS 0.0092 px (7.9 s)", True),
         ("12 views", "13 views", True),
         ("12 views", "14 views", False),

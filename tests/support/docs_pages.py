@@ -187,13 +187,13 @@ def check_output(block: Block, said: str) -> None:
 def like(line: str, printed: str) -> bool:
     """Whether the numbers of a page's line are those that were printed.
 
-    A number before ``+- sd`` may differ by half of this standard deviation, a whole number by 1 or
+    A number before ``± sd`` may differ by half of this standard deviation, a whole number by 1 or
     2 % of it, seconds by anything, and every other number by 10 % or one unit of its last digit.
     """
     for match, other in zip(NUMBER.finditer(line), NUMBER.finditer(printed)):
         text, after = match[0].strip(".,"), line[match.end() :]
         value, seen = (float(m[0].rstrip(".,").replace(",", "")) for m in (match, other))
-        sd = re.match(r" \+- ([\d.e-]+\d)", after)
+        sd = re.match(r" ± ([\d.e-]+\d)", after)
         decimals = len(text.partition(".")[2])
         if sd:
             near = 0.5 * float(sd[1])

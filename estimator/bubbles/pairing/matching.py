@@ -453,7 +453,7 @@ class PairModel:
         return [
             f"The run gives {self.pairs:.1f} pairs. The two rays of a pair miss each other by "
             f"{raw:.2f} px RMS along the axis that the cameras share, on average by "
-            f"{offset:+.2f} +- {error:.2f} px.",
+            f"{offset:+.2f} ± {error:.2f} px.",
             *(text for finding, text in texts.items() if finding in {*self.findings} - {*without}),
         ]
 

@@ -92,7 +92,7 @@ class Calibration(ShortText):
         scales = []
         for camera in self.cameras:
             name = f"{camera.name}.scale_px_per_mm"
-            sd = f" +- {self.sd(name):.2g}" if name in self.covariance_names else ""
+            sd = f" ± {self.sd(name):.2g}" if name in self.covariance_names else ""
             scales.append(f"{camera.name} {camera['scale_px_per_mm']:.6g}{sd} px/mm")
         facts = {"cameras": ", ".join(scales)}
         if "views" in s:
@@ -102,8 +102,7 @@ class Calibration(ShortText):
             )
         if "axes_angle_deg" in s:
             facts["angle"] = (
-                f"{s['axes_angle_deg']:.4f} +- {s['axes_angle_sd_deg']:.2g} degrees between the "
-                "axes"
+                f"{s['axes_angle_deg']:.4f} ± {s['axes_angle_sd_deg']:.2g} degrees between the axes"
             )
         if "space_sd_um" in s:
             facts["a point"] = (

@@ -31,7 +31,7 @@ def summary(calibration: CalibrationFile) -> str:
     lines.append(f"  model {calibration.model.words}")
     for camera_name, camera in calibration.cameras.items():
         parts = [
-            f"{name} {camera.parameters[name]:.6g} +- {deviation or 0.0:.2g}"
+            f"{name} {camera.parameters[name]:.6g} ± {deviation or 0.0:.2g}"
             for name, deviation in camera.standard_deviations.items()
         ]
         lines.append(f"  camera {camera_name}: " + ", ".join(parts))
@@ -40,7 +40,7 @@ def summary(calibration: CalibrationFile) -> str:
     for other, angle in others.items():
         which = f" of {first} and {other}" if other else ""
         lines.append(
-            f"  angle between the axes{which} {angle['axes_angle_deg']:.4f} +- "
+            f"  angle between the axes{which} {angle['axes_angle_deg']:.4f} ± "
             f"{angle['axes_angle_sd_deg']:.2g} degrees"
         )
     if "space_sd_um" in s:

@@ -54,6 +54,7 @@ _LEAST_SAMPLES_KEPT = 0.95
 _MOST_ROUNDS, _LEAST_SCALE = 5, 1e-9
 _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
 _LARGEST_STEP_PX = 5.0
+_ROUNDING = 1e-9
 _STACK_BYTES = 512 << 20
 _AT_ONCE = 8192
 _COLUMNS_AT_ONCE = 4
@@ -237,6 +238,7 @@ def _solve(
         residuals = pixel_residuals(graph, state)
     _check_converged(graph, state, 0.0 if exact else last.largest_px)
     found = _finish(graph, state, (weights, residuals), last, options, done, progress)
+    _check_variances(found.covariances)
     return replace(
         found, sample_weights=samples, sample_residuals=sample_residuals(graph, found.state)
     )
@@ -262,6 +264,21 @@ def _check_converged(graph: GraphLayout, state: State, largest_px: float) -> Non
             where="smooth",
             todo="check calibration, encoder and sensors, or smooth without each of them in turn",
         )
+
+
+def _check_variances(found: Covariances | None) -> None:
+    """Raise CalibrationError if rounding has left a state without a positive variance."""
+    if found is None:
+        return
+    for what, covariance in (("bubble", found.bubbles), ("rig", found.shake)):
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        if variance.size and np.any(variance < -_ROUNDING * variance.max(axis=0)):
+            raise CalibrationError(
+                f"a state of a {what} has a negative variance: it is hardly determined",
+                where="smooth",
+                todo="look for short or broken tracks in tracking's report and drop them in "
+                "corrections.csv, or smooth with other sensors",
+            )
 
 
 def _warm(graph: GraphLayout, state: State, start: Solution) -> State:

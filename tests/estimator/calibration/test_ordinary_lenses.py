@@ -114,9 +114,9 @@ def test_words_of_lenses_that_are_telecentric_and_not_quite() -> None:
         }
     })  # fmt: skip
     assert words == [
-        "camera left is telecentric: its scale changes by 0.02 +- 0.002 % over the views' 20 mm of "
+        "camera left is telecentric: its scale changes by 0.02 ± 0.002 % over the views' 20 mm of "
         "depth",
-        "camera right is not quite telecentric: its scale changes by -0.4 +- 0.002 % over the "
+        "camera right is not quite telecentric: its scale changes by -0.4 ± 0.002 % over the "
         "views' 20 mm of depth",
     ]
     assert telecentricity_words({}) == []

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import telerig
 from telerig.errors import InputError
 from telerig.estimator.physics.bodies import bodies_table
 from telerig.estimator.physics.frames import frames_table, propagated
@@ -137,12 +138,12 @@ def test_bodies_of_a_table_without_outlines_are_diameters() -> None:
     assert not len(bodies_table(tracks.drop(columns="d_eq_mm").assign(d_eq_mm=np.nan), (), UP)[0])
 
 
-def test_the_mean_of_a_body_keeps_what_frames_have_in_common() -> None:
+def test_the_mean_of_a_body_averages_only_what_exceeds_its_stated_errors() -> None:
     rng = np.random.default_rng(2)
     ratio = []
     for _ in range(300):
-        common, own = 0.02 * rng.standard_normal(), 0.01 * rng.standard_normal(400)
-        mean, sd = mean_of_body(3.0 + common + own, np.full(400, np.hypot(0.02, 0.01)))
+        common, own = 0.02 * rng.standard_normal(), 0.2 * rng.standard_normal(400)
+        mean, sd = mean_of_body(3.0 + common + own, np.full(400, 0.02))
         ratio.append((mean - 3.0) / sd)
     assert np.mean(np.square(ratio)) == pytest.approx(1.0, abs=0.25)
     assert np.isnan(mean_of_body(np.full(3, np.nan), np.full(3, np.nan))[0])
@@ -205,3 +206,8 @@ def test_a_bubble_is_summarised() -> None:
     alone = summary_table(frames_table(motion(1), None, UP, G), UP)
     assert alone.loc[0, "rise_mm_s"] == 250.0 and alone.loc[0, "s_rise_mm_s"] == 3.0
     assert not len(summary_table(frames.iloc[:0], UP))
+
+
+def test_a_table_of_bubbles_needs_a_smoothing() -> None:
+    with pytest.raises(InputError, match="from a Smoothing, not from int"):
+        telerig.bubble_table(3)  # type: ignore[arg-type]

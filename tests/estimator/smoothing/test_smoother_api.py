@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +16,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from telerig.errors import InputError
+from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.sensors.findings import SensorError
-from telerig.estimator.smoothing.graph.solve import SampleRejection
+from telerig.estimator.smoothing.graph.solve import Covariances, SampleRejection, _check_variances
 from telerig.estimator.smoothing.problem.problem import CarriageModel, RigMode, ShakeModel
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
@@ -354,6 +355,19 @@ def test_samples_in_a_row_that_two_sensors_contradict_are_used_by_neither() -> N
     weights, _ = SampleRejection(True, (t_s, t_s)).update((None, None), (alone, second))
     assert weights[1] is None and weights[0] is not None
     assert np.flatnonzero(weights[0] == 0).tolist() == [300, 1000]
+
+
+def test_a_negative_variance_is_refused_and_rounding_is_not() -> None:
+    good, none = np.tile(np.eye(3), (4, 1, 1)), np.zeros((0, 0))
+    for least, refused in ((-1e-12, False), (-1e-3, True)):
+        bubbles = good.copy()
+        bubbles[2, 1, 1] = least
+        found = Covariances(
+            good, bubbles, good, np.arange(4), good, good, none, none, good, good
+        )  # fmt: skip
+        expected: Any = pytest.raises(CalibrationError, match="a bubble has a negative")
+        with expected if refused else nullcontext():
+            _check_variances(found)
 
 
 @pytest.mark.parametrize("sharp", [True, False])

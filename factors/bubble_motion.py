@@ -114,10 +114,11 @@ FORCES = Prior(0.02, 10.0, 1.0, 1.0, 0.7)
 
 @dataclass(frozen=True)
 class Inertia:
-    """Describes the low-pass through which forces move a bubble.
+    """Describes the first-order low-pass filter through which forces move a bubble.
 
-    time_s : its time.  forces : intensity of the forces along the rig's x, y and z axes, over that
-        of the model. The zigzags keep their RMS: their damping changes by the factor.
+    time_s : time constant of the filter.
+    forces : intensity of the forces along the rig's x, y and z axes, divided by their intensity in
+        the model. The zigzags keep their RMS; their damping is multiplied by this factor instead.
     """
 
     time_s: float
@@ -204,9 +205,9 @@ def bubble_processes(
 
 
 def inertial_bubble_path(model: BubbleModel, direction: Array, inertia: Inertia) -> Component:
-    """Return the sum of a bubble's processes along a direction (3,) after the low-pass.
+    """Return a bubble's motion along a direction (3,): its path and zigzags after the low-pass.
 
-    Its first states are position, velocity and acceleration.
+    The first states of the process are position, velocity and acceleration.
     """
     intensity = float(np.square(direction) @ inertia.forces)
     sigma = model.velocity_sigma_mm_s * float(np.sqrt(intensity))

@@ -108,13 +108,16 @@ def add_linear_factors(
 
 
 _AT_ONCE = 8192
-"""Factors that are multiplied together; what is worked out on the way then stays in the cache."""
+"""Number of factors that are multiplied at once; intermediate results then stay in the cache."""
 
 
 def product(factors: Sequence[LinearFactors], starts: Ints, values: Array) -> list[Array]:
-    """Return for each group of factors sum_k A_k x_k (M, rows, K), x the columns of values (D, K).
+    """Return the product A x of the factors' Jacobians and K vectors.
 
-    starts : first row of each key in ``values``, keys counting from 0.
+    starts : for each key, counted from 0, the row of ``values`` at which its variable begins.
+    values : (D, K) the vectors x in columns, D the total size of all variables.
+
+    Returns for each element of ``factors`` the products (M, rows, K) of its M factors.
     """
     out = []
     for linear in factors:
@@ -128,7 +131,10 @@ def product(factors: Sequence[LinearFactors], starts: Ints, values: Array) -> li
 def transposed_product(
     factors: Sequence[LinearFactors], starts: Ints, values: Sequence[Array]
 ) -> Array:
-    """Return the sum (D, K) of A^T times the values (M, rows, K) of each group of factors."""
+    """Return the product (D, K) of the factors' transposed Jacobians and K vectors.
+
+    starts : as in `product`. values : for each element of ``factors`` the vectors (M, rows, K).
+    """
     out = np.zeros((int(starts[-1]), values[0].shape[-1]))
     for linear, given in zip(factors, values):
         for mine, at, block in _places(linear, starts):

@@ -13,22 +13,28 @@ import numpy as np
 from telerig.arrays import Array
 
 _FIRM = 1e3
-"""Control beyond which `truncation_weights` is truncated least squares."""
+"""Value of ``control`` beyond which `truncation_weights` gives truncated least squares."""
 
 
 def next_limit(limit: float, largest: float, last: float) -> float:
-    """Return half of the limit or of the largest distance, whichever is less; at least ``last``."""
+    """Return the limit of the next iteration, which is lowered step by step to ``last``.
+
+    It is half of the present limit or of the largest distance, whichever is less, but not less than
+    ``last``. All are in standard deviations.
+    """
     return max(last, min(limit, largest) / 2)
 
 
 def calibration_weights(distance: Array, before: Array, limit: float, last: float) -> Array:
     """Return the weights (M,) of the dots of a calibration.
 
-    They fall smoothly (Geman-McClure) as long as the limit is above ``last``. Then they are 0 or 1
-    (truncated least squares), and a dot that was left out is taken back only well inside the limit,
-    so that no dot alternates.
+    The weights fall smoothly with the distance (Geman-McClure) as long as the limit is above
+    ``last``. Then they are 0 or 1 (truncated least squares). A dot that was left out is then taken
+    back only if its distance is below 0.9 times the limit, so that no dot alternates.
 
-    distance : (M,).  before : (M,) weights of the iteration before.
+    distance : (M,) distance of each dot from its prediction, in standard deviations.
+    before : (M,) weights of the iteration before.
+    limit, last : limit of this iteration and of the last ones, in standard deviations.
     """
     if limit > last:
         return (limit**2 / (limit**2 + distance**2)) ** 2
@@ -36,8 +42,10 @@ def calibration_weights(distance: Array, before: Array, limit: float, last: floa
 
 
 def travel_weights(squares: Array, limit: float) -> Array:
-    """Return the weights (limit / z)^4 for distances z beyond the limit, otherwise 1: the weights
-    of the dots and readings of the travel axis.
+    """Return the weights (M,) of dots and encoder readings when the travel axis is measured.
+
+    The weight is 1 up to the limit and (limit / z)^4 beyond it, with z the distance from the
+    prediction in standard deviations.
 
     squares : (M,) values of z^2.
     """
@@ -45,11 +53,12 @@ def travel_weights(squares: Array, limit: float) -> Array:
 
 
 def truncation_weights(squares: Array, bound: float, control: float) -> Array:
-    """Return the weights (M,) of the pixels of a smoothing.
+    """Return the weights (M,) of detections, from 0 to 1, when a run is smoothed.
 
-    squares : (M,) squared distances.
-    bound : the square of the limit.
-    control : grows from near 0 (convex loss) to infinity (truncated least squares).
+    squares : (M,) squared distances of the detections from their predictions, in variances.
+    bound : square of the distance beyond which a detection is an outlier.
+    control : sharpness of the loss; the caller raises it from near 0 (convex loss) towards infinity
+        (truncated least squares).
     """
     low, high = control / (control + 1) * bound, (control + 1) / control * bound
     if control > _FIRM:

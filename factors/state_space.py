@@ -30,8 +30,10 @@ a nanosecond vary in the last digit."""
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """Describes one stochastic process. Lengths are in mm (or px or rad, as the caller chooses),
-    times in s.
+    """Describes one stochastic process x' = F x + B c + L w.
+
+    It has n states x, k constant inputs c and m white noises w of unit two-sided spectral density.
+    Lengths are in mm (or px or rad, as the caller chooses), times in s.
 
     drift : (n, n) F.
     noise : (n, m) L.

@@ -33,20 +33,20 @@ class Liquid:
 
     @property
     def morton(self) -> float:
-        """Morton number g mu^4 (rho - rho_gas) / (rho^2 sigma^3)."""
+        """The Morton number g mu^4 (rho - rho_gas) / (rho^2 sigma^3)."""
         lift = self.gravity * (self.density - self.gas_density)
         return lift * self.viscosity**4 / (self.density**2 * self.surface_tension**3)
 
     def reynolds(self, d: ArrayLike, speed: ArrayLike) -> Array:
-        """Return the Reynolds number rho U d / mu."""
+        """Return the Reynolds number rho U d / mu for the diameter d (m) and the speed U (m/s)."""
         return np.asarray(self.density * np.multiply(d, speed) / self.viscosity)
 
     def weber(self, d: ArrayLike, speed: ArrayLike) -> Array:
-        """Return the Weber number rho U^2 d / sigma."""
+        """Return the Weber number rho U^2 d / sigma for the diameter d (m) and speed U (m/s)."""
         return np.asarray(self.density * np.multiply(d, np.square(speed)) / self.surface_tension)
 
     def eotvos(self, d: ArrayLike) -> Array:
-        """Return the Eotvos number (rho - rho_gas) g d^2 / sigma."""
+        """Return the Eotvos number (rho - rho_gas) g d^2 / sigma for the diameter d (m)."""
         lift = self.gravity * (self.density - self.gas_density)
         return np.asarray(lift * np.square(d) / self.surface_tension)
 
@@ -98,18 +98,22 @@ def drag_coefficient(
 
 
 def wellek_aspect(eotvos: ArrayLike) -> Array:
-    """Return the aspect ratio of contaminated bubbles and drops.
+    """Return the aspect ratio (equatorial over polar semi-axis) of contaminated bubbles and drops.
 
-    It is from Wellek, Agrawal, Skelland, AIChE J. 12:854, 1966.
+    The law is 1 + 0.163 Eo^0.757 (Wellek, Agrawal, Skelland, AIChE J. 12:854, 1966).
+
+    eotvos : Eotvos number Eo.
     """
     return np.asarray(1 + 0.163 * np.asarray(eotvos, float) ** 0.757)
 
 
 def mendelson_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Return the rise velocity by the wave analogy, for water above 1.3 mm.
+    """Return the rise velocity (m/s) by Mendelson's wave analogy (AIChE J. 13:250, 1967).
 
-    Smaller bubbles are slower: surface tension then keeps them round (Mendelson, AIChE J. 13:250,
-    1967).
+    It holds in water for bubbles of more than 1.3 mm. Smaller ones rise more slowly, because
+    surface tension keeps them round.
+
+    d : equivalent diameter in m.
     """
     d = np.asarray(d, float)
     wave = 2 * liquid.surface_tension / (liquid.density * d)
@@ -117,9 +121,11 @@ def mendelson_velocity(d: ArrayLike, liquid: Liquid) -> Array:
 
 
 def clift_clean_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Return the rise velocity in pure water above 1.3 mm.
+    """Return the rise velocity (m/s) of bubbles of more than 1.3 mm in pure water.
 
-    It is from Clift, Grace, Weber, Bubbles, Drops and Particles, 1978, eq. 7-3.
+    The law is eq. 7-3 of Clift, Grace, Weber, Bubbles, Drops and Particles, 1978.
+
+    d : equivalent diameter in m.
     """
     d = np.asarray(d, float)
     wave = 2.14 * liquid.surface_tension / (liquid.density * d)
@@ -130,10 +136,13 @@ _WATER_VISCOSITY_PA_S = 9e-4
 
 
 def clift_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Return the rise velocity of contaminated bubbles and drops (Clift, Grace, Weber, 1978).
+    """Return the rise velocity (m/s) of contaminated bubbles and drops.
 
-    Eqs 7-5 to 7-9, for Morton numbers below 1e-3 and Eotvos numbers below 40; NaN where its H is
-    below 2, which is where bubbles are round.
+    The law is eqs 7-5 to 7-9 of Clift, Grace, Weber, Bubbles, Drops and Particles, 1978, for Morton
+    numbers below 1e-3 and Eotvos numbers below 40. The result is NaN where the book's parameter H
+    is below 2, because such small bubbles are round and the law does not hold.
+
+    d : equivalent diameter in m.
     """
     d = np.asarray(d, float)
     ratio = (liquid.viscosity / _WATER_VISCOSITY_PA_S) ** -0.14
@@ -146,8 +155,10 @@ def clift_velocity(d: ArrayLike, liquid: Liquid) -> Array:
 def tomiyama_drag(reynolds: ArrayLike, eotvos: ArrayLike, contamination: str = "pure") -> Array:
     """Return the drag coefficient of a bubble in a pure, slightly or fully contaminated liquid.
 
-    It is from Tomiyama, Kataoka, Zun, Sakaguchi, JSME Int. J. B 41:472, 1998. contamination :
-    "pure", "slight" or "full". Raises KeyError for another word.
+    The law is that of Tomiyama, Kataoka, Zun, Sakaguchi, JSME Int. J. B 41:472, 1998.
+
+    reynolds, eotvos : Reynolds and Eotvos numbers of the bubble.
+    contamination : "pure", "slight" or "full". Raises KeyError for another word.
     """
     re, eo = np.asarray(reynolds, float), np.asarray(eotvos, float)
     factor, most = {"pure": (16, 48), "slight": (24, 72), "full": (24, np.inf)}[contamination]
@@ -156,7 +167,10 @@ def tomiyama_drag(reynolds: ArrayLike, eotvos: ArrayLike, contamination: str = "
 
 
 def tomiyama_velocity(d: ArrayLike, liquid: Liquid, contamination: str = "pure") -> Array:
-    """Return the rise velocity at which `tomiyama_drag` balances buoyancy."""
+    """Return the rise velocity (m/s) at which `tomiyama_drag` balances buoyancy.
+
+    d : equivalent diameter in m. contamination : as in `tomiyama_drag`.
+    """
     d = np.asarray(d, float)
 
     def excess(speed: Array) -> Array:
@@ -167,9 +181,11 @@ def tomiyama_velocity(d: ArrayLike, liquid: Liquid, contamination: str = "pure")
 
 
 def moore_aspect_weber(aspect: ArrayLike) -> Array:
-    """Return the Weber number of a clean bubble of this aspect ratio at high Reynolds number.
+    """Return the Weber number at which a clean bubble has a given aspect ratio.
 
-    It is from Moore, J. Fluid Mech. 23:749, 1965, eq. 2.1.
+    The law is eq. 2.1 of Moore, J. Fluid Mech. 23:749, 1965, for high Reynolds numbers.
+
+    aspect : equatorial over polar semi-axis, above 1.
     """
     x = np.asarray(aspect, float)
     root, angle = np.sqrt(x**2 - 1), np.arccos(1 / x)
@@ -180,8 +196,11 @@ def moore_aspect_weber(aspect: ArrayLike) -> Array:
 def moore_drag(reynolds: ArrayLike, aspect: ArrayLike) -> Array:
     """Return the drag coefficient of a clean oblate bubble at high Reynolds number.
 
-    It is 48 / Re G (1 + H / sqrt Re) (Moore, J. Fluid Mech. 23:749, 1965), where the polynomial for
-    H is that of Loth (Int. J. Multiphase Flow 34:523, 2008) through Moore's table.
+    It is (48 / Re) G (1 + H / sqrt(Re)) (Moore, J. Fluid Mech. 23:749, 1965), where G and H depend
+    on the aspect ratio. H is the polynomial that Loth (Int. J. Multiphase Flow 34:523, 2008) fitted
+    to Moore's table.
+
+    reynolds : Reynolds number Re. aspect : equatorial over polar semi-axis, above 1.
     """
     x = np.maximum(np.asarray(aspect, float), 1 + 1e-4)
     root, angle = np.sqrt(x**2 - 1), np.arccos(1 / x)
@@ -192,10 +211,12 @@ def moore_drag(reynolds: ArrayLike, aspect: ArrayLike) -> Array:
 
 
 def moore_velocity(d: ArrayLike, liquid: Liquid) -> Array:
-    """Return the rise velocity of a clean bubble by `moore_drag` and `moore_aspect_weber`.
+    """Return the rise velocity (m/s) of a clean bubble by `moore_drag` and `moore_aspect_weber`.
 
-    NaN where the Reynolds number is below 50 or the aspect ratio above 2.2: Moore's theory does
-    not hold there.
+    The result is NaN where the Reynolds number is below 50 or the aspect ratio above 2.2, because
+    Moore's theory does not hold there.
+
+    d : equivalent diameter in m.
     """
     d = np.asarray(d, float)
     grid = np.linspace(1.001, 2.2, 400)

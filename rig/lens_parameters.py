@@ -124,7 +124,8 @@ DISTORTIONS: dict[str, tuple[str, ...]] = {
 NAMES = (*DISTORTIONS, *GROUPS)
 """The names that a model can have, and that can be joined by +."""
 PLAIN_GROUPS = tuple(g for g in GROUPS if g not in ("tilt", "centre"))
-"""The groups that do not describe the same as another group."""
+"""The groups that remain when tilt, which acts like affine, and the image centre, which acts like
+the tangential terms, are left out."""
 
 Model = str | Mapping[str, str] | Sequence[str]
 """A lens model of a rig: one name for all cameras, "left=NAME,right=NAME", a mapping from camera to
@@ -171,9 +172,10 @@ def name_of(groups: Iterable[str]) -> str:
 def rich_groups(*, mono: bool, strong: bool) -> frozenset[str]:
     """Return the parameter groups that are tried for a camera whose model is chosen automatically.
 
-    mono : kappa is not tried for a rig of one camera. strong : with strong perspective kappa and
-    the image centre are free. A free centre makes a tilted sensor's image equal to a rotated
-    camera's, so s or a tilt cannot be distinguished from a rotation (docs/decisions/014).
+    mono : whether the rig has one camera only; kappa is then not tried.
+    strong : whether the lens has strong perspective; kappa and the image centre are then tried, but
+    affine and s are not. With a free image centre, a tilted sensor (affine, s) gives the same image
+    as a rotated camera (docs/decisions/014).
     """
     if strong:
         return frozenset(PLAIN_GROUPS) - {"affine", "s"} | {"centre"}
@@ -221,7 +223,10 @@ def joint_name(names: Sequence[str], cameras: Sequence[str]) -> str:
 
 
 def checked_model(model: str) -> str:
-    """Return ``model`` unchanged; CalibrationError for an unknown name. Cameras may be unknown."""
+    """Return ``model`` unchanged. Raises CalibrationError for an unknown name of a lens model.
+
+    The names of cameras in "left=NAME,right=NAME" are not checked.
+    """
     for name in _by_camera(model).values() if "=" in model else [model]:
         if name != AUTO:
             groups_of(name)

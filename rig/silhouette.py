@@ -39,7 +39,12 @@ _THINNEST = 0.05
 
 
 def third_degree(directions: Array) -> Array:
-    """Return the 7 real spherical harmonics (..., 7) of degree 3, of unit mean square."""
+    """Return the values (..., 7) of the 7 real spherical harmonics of degree 3.
+
+    Each has a mean square of 1 over the sphere.
+
+    directions : (..., 3) unit vectors.
+    """
     x, y, z = np.moveaxis(directions, -1, 0)
     zonal = [np.sqrt(7) / 2 * c * (5 * c * c - 3) for c in (x, y, z)]
     planar = [p * (q * q - r * r) for p, q, r in ((x, y, z), (y, z, x), (z, x, y))]
@@ -48,10 +53,12 @@ def third_degree(directions: Array) -> Array:
 
 
 def third_degree_traces(frames: Array) -> tuple[Array, Array]:
-    """Return the traces of `third_degree` on the circle W (cos phi, sin phi), W (..., 3, 2).
+    """Return the harmonics of `third_degree` along the great circle W (cos phi, sin phi).
 
-    Returns two arrays (..., 2, 7): the coefficients of (cos phi, sin phi) and those of (cos 3 phi,
-    sin 3 phi). A trace of degree 3 has no other harmonics.
+    frames : W (..., 3, 2), whose columns are orthonormal.
+    Returns two arrays (..., 2, 7) for the 7 functions: the coefficients of (cos phi, sin phi) and
+    those of (cos 3 phi, sin 3 phi). A function of degree 3 has no other harmonics on a great
+    circle.
     """
     phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     circle = np.stack([np.cos(phi), np.sin(phi)])
@@ -63,10 +70,14 @@ def third_degree_traces(frames: Array) -> tuple[Array, Array]:
 
 
 def zonal_traces(projection: Array) -> tuple[Array, Array]:
-    """Return the traces of h(s) = P_3(s . n), which is axisymmetric about the unit vector n.
+    """Return the harmonics of P_3(s . n) along the great circle s = W (cos phi, sin phi).
 
-    projection : (..., 2) q = W^T n. Returns two arrays (..., 2), the coefficients of the first and
-    of the third harmonic: (15/8 |q|^2 - 3/2) q, and 5/8 q^3 with q taken as a complex number.
+    P_3 is the Legendre polynomial of degree 3, so the function is axisymmetric about the unit
+    vector n.
+
+    projection : (..., 2) q = W^T n.
+    Returns two arrays (..., 2): the coefficients of (cos phi, sin phi), (15/8 |q|^2 - 3/2) q, and
+    those of (cos 3 phi, sin 3 phi), 5/8 q^3 with q taken as a complex number.
     """
     x, y = projection[..., 0], projection[..., 1]
     first = (1.875 * (x * x + y * y) - 1.5)[..., None] * projection
@@ -81,10 +92,12 @@ class EllipsePair:
     shared : (..., 3) unit vector perpendicular to both viewing directions; both cameras measure the
     coordinate along it. sides : two arrays (..., 3) of unit vectors, perpendicular to ``shared``
     and to the viewing direction of each camera.
-    moments_mm2 : two arrays (..., 2, 2), A A^T of the ellipse in the axes (shared, side).
-    rims : two arrays (..., 2, 2) in the components (cos phi, sin phi). Column 0 is the point of the
-    rim on the unit sphere that reaches farthest along the shared coordinate. Column 1 lies a
-    quarter turn from it, on the positive side.
+    moments_mm2 : two arrays (..., 2, 2), for each camera the matrix M of its ellipse x^T M^-1 x = 1
+    in the axes (shared, side).
+    rims : two arrays (..., 2, 2). In each camera the body's rim is the image of a great circle of
+    the unit sphere with the angle phi; the columns are two of its points as (cos phi, sin phi).
+    Column 0 is the point that reaches farthest along the shared coordinate. Column 1 lies a quarter
+    turn from it, on the positive side.
     """
 
     shared: Array
@@ -93,11 +106,13 @@ class EllipsePair:
     rims: tuple[Array, Array]
 
     def frames(self, coupling: Array) -> tuple[Array, Array]:
-        """Return W (..., 3, 2) of both cameras; the rim in a camera is W (cos phi, sin phi).
+        """Return for each camera W (..., 3, 2): its rim on the unit sphere is W (cos phi, sin phi).
 
-        The first unit vector is the shared coordinate; the other direction is (0, 1, 0) for the
-        first rim and (0, r, sqrt(1 - r^2)) for the second, with r (...) the coupling (see
-        `coupling_of`).
+        The axes of the sphere are chosen such that the first one is the shared coordinate and the
+        rim of the first camera lies in the plane of (1, 0, 0) and (0, 1, 0). That of the second
+        camera lies in the plane of (1, 0, 0) and (0, r, sqrt(1 - r^2)).
+
+        coupling : (...) the number r, see `coupling_of`.
         """
         zero, one = np.zeros_like(coupling), np.ones_like(coupling)
         second = np.stack([zero, coupling, np.sqrt(1 - coupling**2)], -1)
@@ -107,9 +122,10 @@ class EllipsePair:
         return left, right
 
     def coupling_of(self, moments_mm2: Array) -> Array:
-        """Return the coupling (...) of ellipsoids A A^T (..., 3, 3).
+        """Return the coupling (...) of ellipsoids x^T M^-1 x = 1 with M (..., 3, 3) in mm^2.
 
-        It is the partial correlation of the two side coordinates, given the shared coordinate.
+        It is the partial correlation of the two side coordinates, given the shared coordinate, if M
+        is read as a covariance.
         """
         basis = np.stack([self.shared, *self.sides], -2)
         return _coupling(basis @ moments_mm2 @ basis.mT)
@@ -118,8 +134,10 @@ class EllipsePair:
 def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> EllipsePair:
     """Return the pair of silhouettes that one ellipsoid has in two cameras.
 
-    jacobians : two arrays (..., 2, 3), px/mm. axes_px : two arrays (..., 2, 2) whose columns are
-    the semi-axes of the ellipse in the image.
+    jacobians : for each camera (..., 2, 3), the derivative of the pixel with respect to the point,
+    in px/mm.
+    axes_px : for each camera (..., 2, 2), whose columns are the semi-axes of the ellipse in the
+    image.
     """
     across = [np.cross(j[..., 0, :], j[..., 1, :]) for j in jacobians]
     view = [d / np.linalg.norm(d, axis=-1, keepdims=True) for d in across]
@@ -136,11 +154,13 @@ def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -
 
 
 def most_spherical(pair: EllipsePair) -> Array:
-    """Return A A^T (..., 3, 3) in mm^2 of the most spherical ellipsoid that has these silhouettes.
+    """Return the most spherical of all ellipsoids that have these silhouettes.
 
     Two silhouettes determine five of the six parameters of an ellipsoid. Both give the extent along
-    the shared coordinate; their geometric mean is used. The sixth parameter is chosen such that det
-    / trace^3 of A A^T is largest.
+    the shared coordinate; their geometric mean is used. The sixth parameter is chosen such that
+    det(M) / trace(M)^3 is largest.
+
+    Returns M (..., 3, 3) in mm^2 of the ellipsoid x^T M^-1 x = 1, in the axes of the rig frame.
     """
     inverse = np.linalg.inv(np.stack([pair.shared, *pair.sides], -2))
     moments = _joined(pair.moments_mm2)
@@ -150,11 +170,14 @@ def most_spherical(pair: EllipsePair) -> Array:
 
 
 def oblate_spheroid(pair: EllipsePair) -> tuple[Array, Array]:
-    """Return pole (..., 3) and A A^T (..., 3, 3), in mm and mm^2, of the nearest oblate spheroid.
+    """Return the oblate spheroid whose silhouettes are nearest to the given ones.
 
     The long semi-axis of every silhouette is the radius of the equator. The short one gives the
     inclination of the pole in that view except for its sign, which follows from the shared
     coordinate.
+
+    Returns the polar semi-axis (..., 3) in mm as a vector in the rig frame, and M (..., 3, 3) in
+    mm^2 of the spheroid x^T M^-1 x = 1.
     """
     equator2, leaning = [], []
     for moments in pair.moments_mm2:
@@ -222,14 +245,17 @@ def _most_spherical(moments: Array, gram: Array) -> Array:
 def ellipsoids_from_outlines(
     cameras: tuple[Camera, Camera], points_mm: Array, ellipses: Array
 ) -> Array:
-    """Return Q (N, 3, 3) in mm^2 and rig axes of the ellipsoids x^T Q^-1 x = 1 with these outlines.
+    """Return the ellipsoids x^T Q^-1 x = 1 that have the given outlines in two cameras.
 
     points_mm : (N, 3) centres in the rig frame.
-    ellipses : (N, 2, 3) semi-axes in px and angle in rad of each outline.
+    ellipses : (N, 2, 3) for each point and camera the two semi-axes in px and the angle in rad.
+
+    Returns Q (N, 3, 3) in mm^2, in the axes of the rig frame.
 
     A parallel projection P maps an ellipsoid Q to the ellipse P Q P^T, so the two outlines are six
-    linear equations. They leave one number open, a shear that neither camera sees: of all that
-    fit, the body of largest volume is taken (the determinant is quadratic along that direction).
+    linear equations. They leave one of the six numbers of Q undetermined, a shear that neither
+    camera sees. Of all ellipsoids that fit, the one of largest volume is taken (the determinant is
+    quadratic along that direction).
     """
     upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
     basis = np.zeros((6, 3, 3))

@@ -122,18 +122,21 @@ class Target:
         return np.where(self.is_mark(dot), mark, self.dot_diameter_mm).astype(float)
 
     def symmetry_order(self) -> int:
-        """Return how many rotations leave the target unchanged: of a grid those by multiples of 90
-        degrees, of listed points the largest of 6, 4, 3, 2 and 1 equal parts of a full turn.
+        """Return how many rotations about z leave the target unchanged; that by 0 degrees counts.
 
-        On an unbounded grid a rotation may be combined with a shift.
+        Of a grid, rotations by multiples of 90 degrees are tried (on an unbounded grid a rotation
+        may be combined with a shift). Of listed points, a full turn in 6, 4, 3 and 2 equal parts is
+        tried in this order.
         """
         if self.layout == "points":
             return len(self.turns())
         return sum(self._unchanged_by(turn) for turn in QUARTER_TURNS)
 
     def turns(self) -> list[Ints]:
-        """Return the relabellings (N,), id -> id, by the rotations about z that leave a bounded
-        target unchanged, in the order of their angles; the first is no rotation.
+        """Return how the rotations about z that leave a bounded target unchanged exchange its dots.
+
+        For each rotation, in the order of their angles and beginning with 0 degrees, an array (N,)
+        gives for each of the N dots the id of the dot that takes its place.
         """
         if self.layout == "points":
             for order in (6, 4, 3, 2):

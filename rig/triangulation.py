@@ -47,8 +47,8 @@ class Triangulation(ShortText):
     uncertainty if a calibration triangulates; measurement_covariance_mm2 : its part from the noise
     of the pixels.
     ray_miss_mm : (...) signed distance from the first ray to the second, along first direction x
-    second direction. `triangulate_views` gives (..., C), the distance of the point from each
-    camera's ray, NaN for a camera that does not see it.
+    second direction. From `triangulate_views` it is (..., C), the distance of the point from the
+    ray of each of the C cameras, NaN for a camera that does not see the point.
     seen_by : (...) number of cameras that saw each point; None if two cameras saw all points. A
     point that fewer than two cameras saw is NaN.
     """
@@ -430,7 +430,14 @@ def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
 def rig_jacobian(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
-    """Return the derivative (..., 2C, P) of rig points' pixels in C cameras by the rig block."""
+    """Return the derivative of points' pixels with respect to the parameters of the rig.
+
+    free : for each of the C cameras the names of its free intrinsics.
+    points_mm : (..., 3) in the rig frame.
+
+    Returns (..., 2C, P) in px per unit of each parameter. The P parameters are the free intrinsics
+    of all cameras, then the pose (rotation, translation) of each camera but the first.
+    """
     lens = np.cumsum([0, *map(len, free)])
     out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), lens[-1] + 6 * (len(cameras) - 1)))
     for c, camera in enumerate(cameras):
@@ -450,9 +457,12 @@ def aligned_covariance(
     covariance: Array,
     points_mm: Array,
 ) -> Array:
-    """Return the covariance (3 N, 3 N) of N rig points due to the calibration.
+    """Return the covariance (3 N, 3 N) in mm^2 of N triangulated points due to the calibration.
 
-    Rigid motions are projected out as in `aligned_shift`. covariance : (P, P) of the rig block.
+    Rigid motions are projected out as in `aligned_shift`.
+
+    free : as in `rig_jacobian`. points_mm : (N, 3) in the rig frame.
+    covariance : (P, P) of the P parameters of the rig, in the order of `rig_jacobian`.
     """
     inner = aligned_shift(cameras, free, points_mm)
     return np.asarray(inner @ covariance @ inner.T)
@@ -461,11 +471,14 @@ def aligned_covariance(
 def aligned_shift(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
-    """Return the derivative (3 N, P) of triangulated points by the rig block, less rigid motion.
+    """Return the derivative (3 N, P) of N triangulated points, without their common rigid motion.
 
-    A motion that is common to all points is projected out, because the place of the rig frame is a
-    matter of definition (Baarda's S-transformation to the points' own frame). The result describes
-    errors of shapes, distances and motions inside the rig.
+    The derivative is that of `point_shift_jacobian`, with equal noise of all pixels. A motion that
+    is common to all points is projected out, because the place of the rig frame is a matter of
+    definition (Baarda's S-transformation to the points' own frame). The result describes errors of
+    shapes, distances and motions inside the rig.
+
+    free : as in `rig_jacobian`. points_mm : (N, 3) in the rig frame.
     """
     rows = 2 * len(cameras)
     information = np.broadcast_to(np.eye(rows), (len(points_mm), rows, rows))
@@ -483,9 +496,10 @@ def point_shift_jacobian(
     points_mm: Array,
     information_px: Array,
 ) -> Array:
-    """Return the derivative (..., 3, P) of triangulated points by the rig block.
+    """Return the derivative (..., 3, P) of triangulated points by the P parameters of the rig.
 
-    information_px : (..., 2C, 2C) inverse covariance of the pixels.
+    free, points_mm : as in `rig_jacobian`, which also gives the order of the parameters.
+    information_px : (..., 2C, 2C) inverse covariance of the pixels in C cameras, in 1/px^2.
     """
     _, by_point = stacked_jacobian(cameras, points_mm)
     weighted = np.swapaxes(by_point, -1, -2) @ information_px

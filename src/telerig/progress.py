@@ -14,14 +14,14 @@ from telerig.errors import InputError
 P = ParamSpec("P")
 T = TypeVar("T")
 Progress = Callable[[str, float, int], None]
-"""Called with the name of a step, the number done and the total; a share has the total 1."""
+"""Called with the name of a step, the number done and the total number. Where nothing is counted,
+these are the share that is done, from 0 to 1, and 1."""
 
 
 class Steps:
-    """Show how far a command is: call it with the name of a step, the number done and the total.
+    """Show how far a command is: call the object as a `Progress`.
 
-    A number with a point is the share that is done, of 1.
-    seconds : how long each step has taken so far, by name.
+    seconds : for each step, by its name, the seconds that it has taken so far.
     """
 
     def __init__(self, show: Callable[[str, float, int, float, float], None] | None) -> None:
@@ -46,10 +46,10 @@ class Steps:
 
 
 def showing_progress(function: Callable[P, T]) -> Callable[P, T]:
-    """Let the argument ``progress`` of a public function be True, to show how far it is.
+    """Decorate a function so that its argument ``progress`` may be True, False or a function.
 
-    The function itself then gets a `Progress`; False means that nobody wants to know. It raises
-    InputError for anything else.
+    True shows a progress bar or lines of text (see `steps_shown`), False shows nothing, and a
+    function is called as a `Progress`. For anything else the decorated function raises InputError.
     """
 
     @wraps(function)
@@ -59,7 +59,7 @@ def showing_progress(function: Callable[P, T]) -> Callable[P, T]:
             named.pop("progress", None)
         elif not (isinstance(wanted, bool) or callable(wanted)):
             what = f"progress is {type(wanted).__name__}"
-            todo = "give True, False, or a function of (what, done, of)"
+            todo = "give True, False, or a function of (name of the step, number done, total)"
             raise InputError(what, where=function.__name__, todo=todo)
         if wanted is not True:
             return function(*arguments, **named)

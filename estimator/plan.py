@@ -450,10 +450,10 @@ def plan_words(
         f"{planned.shake_mm:g} mm RMS at {planned.shake_hz:g} Hz",
         f"encoder: {'yes' if rig.stage else 'no'}; accelerometers: {sensors}; marks in each view: "
         f"{planned.marks}",
-        f"the calibration moves all points together by {np.median(um):.2g} um per axis, in the "
-        f"worst corner of the working volume by {um.max():.2g} um",
+        f"the calibration moves all points together by {np.median(um):.2g} µm per axis, in the "
+        f"worst corner of the working volume by {um.max():.2g} µm",
         "",
-        f"{'':30}{'position, um':>20}{'velocity, mm/s':>22}",
+        f"{'':30}{'position, µm':>20}{'velocity, mm/s':>22}",
         f"{'standard deviation':30}{'x':>7}{'y':>7}{'z':>7}{'x':>8}{'y':>7}{'z':>7}  verdict",
     ]
     for name, one in expected.items():

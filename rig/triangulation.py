@@ -79,9 +79,9 @@ class Triangulation(ShortText):
         ):  # fmt: skip
             variance = np.diagonal(covariance, axis1=-2, axis2=-1)[placed]
             x, y, z = 1e3 * np.sqrt(np.median(variance, axis=0))
-            facts[name] = f"x {x:.3g}, y {y:.3g}, z {z:.3g} um (median)"
+            facts[name] = f"x {x:.3g}, y {y:.3g}, z {z:.3g} µm (median)"
         miss = 1e3 * np.nanmedian(np.abs(self.ray_miss_mm))
-        facts["ray miss"] = f"{miss:.3g} um (median)"
+        facts["ray miss"] = f"{miss:.3g} µm (median)"
         facts["not placed"] = str(self.unplaced or "")
         return facts
 

@@ -94,7 +94,7 @@ def _with_priors(
 
 
 def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
-    """Return the largest error (um) of points if ``used`` replaces the ``true`` cameras.
+    """Return the largest error (µm) of points if ``used`` replaces the ``true`` cameras.
 
     A common shift of all points is set aside. With one camera, it is the error across its own axis.
     """

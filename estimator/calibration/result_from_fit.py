@@ -300,7 +300,7 @@ def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dic
 
 
 def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str, Any]:
-    """Return residuals in space and predicted uncertainty of points (um), less rigid motion."""
+    """Return residuals in space and predicted uncertainty of points (µm), less rigid motion."""
     if len(problem.cameras) < 2:
         return {}
     pixels, truth = _seen_in_space(problem, state)

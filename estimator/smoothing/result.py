@@ -99,7 +99,7 @@ class Smoothing(ShortText):
         facts = {"bubbles": f"{counted(bubbles, 'bubble')} in {counted(frames, 'frame')}"}
         facts["axes"] = ", ".join(f"{name} {axis['verdict']}" for name, axis in axes.items())
         for name, pattern, factor, unit in (
-            ("position sd", "s{}_mm", 1e3, "um"), ("velocity sd", "sv{}_mm_s", 1.0, "mm/s")
+            ("position sd", "s{}_mm", 1e3, "µm"), ("velocity sd", "sv{}_mm_s", 1.0, "mm/s")
         ):  # fmt: skip
             columns = [pattern.format(axis) for axis in AXES]
             table = self.tables.typical(columns)

@@ -284,7 +284,7 @@ class Structure(Part):
 
 
 class NextPose(Part):
-    """Check one proposed pose of the target; after_um : the error that it leaves, in um."""
+    """Check one proposed pose of the target; after_um : the error that it leaves, in µm."""
 
     words: str
     reasons: tuple[str, ...] = ()

@@ -72,12 +72,12 @@ class FieldDifference:
 
     @property
     def rms_um(self) -> float:
-        """Return the RMS of the shift per axis, in um."""
+        """Return the RMS of the shift per axis, in µm."""
         return float(1e3 * np.sqrt(np.mean(self.shift_mm**2)))
 
     @property
     def predicted_um(self) -> float:
-        """Return the value of `rms_um` (um) that is expected if the rig did not change."""
+        """Return the value of `rms_um` (µm) that is expected if the rig did not change."""
         return float(1e3 * np.sqrt(np.mean(self.sd_mm**2)))
 
 

@@ -37,7 +37,7 @@ def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
     """Calibrate from each half of the views and compare the two rigs.
 
     Returns the content of `Calibration.diagnostics`, entry "halves": "words" and, if the check was
-    possible, the views of each half, the RMS difference and its prediction (um per axis), the
+    possible, the views of each half, the RMS difference and its prediction (µm per axis), the
     p-value, "agree", and the differences at a grid of points.
     Both halves use the same size of the target, which tells nothing about repeatability: the known
     distance of two dots, or else the estimated one of two dots far apart, is taken as exact in

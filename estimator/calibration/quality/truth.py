@@ -24,7 +24,7 @@ MANY_SD = 4.0
 
 @dataclass(frozen=True)
 class SpaceError:
-    """Errors of N triangulated points after the best rigid motion: RMS and predicted, um per axis.
+    """Errors of N triangulated points after the best rigid motion: RMS and predicted, µm per axis.
 
     errors_mm : (N, 3) estimated minus true. covariance_mm2 : (3N, 3N) predicted covariance.
     """

@@ -106,7 +106,7 @@ class Calibration(ShortText):
             )
         if "space_sd_um" in s:
             facts["a point"] = (
-                f"triangulated from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um "
+                f"triangulated from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} µm "
                 "per axis"
             )
         facts["medium"] = self.medium if self.medium != "air" else ""

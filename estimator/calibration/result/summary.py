@@ -45,8 +45,8 @@ def summary(calibration: CalibrationFile) -> str:
         )
     if "space_sd_um" in s:
         lines.append(
-            f"  in space: dots {s['space_rms_um']:.2f} um RMS from the fit; a point triangulated "
-            f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um per axis"
+            f"  in space: dots {s['space_rms_um']:.2f} µm RMS from the fit; a point triangulated "
+            f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} µm per axis"
         )
     lines += _trust(calibration)
     advice = calibration.diagnostics.next_view

@@ -244,11 +244,6 @@ def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
     return Factor(signal, model).posterior()
 
 
-def position_sigma(signal: Signal, model: ShakeModel, frames: Ints) -> Array:
-    """Return the standard deviation (B, n) of the moving items' positions at some frames."""
-    return Factor(signal, model).position_sigma(frames)
-
-
 def _system(signal: Signal, model: ShakeModel) -> _System:
     shake = [(p.component, p.camera) for p in shake_processes(signal, model)]
     bubble = [p.component for p in moving_processes(signal, model)]
@@ -368,18 +363,6 @@ class Factor:
         found = position + speed * since, velocity + speed, offset
         frames = len(signal.t_s)
         return SignalPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
-
-    def position_sigma(self, frames: Ints) -> Array:
-        system, signal = self.system, self.signal
-        movers = np.flatnonzero(signal.moving)
-        sides, constants = self.spread()
-        mean, own, _ = self.chain.moments(sides[:, self.count :])
-        since = (signal.t_s - signal.t_s[signal.first[movers], None])[:, frames, None]
-        rows = system.position @ self.bases[self.which[frames]]
-        by_constant = np.einsum("fbd,fkd->bfk", rows, mean[frames])
-        by_constant += since * constants[movers, None, self.count :]
-        variance = np.einsum("fbd,fde,fbe->bf", rows, own[frames], rows, optimize=True)
-        return np.asarray(np.sqrt(variance + (by_constant**2).sum(-1)))
 
 
 def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:

@@ -243,11 +243,6 @@ class Accelerometer:
     drift_ppm: float = 0.0
     confirmed: bool | None = None
 
-    @property
-    def masked_samples(self) -> int:
-        """Number of samples that are not used."""
-        return 0 if self.kept is None else int(np.count_nonzero(~self.kept))
-
     def of(self, which: NDArray[Any]) -> Accelerometer:
         """Return the sensor with some of its samples: (N,) booleans, indices, or a slice."""
         kept = None if self.kept is None else self.kept[which]

@@ -24,9 +24,10 @@ from telerig.io.report.page.figures import (
 )
 from telerig.io.report.page.number_format import ABSENT, is_number, number
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
-from telerig.io.results.batch import verdict_counts
+from telerig.io.results.batch import verdict_counts, verdict_of
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import read_object
+from telerig.io.results.smoothing import Verdict
 from telerig.short_text import counted
 
 Job = Mapping[str, Any]
@@ -191,7 +192,7 @@ def _run(dataset: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line
         ", ".join(map(_text, sd)) if any(map(is_number, sd)) else ABSENT,
     )
     link = _link(next(iter(kinds.values())), folder, run)
-    off = bool(failed) or str(verdict).startswith("CONTRADICTED")
+    off = bool(failed) or verdict_of(kinds.get("smooth", {})) == Verdict.CONTRADICTED
     return Line(f"{Path(dataset).name} / {run}", link, cells, off)
 
 

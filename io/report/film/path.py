@@ -266,7 +266,7 @@ def view_matrix(angle_deg: float, elevation_deg: float) -> Array:
     ])  # fmt: skip
 
 
-def _screen(panel: Panel, angle_deg: float) -> tuple[Array, Array]:
+def screen_of(panel: Panel, angle_deg: float) -> tuple[Array, Array]:
     """Return (3, 3) px per mm: u right, v down, away; and (2,) px of the axes' origin."""
     view = view_matrix(angle_deg, _elevation_deg(panel.stretch))
     view = view * [panel.stretch, panel.stretch, 1]
@@ -274,18 +274,12 @@ def _screen(panel: Panel, angle_deg: float) -> tuple[Array, Array]:
     return matrix, panel.centre_px - matrix[:2] @ ((panel.low_mm + panel.high_mm) / 2)
 
 
-def project_px(panel: Panel, points_mm: Array, angle_deg: float) -> Array:
-    """Return (N, 2) pixels of the picture for points in the film's axes."""
-    matrix, offset = _screen(panel, angle_deg)
-    return np.asarray(points_mm @ matrix[:2].T + offset) * (DPI / 100)
-
-
 def draw_path(path: FilmPath, layout: Layout, angle_deg: float) -> Picture:
     """Return the picture (height, width, 3), RGB."""
     width, height = layout.size_px
     page = _Page(layout.size_px)
     for panel in layout.panels:
-        matrix, offset = _screen(panel, angle_deg)
+        matrix, offset = screen_of(panel, angle_deg)
         _draw_box(page, path.names, panel, matrix, offset)
         _draw_tracks(page, path, panel, matrix, offset)
         lines = [line for line in (panel.words, _band_words(panel)) if line]

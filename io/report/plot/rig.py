@@ -70,7 +70,7 @@ def uncertainty(
     *,
     axes: Any = None,
 ) -> Any:
-    """Draw one standard deviation of a point's position over the plane of the optical axes, in um.
+    """Draw one standard deviation of a point's position over the plane of the optical axes, in µm.
 
     source : uncertainty.npz of a calibration, or its arrays points_mm (N, 3) and <share>_mm2
     (N, 3, 3). share : the calibration's, or that of the pixels. Returns axes.

@@ -12,7 +12,6 @@ from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.learning.evidence import (
-    position_sigma,
     signal_evidence,
     signal_posterior,
 )
@@ -55,7 +54,7 @@ OTHER = replace(
 
 
 @pytest.mark.parametrize("marks", [0, 2])
-def test_evidence_means_and_deviations_equal_the_graphs(marks: int) -> None:
+def test_evidence_and_means_equal_the_graphs(marks: int) -> None:
     problem, _, _ = run(np.random.default_rng(3), bubbles=2, seconds=0.3, marks=marks, kept=0.8)
     signals = signals_of(problem)
     quiet = Options(robust=False)
@@ -63,18 +62,11 @@ def test_evidence_means_and_deviations_equal_the_graphs(marks: int) -> None:
     fast = evidence(signals, true_model()) - evidence(signals, OTHER)
     assert fast == pytest.approx(first.log_evidence - second.log_evidence, abs=1e-4)
 
-    frames = np.array([5, 30, 55])
-    assert first.covariances is not None
     states = first.state.bubbles @ first.graph.bubble.position.T
-    row = first.graph.bubble.position
     for signal in signals[:1]:
         found = signal_posterior(signal, true_model())
         place = (found.position_mm + signal.start_mm[:2, None]).ravel()
         np.testing.assert_allclose(place, states @ signal.direction, atol=1e-6)
-        sigma = position_sigma(signal, true_model(), frames)
-        along = signal.direction @ row
-        full = np.sqrt(np.einsum("d,nde,e->n", along, first.covariances.bubbles, along))
-        np.testing.assert_allclose(sigma, full.reshape(2, -1)[:, frames], rtol=1e-5)
 
 
 def test_shared_coordinate_comes_first_and_depth_is_never_a_channel() -> None:

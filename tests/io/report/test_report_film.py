@@ -24,11 +24,12 @@ from telerig.estimator.calibration.result.calibration import calibration_from_ca
 from telerig.io.report.film import path as film_path
 from telerig.io.report.film.path import (
     FilmPath,
+    Panel,
     draw_path,
     film_axes,
     film_layout,
-    project_px,
     read_film_path,
+    screen_of,
     view_matrix,
     write_path_film,
 )
@@ -65,6 +66,11 @@ def _path(points: Any, **changes: Any) -> FilmPath:
         "notes": (),
     }  # fmt: skip
     return FilmPath(**(whole | changes))
+
+
+def project_px(panel: Panel, points_mm: np.ndarray, angle_deg: float) -> np.ndarray:
+    matrix, offset = screen_of(panel, angle_deg)
+    return np.asarray(points_mm @ matrix[:2].T + offset)
 
 
 def _is_blue(picture: np.ndarray, at: np.ndarray) -> bool:

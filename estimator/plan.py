@@ -116,8 +116,8 @@ class Experiment:
             raise InputError(
                 f"{self.bubbles} bubbles in {self.frames} frames",
                 where="plan",
-                todo=f"plan 1 bubble or more in 10 frames or more, and at most {MOST_STATES} "
-                "bubbles times frames; a longer run is no worse",
+                todo="plan 1 or more bubbles in 10 or more frames, bubbles times frames at most "
+                f"{MOST_STATES}; a longer run will be at least as accurate as this plan says",
             )
 
 
@@ -397,7 +397,7 @@ def _position_sd(solution: Solution) -> Array:
 
 
 def variants(rig: RigDescription, planned: Experiment) -> dict[str, Experiment]:
-    """Return the planned experiment and what could be added to it, by name.
+    """Return the planned experiment and the same with one addition each, keyed by a description.
 
     Only what the plan lacks is added: marks, accelerometers on the arms, both, twice the frame
     rate, and four more bubbles.

@@ -543,7 +543,10 @@ def rig_block(calibration: Calibration) -> tuple[Array, Free]:
 
 
 def with_drift(covariance: Array, drift: Array) -> Array:
-    """Return the covariance (P, P) plus that of a movement (6, 6) of the second camera."""
+    """Return the covariance (P, P) of the cameras' parameters with that of a movement added.
+
+    drift : (6, 6) covariance of a movement of the second camera: rotation (rad), translation (mm).
+    """
     total = covariance.copy()
     total[-POSE:, -POSE:] += drift
     return total

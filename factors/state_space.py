@@ -345,11 +345,13 @@ class Steps:
     start_log_det: Array
 
     def bases(self) -> Array:
-        """Return bases T (N, U + 1, n, n) for the state x = T y before a step of each length.
+        """Return well-conditioned bases T (N, U + 1, n, n) for the states x = T y of N processes.
 
-        The last basis is for a state after which there is no step. Integrated noise has variances
+        There is one basis for the state before a step of each of the U lengths, and a last one for
+        a state after which there is no step. n : size of the state. Integrated noise has variances
         that differ by many powers of the step. In this basis the information from the next state
-        together with that of the state's prior, Phi^T Q^-1 Phi + P^-1, is the identity. The pivots
+        together with that of the state's prior, Phi^T Q^-1 Phi + P^-1 (Phi transition, Q noise
+        of the step, P prior covariance of the state), is the identity. The pivots
         of a forward elimination are then of order one, as a Cholesky factorisation in double
         precision needs.
         """

@@ -142,7 +142,8 @@ def groups_of(name: str) -> tuple[str, ...]:
         if part not in GROUPS and part not in DISTORTIONS:
             raise CalibrationError(
                 f"unknown model {name!r}",
-                todo=f"use one of auto, {', '.join(NAMES)}, joined by +, or LEFT=NAME,RIGHT=NAME",
+                todo=f"use auto, or one or more of {', '.join(NAMES)} joined by +, or a model for "
+                "each camera: LEFT=NAME,RIGHT=NAME",
             )
         found |= set(DISTORTIONS.get(part, (part,)))
     if {"affine", "tilt"} <= found:

@@ -102,7 +102,11 @@ def first_frames(text: str) -> int:
 
 
 def cameras_without_rig(run: Path, calibration: Calibration) -> dict[str, Any]:
-    """The cameras of the calibration, for `load_run` of a folder that belongs to no dataset."""
+    """Return the arguments of `load_run` that name the cameras, taken from the calibration.
+
+    They are needed for a run whose folder belongs to no dataset; a run with a rig.toml two folders
+    above needs none, and an empty mapping is returned.
+    """
     if (run.resolve().parent.parent / "rig.toml").is_file():
         return {}
     return {

@@ -436,7 +436,10 @@ def _result(future: Future[dict[str, Any]]) -> dict[str, Any]:
 
 @contextmanager
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
-    """Give an executor for ``workers`` jobs at once (None: one per core), each in a process."""
+    """Context manager of an executor that runs ``workers`` jobs at once, each in its own process.
+
+    workers : None for one per core. Raises InputError for less than one.
+    """
     count = cores() if workers is None else workers
     if count < 1:
         raise InputError(f"{count} workers", where="--workers", todo="give 1 or more")

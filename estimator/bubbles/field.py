@@ -99,7 +99,11 @@ def region_field(shape: tuple[int, int], corners_px: ArrayLike, where: str) -> B
             "is no polygon", where=where, todo="give three corners or more: [[u, v], [u, v], ...]"
         )
     if not np.isfinite(corners).all() or np.abs(corners).max() > 1e6:
-        raise InputError("has a corner that is no place in an image", where=where)
+        raise InputError(
+            "has a corner that is not two finite numbers, or is far outside any image",
+            where=where,
+            todo="give the corners in px: [[u, v], [u, v], ...]",
+        )
     inside = np.zeros(shape, np.uint8)
     cv2.fillPoly(inside, [np.round(corners).astype(np.int32)], 1)
     if not inside.any():

@@ -82,7 +82,10 @@ class TankView:
     def in_image(
         self, lab_mm: Array, position_mm: float, margin_px: float = 0.0
     ) -> tuple[list[int], Array]:
-        """Return which of (n, 2) lab places are in the image or a margin round it, and pixels."""
+        """Return the indices of marks in the image or a margin round it, and their pixels (k, 2).
+
+        lab_mm : (n, 2) places of the marks in the strip's plane. position_mm : of the stage.
+        """
         width, height = self.camera.image_size_px
         offset = lab_mm - self.basis @ self.axis_rig * position_mm
         reach = 0.6 * np.hypot(width, height) / self.px_per_mm

@@ -130,8 +130,12 @@ def _numbers(
 def propagated(law: Callable[..., Array], inputs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Return a law's values and their standard deviations.
 
-    inputs : for each argument of the law its values (..., k), and the standard deviations (..., k)
-    of independent components or the directions (..., m, k) in which it may be off by one of them.
+    Errors are propagated by central differences of one standard deviation to either side; the
+    errors of different arguments are independent.
+
+    inputs : for each argument of the law, its values (..., k) and its errors: either the standard
+        deviations (..., k) of k independent components, or m independent error vectors
+        (..., m, k) of one standard deviation each, when the components are correlated.
     """
     values = [value for value, _ in inputs]
     variance = np.zeros(1)

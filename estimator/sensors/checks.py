@@ -228,7 +228,8 @@ def check_tracks(table: Any, calibration: Calibration) -> list[Finding]:
             raise InputError(
                 f"the tracks have no pixels of camera {camera.name!r}",
                 where="tracks",
-                todo=f"they have {', '.join(there) or 'none'}: track with this calibration",
+                todo=f"they hold pixels of {', '.join(there) or 'no camera'}: track the run again "
+                "with this calibration",
             )
     if len(calibration.cameras) != 2 or not len(table):
         return []

@@ -74,10 +74,13 @@ def signed_permutations() -> Array:
 def mounting(
     axes: Array, at_rest: Array, up: Array, x: Array, known: Bools, felt: Sequence[Felt]
 ) -> Mounting:
-    """Return the axes, among exchanges and reversals of the stated ones, and the gain that fit.
+    """Return the sensor's axes and gain that agree best with gravity and with the images' motion.
 
-    at_rest : (3,) median reading, whose direction must be up (3,). x, known : (n, 3), (n,) readings
-    on the grid of the images.
+    The axes are sought among all exchanges and reversals of the stated ones.
+    axes : (3, 3) stated direction of each of the sensor's axes.
+    at_rest : (3,) median reading, which has to point along up (3,).
+    x, known : (n, 3) readings at the times of the images, and (n,) whether there is one.
+    felt : the accelerations that the images show, each along one direction.
     """
     turned = np.swapaxes(signed_permutations(), -1, -2) @ axes
     forces = np.einsum("pij,i->pj", turned, at_rest)

@@ -109,8 +109,10 @@ def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
         warn(f"{np.count_nonzero(spikes)} of {len(t)} samples are spikes and are not used", spikes)
     shifted = shifted_samples(np.delete(reading, list(unused), axis=1)) & ~clipped & ~frozen
     if shifted.any():
-        words = f"{np.count_nonzero(shifted)} of {len(t)} samples are shifted against those before "
-        warn(f"{words}and after, as of a loose cable, and are not used", shifted)
+        words = (
+            f"{np.count_nonzero(shifted)} of {len(t)} samples are offset from the samples before "
+        )
+        warn(f"{words}and after them (a loose cable?): they are not used", shifted)
     findings += _gaps(t, where)
     kept = ~(clipped | frozen | spikes | shifted)
     filled = reading

@@ -263,10 +263,12 @@ def pair_pixels(
     size_score: ArrayLike = 0.0,
     allowed: ArrayLike = True,
 ) -> list[int]:
-    """Return the detection that continues each expected track; -1 for none or a rival.
+    """Return for each of K expected tracks the index of the detection that continues it, or -1.
 
-    uv_px (L, 2), covariance_px2 (L, 2, 2) : the detections.
-    size_score, allowed : (K, L) or less, log-likelihood ratio of the sizes, and pairings to try.
+    It is -1 where no detection lies in the gate, and where a second pairing is nearly as likely.
+    uv_px (L, 2), covariance_px2 (L, 2, 2) : the L detections.
+    size_score : log-likelihood ratio of the sizes, broadcast to (K, L).
+    allowed : whether a pairing may be made, broadcast to (K, L).
     """
     between = uv_px[None] - expected.uv_px[:, None]
     covariance = expected.covariance_px2[:, None] + covariance_px2[None]
@@ -284,7 +286,12 @@ def pair_pixels(
 def update_pixels(
     track: Track, uv_px: Array, covariance_px2: Array, expected_px: Array, by_point: Array
 ) -> None:
-    """Update the filter with a pixel (2,), linearised where the track is expected."""
+    """Update a track's filter in place with its pixel in one camera, by an extended Kalman step.
+
+    uv_px (2,), covariance_px2 (2, 2) : the detection.
+    expected_px (2,), by_point (2, 3) : the predicted pixel, and its derivative (px/mm) with respect
+        to the position.
+    """
     h = np.zeros((2, len(track.filter.x)))
     h[:, POSITION] = by_point
     linear = uv_px - expected_px + h @ track.filter.x
@@ -564,7 +571,10 @@ class Association:
         return list(groups.values())
 
     def outside(self, members: Sequence[int]) -> Common:
-        """The common shift, estimated from the bubbles outside some clusters."""
+        """Return the shift of this frame that all bubbles share, without those of some clusters.
+
+        members : indices of the clusters (bubbles whose pairings compete) to leave out.
+        """
         others = self.picked[~np.isin(self.owner[self.picked], members)]
         return self.prior.informed(
             self.pairs.innovation_mm[others], self.pairs.covariance_mm2[others]

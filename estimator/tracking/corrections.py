@@ -97,7 +97,8 @@ class Corrections:
             raise InputError(
                 f"two tracks have the id {particle} in frame {frame}",
                 where=str(self.file),
-                todo="join tracks that follow each other in time, and give new ids to others",
+                todo="join only tracks that follow each other in time; give another id to a track "
+                "that overlaps in time",
             )
         return replace(part, tracks=tracks, detections=detections)
 

@@ -208,7 +208,7 @@ def _words(summary: Mapping[str, Mapping[str, Any]], run: RunData) -> list[str]:
         if not found["marks"]:
             out.append(
                 f"camera {name}: rig.toml describes a strip of dots ([references]), but none is "
-                "seen in the images. Check its dot_diameter_mm and polarity, or remove the table"
+                "seen in the images. Check its dot_diameter_mm and polarity, or remove [references]"
             )
             continue
         out.append(

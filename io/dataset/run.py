@@ -373,7 +373,7 @@ def _times(
     if file.is_file():
         if settings.is_file():
             read_run_toml(settings)
-            notes.append("the frames' times are those of frames.csv, not of run.toml")
+            notes.append("frame times are read from frames.csv; those of run.toml are not used")
         return np.asarray(read_frames_csv(file, count, names)["t_s"], float)
     if count is None:
         count = 0
@@ -385,7 +385,7 @@ def _times(
         rate, start = read_run_toml(settings)
         return start + np.arange(count) / rate
     if recorded is not None:
-        notes.append(f"the frames' times are those of {recorded[0].name}, from 0 s")
+        notes.append(f"frame times are read from {recorded[0].name}, counted from its first frame")
         return recorded[1]
     if count == 1:
         notes.append("neither frames.csv nor run.toml: the only frame is taken at 0 s")

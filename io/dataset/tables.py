@@ -48,7 +48,7 @@ def choose_source(
     found = [s for s in has if has[s] and source in (None, s)]
     if len(found) > 1:
         raise InputError(
-            f"holds both {first} and {second}.csv, and nothing says which to use",
+            f"holds measurements in two forms, {first} and {second}.csv",
             where=str(folder),
             todo=f"choose with --from {first} or --from {second}",
         )

@@ -47,9 +47,13 @@ class FrameTable:
 
     @classmethod
     def of(cls, file: Path, read: Read, see: Callable[[pd.DataFrame], None]) -> FrameTable | None:
-        """Return the table of a file; None if it is small, unusual, or not in the order of frames.
+        """Return a table that reads the rows of single frames from a CSV file when they are needed.
 
-        see : is called with all parts of the table, one after the other.
+        Returns None for a file that is to be read as a whole: one below `LARGE_BYTES`, one that
+        ``read`` cannot read in parts, and one whose rows are not in the order of the frames.
+
+        read : takes the bytes of a part with the header, and the number of its first row.
+        see : called with each part of the table, in order.
         """
         if not file.is_file() or file.stat().st_size < LARGE_BYTES:
             return None

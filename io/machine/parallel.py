@@ -33,7 +33,7 @@ def cores() -> int:
 
 
 def can_fork() -> bool:
-    """Return whether copies of this process start at once; safe only with a single thread."""
+    """Return whether this process may be copied by fork: on Linux, while it has one thread."""
     return sys.platform == "linux" and threading.active_count() == 1
 
 

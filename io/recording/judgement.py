@@ -53,7 +53,10 @@ def amid_garbage(spans: Ints, garbage: Ints) -> Bools:
 
 
 def mostly_garbage(device: DeviceDescription, found: Readings) -> InputError | None:
-    """Return the error for a device most of whose readings are amid garbage, otherwise None."""
+    """Return the error if most readings of a device stand between bytes that are no readings.
+
+    Returns None for a device whose readings can be used.
+    """
     garbage = found.malformed_spans[found.garbage]
     usable = int(np.sum(~amid_garbage(found.spans, garbage)))
     if not len(garbage) or 2 * usable > len(found.spans):

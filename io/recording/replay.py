@@ -122,7 +122,7 @@ class _Line:
             self._parser = parser(self.device)
         except (ValueError, KeyError) as error:
             self.error = InputError(
-                f"has a protocol or pattern that cannot be used: {error}",
+                f"the protocol of the device, or the pattern of its lines, cannot be used: {error}",
                 where=_place(self.device),
                 todo=f"correct [devices.{self.device.name}] in rig.toml, then {REPLAY_WITH_RIG}",
             )

@@ -103,9 +103,14 @@ def record(
     """Record all devices into ``folder``/recording.raw until ``stop`` is set or time is up.
 
     Returns the path of the log, from which `telerig.io.recording.tables.write_tables` makes the
-    tables. Raises InputError for a port that cannot be opened, a log that cannot be written, and a
-    device whose first `GARBAGE_S` are not what is stated; later no device ends the recording of
-    others.
+    tables.
+
+    cameras : names of the cameras, for the log's header.
+    tell : called with the state of the recording from time to time.
+
+    Raises InputError for a port that cannot be opened, a log that cannot be written, and a device
+    that in its first `GARBAGE_S` seconds does not send what rig.toml states. A device that fails
+    later does not stop the recording of the others.
     """
     if not devices:
         raise InputError("no device to record", todo="add a table [devices.<name>] to rig.toml")

@@ -154,7 +154,7 @@ class FieldDescription(Table):
     camera: str
     region: Annotated[
         tuple[tuple[float, float], ...] | None,
-        Field(description="corners in px, like [[100, 50], [900, 50], [900, 700]]"),
+        Field(description="three or more corners (u, v) in px: [[100, 50], [900, 50], [900, 700]]"),
     ] = None
     mask: Annotated[Text | None, Field(description='a file, like "mask.png"')] = None
 

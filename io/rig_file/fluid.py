@@ -16,11 +16,11 @@ from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 
 def liquid_of(fluid: Any, gravity_m_s2: float = STANDARD_GRAVITY_M_S2) -> tuple[Liquid, Any] | None:
-    """Return the liquid and its velocity in mm/s (three numbers, one upwards, or None).
+    """Return the liquid and its velocity in mm/s, or None where no liquid is described.
 
-    fluid : a `FluidDescription`, a mapping with its keys, or None; None is returned
-    for this and for an empty mapping.
-    Raises InputError for a mapping that lacks a key, has another one, or no positive numbers.
+    The velocity is three numbers, a single upward one, or None for a liquid at rest.
+    fluid : a `FluidDescription`, a mapping with its keys, or None.
+    Raises InputError for a missing or unknown key and for a property that is not positive.
     """
     values = dict(fluid) if isinstance(fluid, Mapping) else vars(fluid) if fluid else {}
     if not values:

@@ -354,8 +354,8 @@ def _profile(table: Array, distance: float, curvature: float) -> tuple[float, fl
 
 @compiled
 def profiles(table: Array, distance: Array, curvature: Array) -> Array:
-    """Return (3, N) the profile of a blurred disc at N places, and its derivatives by distance and
-    by curvature; see `_profile`."""
+    """Return (3, N): the profile of a blurred disc at N places, its derivative with respect to the
+    distance from the outline, and that with respect to the curvature; see `_profile`."""
     out = np.empty((3, distance.size))
     for k in range(distance.size):
         out[0, k], out[1, k], out[2, k] = _profile(table, distance[k], curvature[k])

@@ -80,15 +80,16 @@ def closed_rims(
 ) -> tuple[Array, Array]:
     """Find around each ellipse the closed path along which the image gets brighter outwards most.
 
-    image : (rows, columns) grey levels; ellipse : (N, 5).
-    window : how far from the ellipse the path may be, as a share of its radius; at least 1.5 px.
-    floor : slope (1/px) that is noise. stiffness : what a step sideways costs, between 0 and 1.
+    image : (rows, columns) grey levels. ellipse : (N, 5) centre u, v, semi-axes (px), angle (rad).
+    window : how far from the ellipse the path may be, as a share of its radius; 1.5 px is used
+        where this is less. floor : slope (1/px) that is noise.
+    stiffness : what a step sideways costs, between 0 and 1.
 
     Along each ray the strength of a place is g / (g + g0 / 2 + floor), with g its slope and g0 the
     median over the rays of the steepest one; the path of the largest sum is found by dynamic
-    programming over two turns, of which the middle one counts.
+    programming over two turns, of which the inner half is kept, so that the path closes.
 
-    Returns the path's points (N, RAYS, 2) in px, on the steepest place between two steps, and their
+    Returns the path's points (N, RAYS, 2) in px, interpolated to the steepest place, and their
     strengths (N, RAYS).
     """
     many = ellipse.shape[0]

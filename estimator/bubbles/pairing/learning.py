@@ -56,9 +56,10 @@ _FEW_PAIRS, _CLEAR_VOTE = 5.0, 3.0
 
 
 def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
-    """Return the pair model to use before any detection is known.
+    """Return the model for matching bubbles across the two views before any detection is known.
 
-    It assumes that the calibration is right: its bias is 0. Raises InputError for parallel cameras.
+    It assumes that the calibration is right: its bias is 0. Raises InputError for cameras whose
+    optical axes are parallel.
     """
     axis = shared_axis(cameras)
     size, contrast = (

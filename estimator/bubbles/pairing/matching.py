@@ -410,7 +410,8 @@ class PairModel:
         return np.stack(every[: len(self.bias_px) if terms is None else terms], -1)
 
     def bias(self, points_mm: Array) -> tuple[Array, Array]:
-        """Return the systematic gap (...) in px and its variance (...) in px^2.
+        """Return the systematic distance (...) in px between the two images of one point along the
+        coordinate that both cameras share (0 for a right calibration), and its variance in px^2.
 
         points_mm : (..., 3) points in the rig frame, in mm.
         """

@@ -210,7 +210,11 @@ def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lense
 
 
 def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Addition]:
-    """Yield (camera, group, model) for each allowed model with one group more than ``lenses``."""
+    """Yield each way to add one group of parameters to the lens model of one camera.
+
+    Each is (index of the camera, the group, the lens models of all cameras with it). allowed : the
+    permitted models of each camera.
+    """
     for c, options in enumerate(allowed):
         for lens in options:
             more = lens - lenses[c]

@@ -342,13 +342,13 @@ def _correlated(names: tuple[str, ...], covariance: Array) -> list[str]:
             together = "both" if size > 0 else "one and a fall of the other"
             out.append(
                 f"{words[0]} and {words[1]} can hardly be told apart (correlation {size:+.3f}): "
-                f"a rise of {together} hardly changes the images"
+                f"a rise of {together} leaves the images almost the same"
             )
         elif len(members) > 2:
             largest = np.max(np.abs(correlation[np.ix_(members, members)] - np.eye(len(members))))
             out.append(
                 f"{', '.join(words[:-1])} and {words[-1]} can hardly be told apart (correlations "
-                f"up to {largest:.3f}): they can change together with hardly a change of the images"
+                f"up to {largest:.3f}): changed together, they leave the images almost the same"
             )
     return out
 

@@ -29,10 +29,13 @@ class UncertaintyMap:
 def uncertainty_map(
     calibration: Calibration, *, sigma_px: float | None = None, steps: int = STEPS
 ) -> UncertaintyMap:
-    """Compute how uncertain points are that are triangulated from the pixels of all cameras.
+    """Return the covariance of triangulated points on a cubic grid round the origin of the rig.
 
-    sigma_px : None takes the scatter of the calibration's own dots. Raises CalibrationError for a
-    single camera.
+    It is split into the share of the calibration and that of the pixels (see `UncertaintyMap`).
+
+    sigma_px : standard deviation of a pixel coordinate; None takes the scatter of the calibration's
+        own dots. steps : number of grid points along each axis.
+    Raises CalibrationError for a single camera.
     """
     sigma = float(calibration.statistics.get("scatter_px", 0.02)) if sigma_px is None else sigma_px
     points = working_volume(calibration.cameras, steps)

@@ -349,7 +349,8 @@ def _check_distance(target: Target) -> None:
             f"their nominal places are {nominal:.4g} mm apart and good to "
             f"{target.print_sigma_mm:g} mm each",
             where="rig.toml [target]",
-            todo="correct scale_distance_mm, scale_dots or the pitch, or raise print_sigma_mm",
+            todo="correct scale_distance_mm (the measured distance), scale_dots (the two dots that "
+            "it joins) or the pitch, or raise print_sigma_mm (accuracy of the print)",
         )
 
 

@@ -177,9 +177,9 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
         nearest = int(np.argmin(angles))
         if max(angles) < TIE_DEG and perspective == 0:
             raise CalibrationError(
-                f"the optical axes are nearly parallel: the nominal rotation is right to "
-                f"{max(angles):.0f} degrees, but the two mirror solutions are as near to it, and "
-                "the lenses' perspective is too weak to tell them apart",
+                "the optical axes are nearly parallel: both mirror solutions lie within "
+                f"{max(angles):.0f} degrees of the nominal rotation, which therefore cannot choose "
+                "between them, and the lenses' perspective is too weak to do so",
                 where="rig.toml [stereo]",
                 todo="turn one camera by 20 degrees or more: nearly parallel telecentric cameras "
                 "do not see depth; if the lenses are ordinary ones, state telecentricity_per_mm = "

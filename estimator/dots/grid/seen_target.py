@@ -30,12 +30,15 @@ Places = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class SeenTarget:
-    """What one image or several show of a grid of dots.
+    """What one or several images show of a target with a grid of dots.
 
-    rows, columns : size of the part that is seen. whole : whether the grid ends inside the image on
-    all sides. marks : (row, column) of each mark from the first corner of what is seen, up to
-    quarter turns.
-    mark_diameter, pitch (x, y) : in diameters of the dots, diameter_px, without foreshortening.
+    rows, columns : size of the part of the grid that is seen.
+    whole : whether the grid ends inside the image on all sides.
+    marks : (row, column) of each mark, counted from one corner of the seen part. Which corner is
+        not known: all four quarter turns are possible.
+    mark_diameter, pitch : diameter of the marks and pitch (x, y), both in units of the diameter of
+        a dot and corrected for foreshortening.
+    diameter_px : diameter of a dot in px.
     """
 
     rows: int

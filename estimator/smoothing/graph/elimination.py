@@ -34,12 +34,14 @@ _NOTHING = np.zeros(0, np.int64)
 
 @dataclass(frozen=True)
 class Blocks:
-    """Covariances of increments, in their bases.
+    """Covariances of the variables, each in the basis of `StateSpace.bases` that it is solved in.
 
-    own : of each family of keys, (n, d, d); the shake's at the frames.
-    cross : (C, Ds, Db) of the shake with a bubble at the same frame.
-    cross_row : (C,) rows of the bubbles in whose bases these are.
-    cross_of_row : (rows,) which of them is that of each row.
+    own : for each kind of variable (shake, bubbles, ...), (n, d, d) for its n variables of d
+        numbers; that of the shake at the frames.
+    cross : (C, Ds, Db) covariances of the shake (Ds numbers) with a bubble (Db numbers) at the same
+        frame, for C observations.
+    cross_row : (C,) row of the bubbles' variables that each observation belongs to.
+    cross_of_row : (rows,) the observation's index for each such row.
     """
 
     own: list[Array]

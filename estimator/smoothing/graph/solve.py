@@ -262,7 +262,8 @@ def _check_converged(graph: GraphLayout, state: State, largest_px: float) -> Non
         raise CalibrationError(
             f"the smoother does not converge: the last pass moved a bubble by {largest_px:.3g} px",
             where="smooth",
-            todo="check calibration, encoder and sensors, or smooth without each of them in turn",
+            todo="check calibration, encoder and sensors; to find the cause leave out the encoder, "
+            "then one sensor after the other",
         )
 
 

@@ -366,7 +366,8 @@ class Factor:
 
 
 def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:
-    """Yield each value of an index and where it stands, as a slice if that is one stretch."""
+    """Yield each distinct value of an index (n,) and its positions: a slice if they are contiguous,
+    otherwise an index array."""
     order = np.argsort(index, kind="stable")
     values, first = np.unique(index[order], return_index=True)
     for value, mine in zip(values.tolist(), np.split(order, first[1:])):

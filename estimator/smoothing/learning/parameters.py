@@ -175,7 +175,7 @@ def processes(signal: Signal, model: ShakeModel) -> list[Component]:
 
 
 def depends_on(signal: Signal, model: ShakeModel, names: Sequence[str]) -> bool:
-    """Return whether the signal's evidence depends on any of these hyper-parameters."""
+    """Return whether the likelihood of the signal depends on any of these hyper-parameters."""
     found = shake_processes(signal, model) + moving_processes(signal, model)
     known = {name for p in found for name in names_of_process(p)}
     return "pixel_inflation" in names or not known.isdisjoint(names)

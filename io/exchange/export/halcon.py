@@ -148,7 +148,10 @@ def _halcon_camera(camera: Camera, points: Array) -> HalconCamera:
     if camera.wall is not None:
         notes.append("the refractive window is left out, because HALCON's models have none")
     if distorted:
-        notes.append("the distortion is fitted, because HALCON's maps distorted to undistorted")
+        notes.append(
+            "the distortion is approximated by a fit, because HALCON's model goes the other way, "
+            "from distorted to undistorted pixels"
+        )
     if camera["kappa_per_mm"] != 0 and not perspective:
         notes.append(
             f"the residual perspective kappa = {camera['kappa_per_mm']:.4g} per mm is left out, "

@@ -124,7 +124,7 @@ def _check(one: Pinhole) -> None:
     deviation = float(np.abs(r @ r.T - np.eye(3)).max())
     if deviation > 0.05 or np.linalg.det(r) < 0:
         raise one.error(
-            f"the rotation matrix R is not a rotation (R R' differs by {deviation:.2g} from the "
+            f"the rotation matrix R is not a rotation (R R^T differs by {deviation:.2g} from the "
             f"unit matrix, det R = {np.linalg.det(r):.3f})",
             "export the camera again",
         )

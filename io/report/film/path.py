@@ -198,7 +198,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class Layout:
-    """size_px : (width, height) at 100 dpi, multiples of 20, as videos need even numbers."""
+    """Size and panels of the film.
+
+    size_px : (width, height) at 100 dpi; multiples of 20, so that they are even, as videos need, at
+        other resolutions too.
+    """
 
     size_px: tuple[int, int]
     panels: tuple[Panel, ...]

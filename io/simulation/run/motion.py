@@ -236,11 +236,13 @@ def stochastic_paths(
     height_oscillation: tuple[float, float, float],
     lateral_oscillation: tuple[float, float, float],
 ) -> Path:
-    """Return paths (B, steps) with steady rise, Ornstein-Uhlenbeck velocity and stochastic
-    oscillation.
+    """Return B random paths: a steady rise, Ornstein-Uhlenbeck velocity and damped oscillation.
 
-    rise_mm_s : (B,). The oscillations are (RMS mm, frequency Hz, damping), one vertical, one on
-    each lateral axis.
+    rise_mm_s : (B,) mean velocity upwards.
+    wander_mm_s, wander_tau_s : standard deviation along each axis and correlation time of the
+        velocity about its mean.
+    height_oscillation, lateral_oscillation : (RMS in mm, frequency in Hz, damping ratio) of the
+        vertical oscillation, and of independent ones along the two lateral axes.
     """
     rise = np.asarray(rise_mm_s, float)
     count = len(rise)

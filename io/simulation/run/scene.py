@@ -106,7 +106,10 @@ class RunScene:
         return self.carriage.shake.velocity_mm_s[:, self.carriage.frames]
 
     def rig_from_lab_mm(self, camera: int, frame: int) -> Array:
-        """Return (3,) to add to a lab point to have it where a camera sees it, in rig axes."""
+        """Return the vector (3,) from a lab point to its place before a moving, shaken camera.
+
+        It is in mm along the axes of the rig: minus the stage's position and the shake.
+        """
         return np.asarray(-AXIS_RIG * self.position_mm[frame] - self.shake_mm[camera, frame])
 
     def bodies_lab(self, frame: int, chosen: Ints) -> Bodies:
@@ -132,7 +135,10 @@ class RunScene:
 
 
 def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) -> RunScene:
-    """Draw a run. Raises InputError when the bubbles asked for do not fit."""
+    """Return a random run: carriage, shake, and the bubbles with their paths and shapes.
+
+    Raises InputError when the bubbles that ``config`` asks for do not fit into the view.
+    """
     stage_rng, path_rng, place_rng, shape_rng = rng.spawn(4)
     speed = config.stage.follow * _mean_rise(config.motion)
     carriage = _carriage(config, len(cameras), speed, stage_rng)

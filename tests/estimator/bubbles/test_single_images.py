@@ -65,7 +65,7 @@ def test_regions_and_masks_that_do_not_fit_are_refused() -> None:
     for corners, words in (
         ([[0, 0], [1, 1]], "is no polygon"),
         ([[0, 0], [1, 1, 2], [3, 3]], "is no polygon"),
-        ([[0, 0], [np.nan, 1], [2, 2]], "no place in an image"),
+        ([[0, 0], [np.nan, 1], [2, 2]], "not two finite numbers"),
         ([[900, 900], [950, 900], [950, 950]], "lies outside the image of 440 x 440 px"),
     ):
         with pytest.raises(InputError, match=words):

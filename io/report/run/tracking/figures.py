@@ -307,7 +307,10 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
 
 
 def seen_where(results: TrackResults, index: int) -> Picture:
-    """Where in one camera's image bubbles were, and those of them that are in no track."""
+    """Draw how often each part of a camera's image saw bubbles, and mark detections in no track.
+
+    index : number of the camera, from 0.
+    """
     camera = results.cameras[index]
     table = results.detections[results.detections["camera"] == camera]
     uv = table[["u_px", "v_px"]].to_numpy(float)

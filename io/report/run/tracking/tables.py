@@ -157,7 +157,7 @@ def key_numbers(results: TrackResults) -> list[Figure]:
         Figure("Matched", share(*matched),
                f"{number(matched[0])} of {number(matched[1])} bubbles in single images"),
         Figure("Position, 1 sd", f"{number(median(results.sd_um.max(axis=1)), 2)} µm",
-               "median over the worst axis of each point; the calibration's share not counted"),
+               "along each point's worst axis, median over points; calibration's share left out"),
         Figure("Ray miss", f"{number(median(np.abs(miss)), 2)} µm",
                f"median; {number(None if sd is None else _normal_median(sd), 2)} µm from the "
                f"outlines' noise; RMS {number(rms(miss), 2)} µm"),

@@ -69,7 +69,8 @@ class Alignment:
     no connection at all; runner_up_nats, runner_up_s : at the best other lag; reversed_nats : the
     best with the record reversed in time; at_zero_nats : the best at offsets of a shared clock.
     at_end : whether the peak lies at the end of the lags that were tried. explained : by channel,
-    the share of its variance that the sensors explain at the peak.
+    the share of its variance that the sensors explain at the peak. lag_nats : at every lag lags_s;
+    -inf where it was not tried.
     """
 
     offset_s: float
@@ -81,6 +82,8 @@ class Alignment:
     at_zero_nats: float
     at_end: bool
     explained: dict[str, float]
+    lags_s: Array
+    lag_nats: Array
 
     @property
     def connected(self) -> bool:
@@ -139,9 +142,9 @@ def align(
     others[_lobe(total, peak)] = -np.inf
     second = int(np.argmax(others))
     backward = [_Profile.of(c, readings, f, reverse=True) for c, f in zip(used, filters)]
-    place, sd = _refined(total, peak)
+    place, sd = refined(total, peak)
     sd *= _disagreement(forward, sizes, tried, peak + place, 2 * frames.knots)
-    offsets = lags * frames.step_s
+    offsets = np.asarray(lags * frames.step_s, np.float64)
     ends = np.flatnonzero(tried)[[0, -1]]
     edge = max(round(_END_S / frames.step_s), 1)
     near = np.abs(offsets) <= near_s + frames.step_s / 2
@@ -151,7 +154,7 @@ def align(
         float(_total(backward, sizes, tried[::-1]).max()),
         float(total[near].max(initial=-np.inf)),
         bool(np.abs(peak - ends).min() <= edge),
-        {p.channel.name: float(p.explained[peak]) for p in forward},
+        {p.channel.name: float(p.explained[peak]) for p in forward}, offsets, total,
     )  # fmt: skip
 
 
@@ -301,14 +304,14 @@ def _disagreement(
         low = max(round(place) - reach, 0)
         peak = low + int(np.argmax(own[low : round(place) + reach + 1]))
         if own[peak] > _LEAST_NATS and abs(peak - round(place)) < reach:
-            shift, sd = _refined(own, peak)
+            shift, sd = refined(own, peak)
             squares.append(((peak + shift - place) / sd) ** 2)
     if len(squares) < 2:
         return 1.0
     return max(1.0, float(np.sqrt(np.sum(squares) / (len(squares) - 1))))
 
 
-def _refined(total: Array, peak: int) -> tuple[float, float]:
+def refined(total: Array, peak: int) -> tuple[float, float]:
     """Return place and sd of the peak in steps, from a parabola through three values."""
     if not 0 < peak < len(total) - 1 or not np.isfinite(total[[peak - 1, peak + 1]]).all():
         return 0.0, float("inf")

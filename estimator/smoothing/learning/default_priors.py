@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
-from telerig.estimator.smoothing.graph.linear import images
-from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.arrays import Array
+from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
@@ -182,10 +181,9 @@ def acceleration_rms(stage: Stage) -> float:
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
-_SAMPLED = 1000
 _LEAST_SPARE = 0.2
 _LEAST_PIXELS = 60
-_MEDIAN_OF_CHI_SQUARE, _SD_OF_MEDIAN = 0.4549, 1.16
+_SD_OF_MEDIAN = 1.16
 _FLOORS = np.geomspace(0.03, 0.4, 40)
 _FLOOR_SPREAD = np.log(2.0)
 _LOW_BAND = 0.4
@@ -295,49 +293,25 @@ def _dominant_hz(solution: Solution) -> float:
 def _noise_factor(solution: Solution) -> float:
     """Return by how much the pixels' stated noise is too small, 1 at least.
 
-    It follows from the median square of single coordinates, each divided by one less its leverage;
-    those of high leverage are left out. The noise is never taken for smaller than stated: the error
-    of a bubble's outline changes slowly, and the fit takes that for motion.
+    It follows from the median squares of rows and of columns, beside those of residuals drawn from
+    the model; the larger one counts, because an outline's centre wanders along both, and the fit
+    may take it for motion along one. For the same reason the noise is never taken for smaller than
+    stated, and coordinates of which the fit takes up nearly all are left out.
     """
-    square, spare = [], []
-    for which, leverage in leverages(solution):
-        kept = solution.weights[0][which] > 0.5
-        square.append(solution.residuals[0][which[kept]].ravel() ** 2)
-        spare.append(1 - leverage[kept].ravel())
-    if not square:
+    observed, kept = solution.graph.problem.observations, solution.weights[0] > 0.5
+    if solution.covariances is None or not kept.any():
         return 1.0
-    squares, spares = np.concatenate(square), np.concatenate(spare)
-    informative = spares > _LEAST_SPARE
-    if np.count_nonzero(informative) < _LEAST_PIXELS:
-        return 1.0
-    median = float(np.median(squares[informative] / spares[informative]))
-    found = float(np.sqrt(median / _MEDIAN_OF_CHI_SQUARE))
-    sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(np.count_nonzero(informative)))
-    return found if found > sure else 1.0
-
-
-def leverages(solution: Solution) -> list[tuple[Ints, Array]]:
-    """Return by camera var(prediction) / var(noise) (m, 2) of some bubbles' pixels (m,)."""
-    graph, found = solution.graph, solution.covariances
-    observed = graph.problem.observations
-    if found is None or not len(observed):
-        return []
-    every = [np.flatnonzero(observed.camera == camera) for camera in np.unique(observed.camera)]
-    chosen = [m[np.linspace(0, len(m) - 1, min(len(m), _SAMPLED)).astype(int)] for m in every]
-    few = replace(graph.problem, observations=observed.of(np.concatenate(chosen)))
-    weight = np.ones(len(few.observations))
-    linear = images(replace(graph, problem=few), solution.state, weight).linear
-    out = []
-    for some, part in zip(chosen, linear, strict=True):
-        row, node = np.asarray(part.keys[0]) - graph.base().bubbles, np.asarray(part.keys[1])
-        at = graph.frame_of_row[row]
-        by_bubble = part.blocks[0] @ np.linalg.inv(graph.bubble_basis(row))
-        by_shake = part.blocks[1] @ np.linalg.inv(graph.shake_basis(node))
-        if graph.to_frames is not None:
-            by_shake = by_shake @ np.linalg.inv(graph.to_frames[at])
-        both = by_shake @ found.cross[found.cross_of_row[row]]
-        leverage = (by_bubble @ found.bubbles[row] * by_bubble).sum(-1)
-        leverage += (by_shake @ found.shake[at] * by_shake).sum(-1)
-        leverage += 2 * (both * by_bubble).sum(-1)
-        out.append((some, leverage))
-    return out
+    drawn_px, found = drawn(solution).pixels, [1.0]
+    for k in range(2):
+        ratios = [np.zeros(0)]
+        for camera in np.unique(observed.camera[kept]):
+            mine = kept & (observed.camera == camera)
+            left = drawn_px[mine, k] ** 2
+            if left.mean() > _LEAST_SPARE:
+                ratios.append(solution.residuals[0][mine, k] ** 2 / np.median(left))
+        ratio = np.concatenate(ratios)
+        if len(ratio) >= _LEAST_PIXELS:
+            factor = float(np.sqrt(np.median(ratio)))
+            sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(len(ratio)))
+            found.append(factor if factor > sure else 1.0)
+    return max(found)

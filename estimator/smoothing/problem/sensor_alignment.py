@@ -22,6 +22,7 @@ from telerig.estimator.sensors.accelerations import (
     of_readings,
 )
 from telerig.estimator.sensors.alignment import Alignment, Channel, align
+from telerig.estimator.sensors.drift import LEAST_PARTS, drift_of
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
 from telerig.estimator.sensors.mounting import (
@@ -53,7 +54,6 @@ _LEAST_SAMPLES = 100
 _DIFFERENT_SDS = 5.0
 _LONG_S = 1.2
 _WINDOW_S = 3.0
-_LEAST_WINDOWS = 3
 _MOST_DRIFT, _DRIFT_NATS = 0.02, 5.0
 """No clock's rate is off by a larger share; a drift explains the images better by at least this."""
 _WINDOW_MARGIN_S = 0.1
@@ -130,10 +130,15 @@ def _aligned(
             beside = [s for s in placed.values() if s.confirmed]
             clock = _clock(problem, images, group, beside=beside) or clock
         for index in group:
-            sensor, found = _placed(problem.accelerometers[index], clock, problem, images)
+            sensor, found = _placed(problem.accelerometers[index], clock, problem)
             findings += found
             if sensor is not None:
                 placed[index] = sensor
+        free = [i for i in group if not _keeps_clock(problem.accelerometers[i], clock)]
+        if clock is not None and clock.unique and free:
+            corrected, found = _without_drift([placed[i] for i in free], free, problem, images)
+            placed.update(zip(free, corrected))
+            findings += found
     problem = _with(problem, [placed[i] for i in sorted(placed)])
     findings += _mountings(problem, images, refused)
     findings += _encoder(problem, images, encoder, [*refused, *findings])
@@ -440,13 +445,18 @@ def _left_out(where: str, why: str) -> Finding:
     )  # fmt: skip
 
 
+def _keeps_clock(sensor: Accelerometer, clock: Alignment | None) -> bool:
+    """Whether the images agree with the clock of the frames, which the sensor is said to have."""
+    return sensor.clock == "frames" and clock is not None and clock.at_zero
+
+
 def _placed(
-    sensor: Accelerometer, clock: Alignment | None, problem: SmoothingProblem, images: _Images
+    sensor: Accelerometer, clock: Alignment | None, problem: SmoothingProblem
 ) -> tuple[Accelerometer | None, list[Finding]]:
     """Return a sensor on the clock of the frames, None if it is left out, and what to say."""
     where = f"accelerometer {sensor.name}"
     shared = sensor.clock == "frames"
-    if shared and clock is not None and clock.at_zero:
+    if clock is not None and _keeps_clock(sensor, clock):
         near_zero = abs(clock.offset_s) <= SAME_CLOCK_S
         return replace(sensor, confirmed=True, offset_sd_s=clock.sd_s if near_zero else None), []
     if clock is not None and clock.unique:
@@ -454,7 +464,7 @@ def _placed(
             sensor, t_s=sensor.t_s - clock.offset_s, offset_s=clock.offset_s,
             offset_sd_s=clock.sd_s, confirmed=True,
         )  # fmt: skip
-        moved, findings = _without_drift(moved, problem, images)
+        findings = []
         if shared and abs(clock.offset_s) > max(SAME_CLOCK_S, _DIFFERENT_SDS * clock.sd_s):
             findings.append(
                 Finding(
@@ -495,46 +505,48 @@ def _unconfirmed_words(clock: Alignment | None) -> str:
 
 
 def _without_drift(
-    sensor: Accelerometer, problem: SmoothingProblem, images: _Images
-) -> tuple[Accelerometer, list[Finding]]:
-    """Return the sensor with a drift of its clock taken out, where the run is long enough and the
+    sensors: Sequence[Accelerometer], group: list[int], problem: SmoothingProblem, images: _Images
+) -> tuple[Sequence[Accelerometer], list[Finding]]:
+    """Return sensors of one clock with its drift taken out, where the run is long enough and the
     images are explained better without it.
     """
     t = problem.t_s
-    group = [i for i, s in enumerate(problem.accelerometers) if s.name == sensor.name]
     channels = images.channels(problem, group)
 
-    def nats(one: Accelerometer) -> float:
-        found = _aligned_by(images, channels, [near_frames(one, t, _WINDOW_MARGIN_S)])
+    def nats(some: Sequence[Accelerometer]) -> float:
+        near = [near_frames(s, t, _WINDOW_MARGIN_S) for s in some]
+        found = _aligned_by(images, channels, near)
         return -np.inf if found is None else found.nats
 
-    best = sensor
+    best = sensors
     for _ in range(_MOST_REFINEMENTS if t[-1] - t[0] >= _LONG_S else 0):
-        sds, needed = (_DIFFERENT_SDS, _DRIFT_NATS) if best is sensor else (1.0, 0.0)
+        sds, needed = (_DIFFERENT_SDS, _DRIFT_NATS) if best is sensors else (1.0, 0.0)
         corrected = _corrected_drift(best, t, channels, images, sds)
         if corrected is None or not nats(corrected) > nats(best) + needed:
             break
         best = corrected
-    if best is sensor:
-        return sensor, []
-    words = f"its clock drifts by {best.drift_ppm:+.0f} ppm against that of the frames; corrected"
-    return best, [Finding(words, f"accelerometer {sensor.name}")]
+    if best is sensors:
+        return sensors, []
+    words = (
+        f"its clock drifts by {best[0].drift_ppm:+.0f} ppm against that of the frames; corrected"
+    )
+    return best, [Finding(words, f"accelerometer {s.name}") for s in best]
 
 
 def _corrected_drift(
-    sensor: Accelerometer,
+    sensors: Sequence[Accelerometer],
     t_s: Array,
     channels: Sequence[Channel],
     images: _Images,
     least_sds: float,
-) -> Accelerometer | None:
-    """Return the sensor without the drift that its offsets in parts of the run show, or None."""
-    length_s = float(t_s[-1] - t_s[0])
-    windows = max(round(length_s / _WINDOW_S), _LEAST_WINDOWS)
+) -> list[Accelerometer] | None:
+    """Return the sensors without the drift that their offsets in parts of the run show, or None."""
+    length_s, stamps = float(t_s[-1] - t_s[0]), sensors[0].t_s
+    windows = max(round(length_s / _WINDOW_S), LEAST_PARTS)
     edges = np.linspace(t_s[0], t_s[-1], windows + 1)
-    places, offsets, sds = [], [], []
+    middles, found = [], []
     for low, high in pairwise(edges):
-        near = (sensor.t_s > low - _WINDOW_MARGIN_S) & (sensor.t_s < high + _WINDOW_MARGIN_S)
+        near = (stamps > low - _WINDOW_MARGIN_S) & (stamps < high + _WINDOW_MARGIN_S)
         first, last = (round((e - t_s[0]) / images.grid.step_s) for e in (low, high))
         grid = replace(images.grid, start_s=t_s[0] + first * images.grid.step_s, count=last - first)
         parts = [
@@ -542,27 +554,23 @@ def _corrected_drift(
         ]
         if np.count_nonzero(near) < _LEAST_SAMPLES:
             continue
-        found = align(grid, parts, [_readings(grid, sensor.of(near))], SAME_CLOCK_S)
-        if found is None or not found.connected or not np.isfinite(found.sd_s):
-            continue
-        if abs(found.offset_s) < _MOST_DRIFT * length_s:
-            places.append((low + high) / 2)
-            offsets.append(found.offset_s)
-            sds.append(found.sd_s)
-    if len(places) < _LEAST_WINDOWS:
+        readings = [_readings(grid, s.of(near)) for s in sensors]
+        one = align(grid, parts, readings, SAME_CLOCK_S)
+        if one is not None:
+            middles.append((low + high) / 2)
+            found.append(one)
+    line = drift_of(np.array(middles), found, images.grid.step_s, _MOST_DRIFT)
+    if line is None or abs(line[1]) < least_sds * line[2]:
         return None
-    middle = float(np.mean(places))
-    design = (
-        np.stack([np.ones(len(places)), np.array(places) - middle], -1) / np.array(sds)[:, None]
-    )
-    normal = np.linalg.inv(design.T @ design)
-    shift, drift = normal @ design.T @ (np.array(offsets) / sds)
-    if abs(drift) < least_sds * np.sqrt(normal[1, 1]):
-        return None
-    return replace(
-        sensor, t_s=sensor.t_s - shift - drift * (sensor.t_s - middle),
-        drift_ppm=sensor.drift_ppm + float(1e6 * drift), offset_s=sensor.offset_s + float(shift),
-    )  # fmt: skip
+    shift, drift, _ = line
+    middle = float(np.mean(middles))
+    return [
+        replace(
+            s, t_s=s.t_s - shift - drift * (s.t_s - middle),
+            drift_ppm=s.drift_ppm + float(1e6 * drift), offset_s=s.offset_s + float(shift),
+        )
+        for s in sensors
+    ]  # fmt: skip
 
 
 def _at_frames(images: _Images, sensor: Accelerometer) -> tuple[Array, Bools]:

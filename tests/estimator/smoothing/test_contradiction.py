@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from leverages import leverages
 from shake_learning_data import run, true_model
 
 from telerig.errors import CalibrationError
@@ -17,7 +18,7 @@ from telerig.estimator.smoothing.graph.solve import (
     drawn,
     solve,
 )
-from telerig.estimator.smoothing.learning.default_priors import leverages
+from telerig.estimator.smoothing.learning.default_priors import adapted
 from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
     BroadBand,
@@ -71,6 +72,22 @@ def test_marks_of_another_time_are_named_and_the_bands_are_widened() -> None:
     np.testing.assert_allclose(wide["sy_mm"], factor * plain["sy_mm"])
     assert verdict["axes"]["y"]["verdict"] == "CONTRADICTED"
     assert {use["grade"] for use in verdict["usable_for"]} <= {"limited", "no"}
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_a_centre_that_wanders_with_the_outline_is_noise_and_no_contradiction(seed: int) -> None:
+    """Along the columns; the path along the rows is so free that it takes up the same wander."""
+    problem, rng = marked(seed), np.random.default_rng(seed)
+    seen, wander = problem.observations, np.zeros((2, len(problem.t_s)))
+    for k in range(1, len(problem.t_s)):
+        wander[:, k] = 0.4 * wander[:, k - 1] + 0.6 * rng.normal(size=2)
+    pixels = seen.uv_px + [0, 1] * wander[seen.camera, seen.frame, None]
+    problem = replace(problem, observations=replace(seen, uv_px=pixels))
+    stated = solve(problem, BANDS)
+    assert {(f.source, f.axis) for f in found_in(stated)} == {("bubbles", "y")}
+    better = adapted(stated)
+    assert better is not None and better.pixel_inflation > 1.5
+    assert found_in(solve(problem, better)) == ()
 
 
 def test_a_bias_that_no_sensor_has_is_a_contradiction() -> None:

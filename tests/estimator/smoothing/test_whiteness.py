@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from leverages import leverages
 from numpy.typing import NDArray
 from scipy.stats import kstest
 from shake_learning_data import run, true_model
 
 from telerig.estimator.smoothing.graph.layout import graph_layout
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
-from telerig.estimator.smoothing.learning.default_priors import adapted, leverages
+from telerig.estimator.smoothing.learning.default_priors import adapted
 from telerig.estimator.smoothing.problem.problem import Observations, ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.whiteness import (
     drawn_residuals,

@@ -177,19 +177,19 @@ def inertial_path(
 def forced_mass(
     acceleration_rms_mm_s2: float,
     *,
-    corner_hz: float = 60.0,
+    force_hz: float = 60.0,
     start_sigma_mm: float = 100.0,
     start_sigma_mm_s: float = 1000.0,
 ) -> Component:
     """Return the process of a carriage under a smooth force.
 
-    The acceleration is white noise through three equal poles at ``corner_hz``. The states are
+    The acceleration is white noise through three equal poles at ``force_hz``. The states are
     position, velocity, acceleration and two more of the force. The force has to be smooth: if a
     prior had power above the sampling rate of an accelerometer, this power would be aliased into
     the sensor's band, and the readings would then carry almost no information.
     """
-    _positive(acceleration_rms_mm_s2=acceleration_rms_mm_s2, corner_hz=corner_hz)
-    cutoff = 2 * np.pi * corner_hz
+    _positive(acceleration_rms_mm_s2=acceleration_rms_mm_s2, force_hz=force_hz)
+    cutoff = 2 * np.pi * force_hz
     force = np.diag([-cutoff] * 3) + np.diag([1.0, 1.0], 1)
     scaled = _scaled("force", force, np.array([1.0, 0.0, 0.0]), acceleration_rms_mm_s2)
     drift = np.diag([0.0, 0.0, -cutoff, -cutoff, -cutoff]) + np.diag([1.0] * 4, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,16 +14,22 @@ from telerig.estimator.calibration.lens.choice import Choice, Step
 from telerig.estimator.calibration.quality.checks import Note
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import JointCovariance
-from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    cameras_from_state,
+    parameter_unit,
+)
 from telerig.estimator.calibration.solver.robust_least_squares import (
     RobustFit,
+    Solution,
+    linearisation,
     lost_views,
     pixel_residuals,
     squared_distance,
 )
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
 from telerig.factors.calibration import State
-from telerig.rig.lens_parameters import INDEX, joint_name, name_of
+from telerig.rig.lens_parameters import INDEX, groups_of, joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_covariance, triangulate_any
 
@@ -198,7 +205,7 @@ def _statistics(fit: Fit, joint: JointCovariance, residuals: pd.DataFrame) -> di
     problem = fit.robust.problem
     kept = problem.kept
     values = residuals[["du_px", "dv_px"]].to_numpy()
-    squares = squared_distance(values, problem.covariance_px2)[kept].sum()
+    squares = (problem.weight * squared_distance(values, problem.covariance_px2))[kept].sum()
     out: dict[str, Any] = {
         "views": len(problem.views),
         "dots_measured": len(kept),
@@ -424,10 +431,48 @@ def _step(step: Step, before: Step, cameras: list[str]) -> dict[str, Any]:
     return row | {
         "parameters": fit.parameters, "chi2_dof": 2 * fit.cost / fit.rows,
         "bic": 2 * fit.cost + fit.parameters * float(np.log(fit.rows)), "rms_px": fit.rms_px,
-        "held_out": _finite(fit.held_out),
-        "held_out_before": None if earlier is None else _finite(earlier.held_out),
+        "held_out": _finite(fit.left_out),
+        "held_out_before": None if earlier is None else _finite(earlier.left_out),
     }  # fmt: skip
 
 
 def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
+
+
+def telecentricity(
+    problem: Problem, solution: Solution, models: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Return for each camera's name by how much its scale changes with the depth of the views.
+
+    Where a model holds kappa, it is freed here for one Gauss-Newton step.
+    Entries: "change_per_mm" at the mean depth of the dots, and "sd_per_mm"; "depth_mm", the range
+    of the dots' depths; "perspective", the slope of a ray at the image's corner.
+    """
+    at_kappa = INDEX["kappa_per_mm"]
+    wide = problem.with_model([name_of({*groups_of(model), "kappa"}) for model in models])
+    equations = linearisation(wide)[1](solution.state)
+    step, _ = equations.step(1e-12)
+    variance = np.diag(equations.posterior(whole=False).common)
+    state = solution.state
+    poses = state.rig_from_target[problem.view]
+    points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[problem.dot]) + poses[:, :3, 3]
+    out: dict[str, dict[str, float]] = {}
+    at = 0
+    for c, camera in enumerate(problem.cameras):
+        free = wide.free_indices(c).tolist()
+        place, unit = at + free.index(at_kappa), parameter_unit(camera)[at_kappa]
+        at += len(free)
+        kappa = state.intrinsics[c, at_kappa] + unit * step[place]
+        camera_from_rig = np.linalg.inv(state.rig_from_camera[c])
+        seen = problem.kept & (problem.camera == c)
+        depth = points[seen] @ camera_from_rig[2, :3] + camera_from_rig[2, 3]
+        nearer = 1.0 + kappa * float(depth.mean()) if len(depth) else 1.0
+        change = float(kappa / nearer)
+        out[camera.name] = {
+            "change_per_mm": change,
+            "sd_per_mm": float(unit * np.sqrt(max(variance[place], 0.0)) / nearer**2),
+            "depth_mm": float(np.ptp(depth)) if len(depth) else 0.0,
+            "perspective": abs(change) * camera.rho_mm,
+        }
+    return out

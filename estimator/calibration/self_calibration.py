@@ -24,10 +24,12 @@ from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.split_half import split_half_check
-from telerig.estimator.calibration.quality.telecentricity import telecentricity
-from telerig.estimator.calibration.quality.view_pairing import refuse_copies, wrong_pairs
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit
+from telerig.estimator.calibration.result_from_fit import (
+    Fit,
+    calibration_from_fit,
+    telecentricity,
+)
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import (
     OUTLIER_SD,
@@ -110,7 +112,7 @@ def self_calibrate(
     nominal = _nominal(nominal_rotvec_deg, cameras)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
     problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd), solver=solver)
-    refuse_copies(problem)
+    checks.refuse_copies(problem)
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
@@ -210,7 +212,7 @@ def _with_origin(problem: Problem, start: State) -> Problem:
 
 def _refuse_wrong_pairs(problem: Problem, dots_mm: Array, cause: Exception | None = None) -> None:
     """Raise CalibrationError if images of different views were paired; otherwise do nothing."""
-    words = wrong_pairs(problem, dots_mm)
+    words = checks.wrong_pairs(problem, dots_mm)
     if words:
         raise CalibrationError(
             words, todo="give images that were taken at the same time the same file name"

@@ -123,8 +123,8 @@ class _Sight:
         self.pixels, _ = stacked_jacobian(self.cameras, points)
 
     def _whole(self, pixels: Array, extents_px: Array) -> Array:
-        room = extents_px + _EDGE_PX
-        return np.asarray(((pixels >= room) & (pixels <= self.size - 1 - room)).all(-1))
+        margin = extents_px + _EDGE_PX
+        return np.asarray(((pixels >= margin) & (pixels <= self.size - 1 - margin)).all(-1))
 
     def volume_mm3(self, moments: Array) -> tuple[float, Array]:
         """Volume in which the centre of a body of moments A A^T (3, 3) may lie, and the half widths

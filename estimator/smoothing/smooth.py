@@ -20,8 +20,8 @@ from telerig.estimator.sensors.given import AccelerometerRecord, times
 from telerig.estimator.smoothing.graph.accelerations import accelerations_of
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import carriage, travel_of
+from telerig.estimator.smoothing.learning.cross_validation import learning_record
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
-from telerig.estimator.smoothing.learning.held_out import learning_record
 from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.learning.likelihood import (
     with_hyperparameter_uncertainty,
@@ -493,7 +493,7 @@ def problem_of(
             where="smooth",
             todo="give t_s, the times at which offsets are wanted",
         )
-    check_increasing(at_frames, "frames", 0)
+    check_increasing(at_frames, "frames")
     described = None if rig is None else rig.stage
     encoder_sigma = _ENCODER_SIGMA_MM if described is None else float(described.position_sigma_mm)
     travel = travel_of(calibration.stage, described)

@@ -61,22 +61,22 @@ class _Worst:
 
     def add(self, part: Linked) -> None:
         flags = part.tracks["flags"]
-        unsure = part.tracks.assign(
-            doubt=1 - part.tracks["confidence"], ambiguous=flags.str.contains("ambiguous")
-        ).groupby("frame")[["doubt", "ambiguous"]]
-        sums = unsure.sum()
+        columns = part.tracks.assign(
+            uncertain=1 - part.tracks["confidence"], ambiguous=flags.str.contains("ambiguous")
+        ).groupby("frame")[["uncertain", "ambiguous"]]
+        sums = columns.sum()
         found = part.detections[np.isfinite(part.detections["u_px"].to_numpy(float))]
         unpaired = found["particle"].isna().groupby(found["frame"]).sum()
         merged = found["flags"].str.contains("merged").groupby(found["frame"]).sum()
         for frame in sorted(set(part.detections["frame"])):
-            doubt, ambiguous = sums.loc[frame] if frame in sums.index else (0.0, 0)
+            uncertain, ambiguous = sums.loc[frame] if frame in sums.index else (0.0, 0)
             parts = {
                 "without partner or track": float(unpaired.get(frame, 0)),
                 "merged": float(merged.get(frame, 0)),
                 "ambiguous pairs": float(ambiguous),
             }
             why = ", ".join(f"{int(n)} {what}" for what, n in parts.items() if n)
-            score = sum(parts.values()) + float(doubt)
+            score = sum(parts.values()) + float(uncertain)
             heapq.heappush(self.heap, (score, -int(frame), why or "least sure pairs"))
             if len(self.heap) > WORST_FRAMES:
                 heapq.heappop(self.heap)

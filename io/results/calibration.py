@@ -35,6 +35,7 @@ from telerig.io.results.record import (
     Wholes,
 )
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import LENS_PARAMETERS
 from telerig.rig.pose import Pose
 from telerig.rig.projection import intrinsics_from
 from telerig.rig.windows import Wall
@@ -128,11 +129,12 @@ class CameraRecord(Part):
             raise ValueError(
                 f"kappa_per_mm times rho_mm is {perspective:g}, more than any lens has"
             )
-        radial = sum(self.parameters.get(name, 0.0) for name in ("k1", "k2", "k3"))
+        names = [name for name, one in LENS_PARAMETERS.items() if one.term == "radial"]
+        radial = sum(self.parameters.get(name, 0.0) for name in names)
         if abs(radial) > _MOST_DISTORTED:
             raise ValueError(
-                f"k1 + k2 + k3 is {radial:g}, more than any lens has: so many half diagonals the "
-                "image's corner would be moved"
+                f"{' + '.join(names)} is {radial:g}, more than any lens has: so many half "
+                "diagonals the image's corner would be moved"
             )
         return self
 
@@ -375,7 +377,7 @@ class CalibrationFile(Record):
     @model_validator(mode="after")
     def _parameters_are_known(self) -> Self:
         try:
-            self.rig_cameras(behind_walls=True)
+            self.rig_cameras(windows=True)
         except (KeyError, TypeError, TelerigError) as error:
             raise ValueError(f"lacks or garbles {error}"[:200]) from error
         return self
@@ -392,13 +394,13 @@ class CalibrationFile(Record):
     def _stage_or_empty(self, stage: Stage | None) -> dict[str, Any]:
         return {} if stage is None else stage.content()
 
-    def rig_cameras(self, *, behind_walls: bool) -> tuple[Camera, ...]:
+    def rig_cameras(self, *, windows: bool) -> tuple[Camera, ...]:
         """Return the calibrated cameras in the order of the file.
 
-        behind_walls : True for cameras that look through their refractive windows into the water,
+        windows : True for cameras that look through their refractive windows into the water,
         False for the same cameras without windows.
         """
-        walls = self.walls if behind_walls else {}
+        walls = self.walls if windows else {}
         return tuple(
             Camera(
                 name, c.image_size_px, c.rho_mm, intrinsics_from(c.parameters),

@@ -1,4 +1,4 @@
-"""Named examples of simulated calibrations and runs; every command knows a preset added here."""
+"""Named examples of simulated calibrations and runs. Their names stand in `preset_names`, too."""
 
 from __future__ import annotations
 

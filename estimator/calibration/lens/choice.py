@@ -90,7 +90,7 @@ class FittedModel:
         return tuple(name_of(lens) for lens in self.lenses)
 
     @property
-    def held_out(self) -> float:
+    def left_out(self) -> float:
         """The mean of ``per_view``; infinite if no view could be left out."""
         seen = self.per_view[~np.isnan(self.per_view)]
         return float(seen.mean()) if len(seen) else float("inf")
@@ -215,7 +215,7 @@ def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> FittedM
     residual = pixels(solution.state, obs, problem.rho_mm) - obs.uv_px
     per_view = np.full(len(problem.views), np.inf)
     if predict and solution.cost < TOO_COSTLY * rich.cost:
-        per_view = held_out_chi2(problem, solution.state)
+        per_view = cross_validation_chi2(problem, solution.state)
     count = sum(len(free) for free in problem.free)
     rms = float(np.sqrt((residual**2).mean()))
     return FittedModel(lenses, count, solution.cost, residual.size, rms, per_view, solution.state)
@@ -300,10 +300,10 @@ def _without_worse_predictions(steps: list[Step]) -> list[Step]:
     while last > 0:
         before, after = (steps[k].fit for k in (last - 1, last))
         assert before is not None and after is not None
-        if not after.held_out > before.held_out:
+        if not after.left_out > before.left_out:
             break
         words = (
-            f"left-out views are predicted {after.held_out / before.held_out - 1:.1%} worse with it"
+            f"left-out views are predicted {after.left_out / before.left_out - 1:.1%} worse with it"
         )
         steps[last] = replace(steps[last], taken=False, words=words)
         last -= 1
@@ -362,19 +362,19 @@ def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]
     """Say how all steps together, and the last one, changed the prediction of left-out views."""
     taken = [step for step in steps if step.taken]
     fits = [step.fit for step in taken if step.fit is not None]
-    simpler = [fit for fit in fits[:-1] if np.isfinite(fit.held_out)]
-    if not np.isfinite(chosen.held_out):
+    simpler = [fit for fit in fits[:-1] if np.isfinite(fit.left_out)]
+    if not np.isfinite(chosen.left_out):
         return "lowest information criterion; there are too few views to leave some out"
     if not simpler:
         return "no richer model predicts left-out views better"
     words = (
-        f"left-out views are predicted {simpler[0].held_out / chosen.held_out:.3g} times better "
+        f"left-out views are predicted {simpler[0].left_out / chosen.left_out:.3g} times better "
         f"(mean square) than by {joint_name(simpler[0].names, cameras)}"
     )
     if len(simpler) > 1:
         last = ", ".join(taken[-1].added)
         words += (
-            f", {simpler[-1].held_out / chosen.held_out:.4g} times better than without the last "
+            f", {simpler[-1].left_out / chosen.left_out:.4g} times better than without the last "
             f"step ({last} of camera {cameras[taken[-1].camera]!r})"
         )
     return words
@@ -418,7 +418,7 @@ def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
     return state
 
 
-def held_out_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
+def cross_validation_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
     """Return each view's mean squared whitened residual (V,), predicted by a fit without it.
 
     A fit without some views is one Gauss-Newton step from ``state``, the minimum with all views.

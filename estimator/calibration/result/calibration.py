@@ -515,7 +515,7 @@ def load_calibration(path: str | Path) -> Calibration:
             todo="copy both files together, or delete this one",
         )
     return Calibration(
-        cameras=record.rig_cameras(behind_walls=True),
+        cameras=record.rig_cameras(windows=True),
         dot_ids=record.target.dots,
         target_points_mm=record.target.points_mm,
         target_poses={view: pose.pose() for view, pose in record.views.items()},

@@ -142,13 +142,13 @@ def _is_whole(
     points_px: Array, lattice: Lattice, image_shape: tuple[int, ...], radius_px: float
 ) -> bool:
     """Whether the image would show a whole dot at the place next to every outermost one."""
-    room = radius_px + 2.0
+    margin = radius_px + 2.0
     last = lattice.places.max(axis=0)
     for axis in (0, 1):
         for end, sign in ((0, -1.0), (last[axis], 1.0)):
             outer = lattice.places[:, axis] == end
             beyond = points_px[outer] + sign * lattice.basis_px[outer, axis]
-            if not np.all((beyond > room) & (beyond < np.array(image_shape[::-1]) - 1 - room)):
+            if not np.all((beyond > margin) & (beyond < np.array(image_shape[::-1]) - 1 - margin)):
                 return False
     return True
 

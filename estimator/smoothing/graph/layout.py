@@ -169,9 +169,7 @@ def _carriage(problem: SmoothingProblem, model: ShakeModel) -> list[_Placed]:
     if problem.stage is None:
         return []
     if model.carriage.kind == "force":
-        part = forced_mass(
-            model.carriage.acceleration_rms_mm_s2, corner_hz=model.carriage.corner_hz
-        )
+        part = forced_mass(model.carriage.acceleration_rms_mm_s2, force_hz=model.carriage.corner_hz)
     else:
         part = independent(_READING_SIGMA_MM)
     placed = [_Placed(part, "carriage", problem.axis, CARRIAGE, "carriage")]

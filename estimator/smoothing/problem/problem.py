@@ -282,15 +282,15 @@ class Known:
     side: Array
 
 
-def check_increasing(t_s: Array, where: str, first_row: int) -> None:
+def check_increasing(t_s: Array, where: str) -> None:
     """Raise InputError, which names the row, if the times (N,) do not increase.
 
-    where : name of the table for the message.  first_row : row number of the first time.
+    where : name of the table for the message, in which rows count from 0.
     """
     bad = np.flatnonzero(~(np.diff(t_s) > 0))
     if len(bad):
         raise InputError(
-            f"times do not increase at row {int(bad[0]) + 1 + first_row}",
+            f"times do not increase at row {int(bad[0]) + 1}",
             where=where,
             todo="sort the rows and remove duplicates",
         )
@@ -361,4 +361,4 @@ class SmoothingProblem:
         stage = [] if self.stage is None else [("stage", self.stage.t_s)]
         sensors = [(f"accelerometer {a.name}", a.t_s) for a in self.accelerometers]
         for name, times in [("frames", self.t_s), *stage, *sensors]:
-            check_increasing(times, name, 0)
+            check_increasing(times, name)

@@ -202,7 +202,7 @@ def cameras_of(
         file = place / "calibration.json" if place.is_dir() else place
         with reading(file.parent, [file.name]):
             accepted = refuse_stale(file.parent, [file.name], accept)
-            cameras = CalibrationFile.read(file).rig_cameras(behind_walls=True)
+            cameras = CalibrationFile.read(file).rig_cameras(windows=True)
         return CalibratedCameras(cameras, accepted)
     if required:
         raise InputError(

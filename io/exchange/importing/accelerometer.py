@@ -216,13 +216,13 @@ def _times(recording: Recording, layout: Layout, rows: int) -> tuple[Array, list
             )
         return _times_in(recording, layout, name)
     if layout.rate_hz is None:
-        told = [name for name in there if is_time(name)] or [
+        named = [name for name in there if is_time(name)] or [
             name
             for name in there
             if _is_text(recording, name) and _stamps(recording, name) is not None
         ]
-        if told:
-            best = min(told, key=lambda name: _time_order(recording, name))
+        if named:
+            best = min(named, key=lambda name: _time_order(recording, name))
             return _times_in(recording, layout, best)
     rate = layout.rate_hz if layout.rate_hz is not None else recording.rate_hz
     if rate is None or not rate > 0:

@@ -137,8 +137,8 @@ def _text(path: Path) -> str:
 
 def _shape(lines: Sequence[str], path: Path) -> _Shape:
     """Find separator, number of columns and their kinds from rows of the second half."""
-    told = [line for line in lines if line.strip() and not _is_comment(line)]
-    half = told[len(told) // 2 :] if len(told) > 4 else told
+    filled = [line for line in lines if line.strip() and not _is_comment(line)]
+    half = filled[len(filled) // 2 :] if len(filled) > 4 else filled
     some = half[:: max(1, len(half) // _SAMPLED_ROWS)]
     best, most = None, 0
     for separator in _SEPARATORS:
@@ -190,8 +190,8 @@ def _rows(
 def _header(above: Sequence[str], shape: _Shape) -> tuple[list[str], list[str]]:
     """Return the names and the units of the columns from the lines above the table."""
     units = [""] * shape.columns
-    told = [line for line in reversed(above) if re.search(r"\w|\([^)]*\)|\[[^\]]*\]", line)]
-    for line in told[:_HEADER_WITHIN]:
+    filled = [line for line in reversed(above) if re.search(r"\w|\([^)]*\)|\[[^\]]*\]", line)]
+    for line in filled[:_HEADER_WITHIN]:
         cells = _header_cells(line, shape)
         if cells is None:
             continue

@@ -97,7 +97,7 @@ def read_results(folder: Path) -> CalibrationResults:
 
 def _read_results(folder: Path) -> CalibrationResults:
     file = CalibrationFile.read(folder / "calibration.json")
-    cameras = file.rig_cameras(behind_walls=file.medium == "water")
+    cameras = file.rig_cameras(windows=file.medium == "water")
     views = {name: pose.pose() for name, pose in file.views.items()}
     residuals = _residuals(folder, cameras, views, file)
     names, joint = read_joint_covariance(folder / "covariance.npz")

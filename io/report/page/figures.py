@@ -181,5 +181,5 @@ def limits(*series: Array, beyond: float = 0.08) -> tuple[float, float] | None:
     if not len(finite):
         return None
     low, high = float(finite.min()), float(finite.max())
-    room = beyond * (high - low) or 1e-3 * (abs(high) or 1.0)
-    return low - room, high + room
+    margin = beyond * (high - low) or 1e-3 * (abs(high) or 1.0)
+    return low - margin, high + margin

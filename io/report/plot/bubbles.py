@@ -126,8 +126,8 @@ def drag(table: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
                       label=name)  # fmt: skip
     low, high = np.quantile(coefficient, [0.02, 0.98])
     axes.set_ylim(max(0.0, low - 0.5 * abs(high)), 1.5 * high)
-    room = 0.15 * (re.max() - re.min()) + 0.05 * re.max()
-    axes.set_xlim(max(0.0, re.min() - room), re.max() + room)
+    margin = 0.15 * (re.max() - re.min()) + 0.05 * re.max()
+    axes.set_xlim(max(0.0, re.min() - margin), re.max() + margin)
     return axes
 
 
@@ -140,8 +140,8 @@ def _points(axes: Any, x: Array, y: Array, x_sd: Array, y_sd: Array) -> None:
 def _grid(d_mm: Array) -> Array:
     """Diameters in m about those of the bubbles."""
     low, high = float(d_mm.min()), float(d_mm.max())
-    room = 0.25 * (high - low) + 0.1 * high
-    return np.asarray(1e-3 * np.linspace(max(0.2, low - room), high + room, 160))
+    margin = 0.25 * (high - low) + 0.1 * high
+    return np.asarray(1e-3 * np.linspace(max(0.2, low - margin), high + margin, 160))
 
 
 def _laws(d: Array, liquid: Liquid) -> list[tuple[str, str, str, Array]]:

@@ -12,7 +12,12 @@ import pytest
 
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.lens import choice as model_choice
-from telerig.estimator.calibration.lens.choice import FOLDS, held_out_chi2, model_start, pose_only
+from telerig.estimator.calibration.lens.choice import (
+    FOLDS,
+    cross_validation_chi2,
+    model_start,
+    pose_only,
+)
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
     Lens,
@@ -167,7 +172,7 @@ def test_one_step_predicts_like_a_whole_fit(fitted: Any) -> None:
     problem, rich, _ = fitted
     model = problem.with_model(("radial", "none"))
     state = solve(model, model_start(model, rich.state)).state
-    per_view = held_out_chi2(model, state)
+    per_view = cross_validation_chi2(model, state)
     assert np.isfinite(per_view).all()
     for fold in range(FOLDS):
         left_out = np.arange(len(model.views))[fold::FOLDS]

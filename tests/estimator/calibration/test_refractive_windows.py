@@ -199,7 +199,7 @@ def test_files_keep_walls_and_medium(tank: Path, in_air: Calibration, tmp_path: 
     assert not window_warnings(load_dataset(tank).rig, again)
     assert all(
         c.wall is not None
-        for c in CalibrationFile.read(tmp_path / "calibration.json").rig_cameras(behind_walls=True)
+        for c in CalibrationFile.read(tmp_path / "calibration.json").rig_cameras(windows=True)
     )
     assert all(c.wall is None for c in read_results(tmp_path).cameras)
 

@@ -9,8 +9,8 @@ import pytest
 from shake_learning_data import run, true_model, with_comings_and_goings
 
 from telerig.estimator.smoothing.graph.solve import solve
+from telerig.estimator.smoothing.learning.cross_validation import learning_record
 from telerig.estimator.smoothing.learning.evidence import signal_evidence
-from telerig.estimator.smoothing.learning.held_out import learning_record
 from telerig.estimator.smoothing.learning.likelihood import with_hyperparameter_uncertainty
 from telerig.estimator.smoothing.learning.lines_of_sight import pooled
 from telerig.estimator.smoothing.learning.window import (

@@ -108,9 +108,9 @@ def _legend_below(sheet: Any) -> None:
     handles, labels = sheet.axes.get_legend_handles_labels()
     rows = -(-len(labels) // 2)
     height = sheet.figure.get_figheight()
-    room = (0.18 * rows + 0.1) / height
+    margin = (0.18 * rows + 0.1) / height
     box = sheet.axes.get_position()
-    sheet.axes.set_position((box.x0, box.y0 + room, box.width, box.height - room))
+    sheet.axes.set_position((box.x0, box.y0 + margin, box.width, box.height - margin))
     sheet.figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.08, 0.0), ncols=2,
                         fontsize=7.5)  # fmt: skip
 

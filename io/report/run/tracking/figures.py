@@ -325,8 +325,8 @@ def seen_where(results: TrackResults, index: int) -> Picture:
     below = 0.75
     height_in = image_height_in(size) + below
     with drawing(height_in) as sheet:
-        box, room = sheet.axes.get_position(), below / height_in
-        sheet.axes.set_position((box.x0, box.y0 + room, box.width, box.height - room))
+        box, margin = sheet.axes.get_position(), below / height_in
+        sheet.axes.set_position((box.x0, box.y0 + margin, box.width, box.height - margin))
         bar = sheet.figure.add_axes((box.x0, 0.42 / height_in, box.width, 0.1 / height_in))
         image_axes(sheet.axes, size)
         mesh = sheet.axes.pcolormesh(*edges, np.where(count.T > 0, count.T, np.nan), cmap="Blues",

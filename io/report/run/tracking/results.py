@@ -304,7 +304,7 @@ def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Came
         return None, "calibration.json is neither in this folder nor in calibration/ beside it"
     with reading(file.parent, [file.name]):
         stated = CalibrationFile.read(file)
-    known = {camera.name: camera for camera in stated.rig_cameras(behind_walls=True)}
+    known = {camera.name: camera for camera in stated.rig_cameras(windows=True)}
     if len(results.cameras) != 2 or not set(results.cameras) <= set(known):
         return None, f"calibration.json beside it has cameras {', '.join(known)}, not the run's"
     cameras = (known[results.cameras[0]], known[results.cameras[1]])

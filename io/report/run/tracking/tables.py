@@ -243,9 +243,11 @@ def event_rows(results: TrackResults) -> list[Row]:
 def event_words(results: TrackResults) -> str:
     """How many of each kind there were."""
     counts = results.file.events or results.events["kind"].value_counts().to_dict()
-    told = [f"{kind}: {number(n)}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])]
+    kinds = [
+        f"{kind}: {number(n)}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])
+    ]
     rest = len(results.events) - MOST_EVENTS
-    text = ", ".join(told) + "." if told else "Nothing is known of any event."
+    text = ", ".join(kinds) + "." if kinds else "Nothing is known of any event."
     if rest > 0:
         text += f" The first {MOST_EVENTS} are listed, {number(rest)} more are in events.csv."
     return text

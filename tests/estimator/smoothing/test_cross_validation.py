@@ -9,7 +9,7 @@ import pytest
 from shake_learning_data import ARM_HZ, run, true_model
 
 from telerig.estimator.smoothing.learning import window
-from telerig.estimator.smoothing.learning.held_out import held_out, learning_record
+from telerig.estimator.smoothing.learning.cross_validation import cross_validate, learning_record
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +20,7 @@ def _short_windows(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_right_model_holds_in_the_rest_of_the_run() -> None:
     problem, _, _ = run(np.random.default_rng(1), bubbles=4, seconds=6)
     model = true_model()
-    found = held_out(problem, model)
+    found = cross_validate(problem, model)
     assert len(found) == 3
     for one in found:
         assert 0.85 < one.square < 1.15

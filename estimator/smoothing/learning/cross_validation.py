@@ -28,7 +28,7 @@ _LARGEST_SQUARE = 1.3
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class OtherWindow:
     """One window compared with the model learned from another.
 
     square : mean squared distance of a sample from the model; 1 if it is right. frequencies : by
@@ -50,7 +50,7 @@ class HeldOut:
         return out
 
 
-def held_out(problem: SmoothingProblem, model: ShakeModel) -> list[HeldOut]:
+def cross_validate(problem: SmoothingProblem, model: ShakeModel) -> list[OtherWindow]:
     """Return the comparison with up to three windows that a model was not learned from."""
     used = _used(problem)
     found = [_compared(w, model) for w in other_windows(problem, used, _MOST_WINDOWS)]
@@ -65,7 +65,7 @@ def _used(problem: SmoothingProblem) -> Window:
     return cut_out(problem, parts[0].first, parts[-1].first + len(parts[-1].problem.t_s))
 
 
-def _compared(window: Window, model: ShakeModel) -> HeldOut | None:
+def _compared(window: Window, model: ShakeModel) -> OtherWindow | None:
     problem, t = window.problem, window.problem.t_s
     signals = tuple(s for s in signals_of(problem) if s.samples)
     if not signals:
@@ -82,7 +82,7 @@ def _compared(window: Window, model: ShakeModel) -> HeldOut | None:
         name: (value_of(fit.model, name), float(np.hypot(np.sqrt(v), model.learned.get(name, 0.0))))
         for name, v in zip(names, here)
     }
-    return HeldOut(float(t[0]), float(t[-1]), float(square), frequencies)
+    return OtherWindow(float(t[0]), float(t[-1]), float(square), frequencies)
 
 
 def learning_record(
@@ -95,8 +95,8 @@ def learning_record(
         "from_s": float(t[0]), "to_s": float(t[-1]), "frames": frames, "held_out": [],
     }  # fmt: skip
     warnings: list[str] = []
-    drifts: dict[str, tuple[float, HeldOut]] = {}
-    for one in held_out(problem, model):
+    drifts: dict[str, tuple[float, OtherWindow]] = {}
+    for one in cross_validate(problem, model):
         record["held_out"].append(
             {"from_s": one.from_s, "to_s": one.to_s, "square_per_sample": one.square}
         )

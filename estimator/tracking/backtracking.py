@@ -1,9 +1,8 @@
 """What smoothed tracks add to frames whose ids are final.
 
 The tracker goes forward only. Where a bubble is born hidden, or in frames with doubtful pairs, its
-position is better known from later frames: it is smoothed over all frames at hand (fixed-interval
-smoother of Rauch, Tung and Striebel, AIAA J. 3:1445, 1965), and detections without a track are
-given to it where no other explanation is nearly as likely (`follow_back`).
+position is better known from later frames: it is smoothed over all frames at hand, and detections
+without a track are given to it where no other explanation is nearly as likely (`follow_back`).
 
 One outline in one image may show two bubbles which the other image separates. One camera alone sees
 the hidden bubble; its depth in that camera follows from the motion between the frames in which both
@@ -12,8 +11,9 @@ saw it (`shared_rows`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -77,52 +77,16 @@ def smooth_points(
 
     motions : into each frame; the first is not used.
     """
-    filtered, predicted = _filtered(readings, motions, settings)
-    x, p = filtered[-1]
-    out = [(x[:, POSITION], p[:, POSITION, POSITION])]
-    for k in range(len(filtered) - 2, -1, -1):
-        motion, (xf, pf), (xp, pp) = motions[k + 1], filtered[k], predicted[k + 1]
-        assert motion is not None
-        gain = np.swapaxes(np.linalg.solve(pp, motion.matrix @ pf), -1, -2)
-        x = xf + (gain @ (x - xp)[..., None])[..., 0]
-        p = pf + gain @ (p - pp) @ np.swapaxes(gain, -1, -2)
-        out.append((x[:, POSITION], p[:, POSITION, POSITION]))
-    points, covariances = zip(*out[::-1])
-    return np.array(points), np.array(covariances)
+    from telerig.estimator.tracking import kernels
 
-
-def _filtered(
-    readings: Readings,
-    motions: Sequence[Motion | None],
-    settings: TrackerSettings,
-) -> tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]:
-    """States (K, n) and covariances (K, n, n) after and before each frame's readings."""
-    bubbles = readings.information.shape[1]
     prior = birth_covariance(settings, _ANYWHERE_MM**2 * np.eye(3), encoder=False)
-    p = np.tile(prior, (bubbles, 1, 1))
-    x = np.zeros((bubbles, len(prior)))
+    x = np.zeros((readings.pull.shape[1], len(prior)))
     total = readings.information.sum(0) + 1e-9 * np.eye(3)
     x[:, POSITION] = np.linalg.solve(total, readings.pull.sum(0)[..., None])[..., 0]
-    filtered, predicted = [], []
-    for k, motion in enumerate(motions):
-        if k:
-            assert motion is not None
-            x = x @ motion.matrix.T + motion.offset
-            p = motion.matrix @ p @ motion.matrix.T + motion.noise
-        predicted.append((x, p))
-        x, p = _updated(x, p, readings.information[k], readings.pull[k])
-        filtered.append((x, p))
-    return filtered, predicted
-
-
-def _updated(x: Array, p: Array, information: Array, pull: Array) -> tuple[Array, Array]:
-    """States after a frame's information on their positions."""
-    mixed = np.eye(3) + information @ p[:, POSITION, POSITION]
-    gain = p[..., POSITION] @ np.linalg.inv(mixed)
-    left = pull - (information @ x[:, POSITION, None])[..., 0]
-    lost = gain @ information @ p[:, POSITION]
-    x = x + (gain @ left[..., None])[..., 0]
-    return x, p - (lost + np.swapaxes(lost, -1, -2)) / 2
+    still = Motion(np.eye(len(prior)), np.zeros_like(prior), np.zeros(len(prior)))
+    steps = [still, *(m for m in motions[1:] if m is not None)]
+    moves = (np.array([getattr(s, f.name) for s in steps]) for f in fields(Motion))
+    return kernels.smooth(readings.information, readings.pull, *moves, x, prior)
 
 
 Tables = tuple["pd.DataFrame", "pd.DataFrame"]
@@ -268,18 +232,15 @@ def readings_of(
     """The frames' measurements of the particles, in the particles' order."""
     place = {p: k for k, p in enumerate(particles)}
     out = Readings.none(len(frames), len(place))
-    wanted = np.array(particles, np.int64)
-    columns = [np.flatnonzero(np.isin(frame.particle, wanted)) for frame in frames]
-    at = np.repeat(np.arange(len(frames)), [len(c) for c in columns])
-    if len(at):
-        kept = [frame.pairs.of(c) for frame, c in zip(frames, columns)]
-        who = np.array([place[p] for pairs in kept for p in pairs.particle.tolist()], np.int64)
+    who = np.array([place.get(p, -1) for frame in frames for p in frame.particle.tolist()], int)
+    kept = np.flatnonzero(who >= 0)
+    if len(kept):
+        at = np.repeat(np.arange(len(frames)), [len(frame.pairs) for frame in frames])
         points, covariances = (
-            np.concatenate([getattr(pairs, name) for pairs in kept])
+            np.concatenate([getattr(frame.pairs, name) for frame in frames])[kept]
             for name in ("points_mm", "covariance_mm2")
         )
-        every = np.broadcast_to(np.eye(3), covariances.shape)
-        out.add(at, who, points, covariances, every)
+        out.add(at[kept], who[kept], points, covariances, np.eye(3))
     for c, camera in enumerate(cameras):
         singles = [
             (i, place[s.particle], s.point_mm, frame.sight.pixels[c][0][s.row] - frame.offset_px[c],
@@ -313,17 +274,37 @@ _DOUBTFUL = {"overlap", "merged", "border"}
 """Flags of outlines of which only a part was seen."""
 
 
-def follow_back(
-    frames: Sequence[Frame],
-    changeable: set[int],
-    cameras: tuple[Camera, Camera],
-    settings: TrackerSettings,
-) -> None:
-    """Give free detections of the ``changeable`` frames to the tracks that they continue.
+@dataclass
+class SmoothedTracks:
+    """Tracks smoothed over consecutive frames with final ids; kept until their readings change."""
 
-    frames : consecutive, all with final ids.
-    """
-    motions = [f.motion for f in frames]
+    frames: Sequence[Frame]
+    cameras: tuple[Camera, Camera]
+    settings: TrackerSettings
+    _known: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+
+    def at(self, index: int, particles: Sequence[int]) -> tuple[Array, Array]:
+        """Points (K, 3) and covariances (K, 3, 3) in one frame, of particles given to `prepare`."""
+        points, covariances = zip(*(self._known[p] for p in particles))
+        return np.array([x[index] for x in points]), np.array([c[index] for c in covariances])
+
+    def prepare(self, particles: Iterable[int]) -> None:
+        """Smooth the particles that are not known."""
+        new = sorted(set(particles) - set(self._known))
+        if new:
+            readings = readings_of(self.frames, new, self.cameras)
+            found = smooth_points(readings, [f.motion for f in self.frames], self.settings)
+            self._known |= zip(new, zip(*(np.swapaxes(values, 0, 1) for values in found)))
+
+    def forget(self, particles: Iterable[int]) -> None:
+        """Readings of these particles have changed."""
+        for particle in particles:
+            del self._known[particle]
+
+
+def follow_back(tracks: SmoothedTracks, changeable: set[int]) -> None:
+    """Give free detections of the ``changeable`` frames to the tracks that they continue."""
+    frames, cameras = tracks.frames, tracks.cameras
     sizes = _sizes(frames)
     for frame in frames:
         if frame.number in changeable:
@@ -332,29 +313,26 @@ def follow_back(
             wrong = twice & set(sizes)
             frame.singles = [s for s in frame.singles if s.particle not in wrong]
     for _ in range(_PASSES):
-        missing = _missing(frames, changeable, sorted(sizes))
-        particles = sorted({p for found in missing for p in found})
-        if not particles:
+        missing = [
+            (i, here)
+            for i, here in enumerate(_missing(frames, changeable, sorted(sizes)))
+            if here and any((frames[i].owners(c) == NO_PARTICLE).any() for c in (0, 1))
+        ]
+        if not missing:
             break
-        points, covariances = smooth_points(
-            readings_of(frames, particles, cameras), motions, settings
-        )
-        place = {p: k for k, p in enumerate(particles)}
-        where = np.repeat(np.arange(len(frames)), [len(found) for found in missing])
-        who = np.array([place[p] for found in missing for p in found])
-        every = (points[where, who], covariances[where, who])
-        expected = [projected(camera, *every) for camera in cameras]
-        changed, first = False, 0
-        for i, frame in enumerate(frames):
-            at = [place[p] for p in missing[i]]
-            if at:
-                ids, d_eq = np.array(missing[i]), np.array([sizes[p] for p in missing[i]])
-                predicted = Prediction(ids, points[i, at], covariances[i, at], d_eq)
-                own = [_of(view, slice(first, first + len(at))) for view in expected]
-                changed |= _claim(frame, predicted, own, cameras, settings)
-                first += len(at)
+        tracks.prepare(chain.from_iterable(here for _, here in missing))
+        every = [tracks.at(i, here) for i, here in missing]
+        expected = [projected(camera, *map(np.concatenate, zip(*every))) for camera in cameras]
+        changed, first = set(), 0
+        for (i, here), (points, covariances) in zip(missing, every):
+            d_eq = np.array([sizes[p] for p in here])
+            predicted = Prediction(np.array(here), points, covariances, d_eq)
+            own = [_of(view, slice(first, first + len(here))) for view in expected]
+            changed |= _claim(frames[i], predicted, own, cameras, tracks.settings)
+            first += len(here)
         if not changed:
             break
+        tracks.forget(changed)
 
 
 def _sizes(frames: Sequence[Frame]) -> dict[int, float]:
@@ -413,22 +391,22 @@ def _claim(
     expected: Sequence[Projected],
     cameras: tuple[Camera, Camera],
     settings: TrackerSettings,
-) -> bool:
-    """Give the frame's free detections to the predicted particles; whether any was given.
+) -> set[int]:
+    """Give the frame's free detections to the predicted particles; those to which any was given.
 
     expected : the predicted points in both cameras.
     """
     found = [_nearest(frame, c, predicted, expected[c], settings) for c in (0, 1)]
-    changed = False
+    changed = set()
     for k, rows in enumerate(zip(*found)):
-        if max(rows) < 0:
-            continue
+        given = max(rows) >= 0
         if min(rows) >= 0:
-            changed |= _claim_pair(frame, rows, k, predicted, cameras, settings)
-        else:
+            given = _claim_pair(frame, rows, k, predicted, cameras, settings)
+        elif given:
             camera = int(rows[0] < 0)
             _claim_single(frame, camera, rows[camera], predicted, k)
-            changed = True
+        if given:
+            changed.add(int(predicted.ids[k]))
     return changed
 
 
@@ -515,40 +493,28 @@ _BEHIND = 0.25
 """Standard deviation of a pixel "behind that outline", as a share of the outline's semi-axis."""
 
 
-def shared_rows(
-    before: Sequence[Frame],
-    frames: Sequence[Frame],
-    after: Sequence[Frame],
-    cameras: tuple[Camera, Camera],
-    settings: TrackerSettings,
-) -> list[dict[str, Any]]:
-    """Rows for the hidden bubbles of ``frames``; the frames before and after are context.
+def shared_rows(tracks: SmoothedTracks, frames: slice) -> list[dict[str, Any]]:
+    """Rows for the hidden bubbles of some of the frames; the others are context.
 
     The hidden view's pixel is that of the point; its covariance states only that the bubble is
     behind that outline, so that motion is not counted twice when tracks are smoothed.
     """
-    every = [*before, *frames, *after]
-    seen = {int(p) for f in every for p in f.particle}
-    particles = sorted({s.particle for f in frames for s in f.hidden()} & seen)
-    if not particles:
-        return []
-    readings = readings_of(every, particles, cameras)
-    motions = [f.motion for f in every]
-    points, covariances = smooth_points(readings, motions, settings)
-    place = {p: k for k, p in enumerate(particles)}
+    seen = {p for frame in tracks.frames for p in frame.particle.tolist()}
     out = []
-    for i, frame in enumerate(frames, len(before)):
+    for i, frame in list(enumerate(tracks.frames))[frames]:
+        singles = [s for s in frame.hidden() if s.particle in seen]
+        if not singles:
+            continue
+        tracks.prepare(s.particle for s in singles)
+        points, covariances = tracks.at(i, [s.particle for s in singles])
         known = frame.particle != NO_PARTICLE
         where, sizes = [*frame.pairs.points_mm[known]], frame.pairs.d_eq_mm[known].tolist()
-        singles = [s for s in frame.hidden() if s.particle in place]
-        for single in sorted(singles, key=lambda s: np.trace(covariances[i, place[s.particle]])):
-            k = place[single.particle]
-            point, covariance = points[i, k], covariances[i, k]
-            row = _row(frame, single, point, covariance, cameras)
-            if row is not None and not _taken(single, point, where, sizes):
+        for k in np.argsort(np.trace(covariances, axis1=1, axis2=2), kind="stable").tolist():
+            row = _row(frame, singles[k], points[k], covariances[k], tracks.cameras)
+            if row is not None and not _taken(singles[k], points[k], where, sizes):
                 out.append(row)
-                where.append(point)
-                sizes.append(single.d_eq_mm)
+                where.append(points[k])
+                sizes.append(singles[k].d_eq_mm)
     return out
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from telerig.estimator.tracking.backtracking import (
     Pairs,
     Pixels,
     Sight,
+    SmoothedTracks,
     Tables,
     follow_back,
     given_ids,
@@ -150,10 +151,10 @@ class RowMaker:
         """Rows of all closed frames but the last few, by which hidden bubbles are smoothed."""
         done = self._closed[: len(self._closed) - ahead]
         self._closed, self._waiting = self._closed[len(done) :], 0
-        window = (self._before, done, self._closed)
-        settings, changeable = self.tracker.settings, {f.number for f in (*done, *self._closed)}
-        follow_back([*chain(*window)], changeable, self.cameras, settings)
-        hidden = shared_rows(*window, self.cameras, settings)
+        window = [*self._before, *done, *self._closed]
+        tracks = SmoothedTracks(window, self.cameras, self.tracker.settings)
+        follow_back(tracks, {f.number for f in (*done, *self._closed)})
+        hidden = shared_rows(tracks, slice(len(self._before), len(self._before) + len(done)))
         self._before = [*self._before, *done][-FRAMES_BEFORE:]
         joined = tuple(pd.concat([f.tables[c] for f in done], ignore_index=True) for c in range(2))
         found = self._tracks(done, joined)

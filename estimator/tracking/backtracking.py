@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.estimator.bubbles.pairing.matching import Prediction, View
+from telerig.estimator.bubbles.pairing.matching import Candidates, Prediction
 from telerig.estimator.tracking.association import (
     Projected,
     gate2,
@@ -100,24 +100,6 @@ CENTRE_PX = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 
 
 @dataclass(frozen=True)
-class Sight:
-    """Hold the detections of one frame as arrays; each field for both cameras.
-
-    views : as the pairing compares them. pixels : centres and covariances with the share of the
-    unknown shape. centre_px : (N, 5) the columns CENTRE_PX. a_px, d_eq_px : (N,) major semi-axes
-    and equivalent diameters. given : (N,) ids given by the user, -1 for none. flags : (N,) texts.
-    """
-
-    views: tuple[View, View]
-    pixels: tuple[Pixels, Pixels]
-    centre_px: tuple[Array, Array]
-    a_px: tuple[Array, Array]
-    d_eq_px: tuple[Array, Array]
-    given: tuple[Ints, Ints]
-    flags: tuple[list[str], list[str]]
-
-
-@dataclass(frozen=True)
 class Pairs:
     """Rows of the two tables that show the same bubble, M of them.
 
@@ -144,6 +126,28 @@ class Pairs:
     def and_also(self, other: Pairs) -> Pairs:
         both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Pairs(*(np.concatenate(columns) for columns in both))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Hold the detections of one frame as arrays; most fields for both cameras.
+
+    pixels : centres and covariances with the share of the unknown shape. centre_px : (N, 5) the
+    columns CENTRE_PX. a_px, d_eq_px : (N,) major semi-axes and equivalent diameters. given : (N,)
+    ids given by the user, -1 for none. flags : (N,) texts.
+    possible : the pairs with given ids, then those of `candidates`, in space. left_px : (E, 4)
+    pixels in both cameras less those of the points.
+    """
+
+    pixels: tuple[Pixels, Pixels]
+    centre_px: tuple[Array, Array]
+    a_px: tuple[Array, Array]
+    d_eq_px: tuple[Array, Array]
+    given: tuple[Ints, Ints]
+    flags: tuple[list[str], list[str]]
+    candidates: Candidates
+    possible: Pairs
+    left_px: Array
 
 
 @dataclass(frozen=True)

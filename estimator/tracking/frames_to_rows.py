@@ -13,9 +13,12 @@ import pandas as pd
 from telerig.arrays import Array, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
 from telerig.estimator.bubbles.pairing.matching import (
+    Candidates,
     PairModel,
     Prediction,
-    match_views,
+    View,
+    candidates,
+    match_candidates,
     shared_axis,
     view_of,
 )
@@ -80,21 +83,72 @@ class RowMaker:
     def sights(self, frames: Sequence[Tables]) -> list[Sight]:
         """Return the detections of several frames as arrays; all frames at once are quicker."""
         axis = shared_axis(self.cameras)
-        of_cameras = []
-        for camera, tables in zip(self.cameras, zip(*frames)):
+        counts = np.array([[len(table) for table in tables] for tables in frames], np.int64)
+        views, pixels, ids, sizes, of_cameras = [], [], [], [], []
+        for c, (camera, tables) in enumerate(zip(self.cameras, zip(*frames))):
             table = pd.concat(tables, ignore_index=True)
-            ends = np.cumsum([0, *map(len, tables)]).tolist()
-            view, (uv, covariance) = view_of(table, camera, axis), _pixels(table, self._wander)
-            centre, ids = table[CENTRE_PX].to_numpy(float), given_ids(table)
+            views.append(view_of(table, camera, axis))
+            pixels.append(_pixels(table, self._wander))
+            ids.append(given_ids(table))
             a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
+            sizes.append(d_eq)
             flags = ["|".join(words) for words in flag_words(table)]
+            centre, (uv, covariance) = table[CENTRE_PX].to_numpy(float), pixels[c]
+            ends = np.cumsum([0, *counts[:, c]]).tolist()
             of_cameras.append(
                 [
-                    (view.of(p), (uv[p], covariance[p]), centre[p], a[p], d_eq[p], ids[p], flags[p])
+                    ((uv[p], covariance[p]), centre[p], a[p], d_eq[p], ids[c][p], flags[p])
                     for p in (slice(low, high) for low, high in pairwise(ends))
                 ]
             )
-        return [Sight(*zip(*both)) for both in zip(*of_cameras)]
+        possible = self._possible((views[0], views[1]), pixels, ids, sizes, counts)
+        return [Sight(*zip(*both), *pairs) for both, pairs in zip(zip(*of_cameras), possible)]
+
+    def _possible(
+        self,
+        views: tuple[View, View],
+        pixels: Sequence[Pixels],
+        ids: Sequence[Ints],
+        d_eq_px: Sequence[Array],
+        counts: Ints,
+    ) -> list[tuple[Candidates, Pairs, Array]]:
+        """Return the last three fields of `Sight` for each of F frames.
+
+        counts : (F, 2) detections of the frames, which follow each other in the other arguments.
+        """
+        frames = [np.repeat(np.arange(len(counts)), many) for many in counts.T]
+        free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
+        left = np.stack([np.bincount(n[i], minlength=len(counts)) for n, i in zip(frames, free)], -1)
+        found = candidates((views[0].of(free[0]), views[1].of(free[1])), left, self.model)
+        rows = np.concatenate([f.rows + s for f, s in zip(found, np.cumsum(left, axis=0) - left)])
+        rows = np.stack([own[r] for own, r in zip(free, rows.T)], -1)
+        if any(len(own) < len(i) for own, i in zip(free, ids)):
+            named = [np.flatnonzero(i != NO_PARTICLE) for i in ids]
+            keys = [n[i] + len(counts) * own[i] for n, own, i in zip(frames, ids, named)]
+            _, first, second = np.intersect1d(*keys, return_indices=True)
+            rows = np.concatenate([np.stack([named[0][first], named[1][second]], -1), rows])
+            rows = rows[np.argsort(frames[0][rows[:, 0]], kind="stable")]
+        (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))
+        rays = [(view.origin_mm[i], view.direction[i]) for view, i in zip(views, rows.T)]
+        points = triangulate(self.cameras, (uv_a, uv_b), (cov_a, cov_b), rays=rays)
+        expected, by_point = stacked_jacobian(self.cameras, points.points_mm)
+        d_eq_mm2 = np.ones(len(rows))
+        for c, view in enumerate(d_eq_px):
+            d_eq_mm2 *= view[rows[:, c]] / px_per_mm(by_point[:, 2 * c : 2 * c + 2])
+        frame = frames[0][rows[:, 0]]
+        pairs = Pairs(
+            rows - (np.cumsum(counts, axis=0) - counts)[frame],
+            np.ones(len(rows)),
+            np.zeros(len(rows), bool),
+            ids[0][rows[:, 0]],
+            points.points_mm,
+            points.covariance_mm2,
+            np.sqrt(d_eq_mm2),
+            np.full(len(rows), NO_PARTICLE),
+        )
+        off = np.hstack([uv_a, uv_b]) - expected
+        cuts = [slice(*ends) for ends in pairwise(np.searchsorted(frame, range(len(counts) + 1)))]
+        return [(one, pairs.of(cut), off[cut]) for one, cut in zip(found, cuts)]
 
     def add(
         self,
@@ -112,12 +166,10 @@ class RowMaker:
         """
         predicted = self.tracker.predict(t_s, position_mm)
         sight = self.sights([tables])[0] if sight is None else sight
-        pixels = sight.pixels
-        pairs, offset_px = pair_frame(sight, self.cameras, self.model, predicted)
-        everyone = (np.arange(len(table)) for table in tables)
-        first, second = (np.setdiff1d(i, rows) for i, rows in zip(everyone, pairs.rows.T))
+        pairs, offset_px = pair_frame(sight, self.model, predicted)
+        first, second = (_others(rows, len(table)) for rows, table in zip(pairs.rows.T, tables))
         unpaired = (first, second)
-        measured = _measured(pairs, unpaired, pixels, offset_px)
+        measured = _measured(pairs, unpaired, sight.pixels, offset_px)
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
             number, t_s, tables, sight, offset_px, pairs, unpaired, result.alone, result.motion
@@ -229,12 +281,9 @@ def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
 
 
 def pair_frame(
-    sight: Sight,
-    cameras: tuple[Camera, Camera],
-    model: PairModel,
-    predicted: Prediction | None,
+    sight: Sight, model: PairModel, predicted: Prediction | None
 ) -> tuple[Pairs, Array]:
-    """Return the triangulated pairs of a frame, and the median shift of each camera's pixels.
+    """Return the pairs of a frame, and the median shift of each camera's pixels.
 
     Detections with given ids are paired by their ids; all others are matched.
 
@@ -245,43 +294,22 @@ def pair_frame(
     The shift is (2, 2) in px: for each camera the median of measured minus projected pixels over
     the pairs; 0 if there are fewer than three pairs.
     """
-    ids, pixels = sight.given, sight.pixels
-    given = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1]).astype(np.int64)
-    rows = np.array([[np.flatnonzero(i == p)[0] for i in ids] for p in given], np.int64)
-    rows = rows.reshape(-1, 2)
-    confidence, ambiguous = np.ones(len(given)), np.zeros(len(given), bool)
-    free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
-    if len(free[0]) and len(free[1]):
-        first, second = (view.of(i) for view, i in zip(sight.views, free))
-        found = match_views((first, second), model, predicted=predicted)
-        matched = np.stack([free[0][found.first], free[1][found.second]], -1)
-        rows = np.concatenate([rows, matched])
-        confidence = np.concatenate([confidence, found.confidence])
-        ambiguous = np.concatenate([ambiguous, found.ambiguous])
-        given = np.concatenate([given, np.full(len(found), NO_PARTICLE)])
-    (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))
-    rays = [(view.origin_mm[i], view.direction[i]) for view, i in zip(sight.views, rows.T)]
-    points = triangulate(cameras, (uv_a, uv_b), (cov_a, cov_b), rays=rays)
-    expected, by_point = stacked_jacobian(cameras, points.points_mm)
-    left = np.hstack([uv_a, uv_b]) - expected
-    offset = np.zeros((2, 2))
-    if len(left) >= _LEAST_FOR_OFFSET:
-        offset = np.median(left, axis=0).reshape(2, 2)
-    d_eq_mm2 = np.ones(len(rows))
-    for c, d_eq_px in enumerate(sight.d_eq_px):
-        scale = px_per_mm(by_point[:, 2 * c : 2 * c + 2])
-        d_eq_mm2 *= d_eq_px[rows[:, c]] / scale
-    pairs = Pairs(
-        rows,
-        confidence,
-        ambiguous,
-        given,
-        points.points_mm,
-        points.covariance_mm2,
-        np.sqrt(d_eq_mm2),
-        np.full(len(rows), NO_PARTICLE),
-    )
-    return pairs, offset
+    found = match_candidates(sight.candidates, model, predicted)
+    given = np.arange(len(sight.possible) - len(sight.candidates))
+    chosen = np.concatenate([given, len(given) + found.candidate])
+    pairs = sight.possible.of(chosen)
+    pairs.confidence[len(given) :] = found.confidence
+    pairs.ambiguous[len(given) :] = found.ambiguous
+    if len(chosen) < _LEAST_FOR_OFFSET:
+        return pairs, np.zeros((2, 2))
+    return pairs, np.median(sight.left_px[chosen], axis=0).reshape(2, 2)
+
+
+def _others(rows: Ints, many: int) -> Ints:
+    """The numbers below ``many`` that are not among the rows."""
+    out = np.ones(many, bool)
+    out[rows] = False
+    return np.flatnonzero(out)
 
 
 def _pixels(table: pd.DataFrame, wander: float) -> Pixels:

@@ -12,7 +12,7 @@ GATE_SIGMA, NEVER = 5.0, -1e6
 
 LARGEST_MAHALANOBIS2 = 60.0
 
-_TAIL, _LEAST_TAIL_PX2, _MOST_TAIL_PX2 = 0.02, 0.25, 1.0
+_TAIL, _LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
 _EXACT_SIDE = 11
 _SHIFT_PASSES = 4
 
@@ -31,7 +31,7 @@ def gap_log_odds(
         for j in range(gap.shape[1]):
             own = variance[i, j] + uncertainty
             square = (gap[i, j] - shift) ** 2
-            wide = own + min(max(3.0 * own, _LEAST_TAIL_PX2), _MOST_TAIL_PX2)
+            wide = own + min(max(3.0 * own, _LEAST_TAIL_PX2), MOST_TAIL_PX2)
             if not square < GATE_SIGMA**2 * wide:
                 out[i, j] = NEVER
                 continue
@@ -175,46 +175,44 @@ def common_shift(
 @compiled
 def ratio_log_odds(
     ratio: Array,
-    first: Array,
-    second: Array,
+    total: Array,
     axes: Array,
     alike: Array,
     wrong: Array,
     rare: float,
     freedom: float,
 ) -> Array:
-    """Return log odds (N1, N2) from K properties; see `matching`.
+    """Return log odds (E,) from K properties; see `matching`.
 
-    ratio : (N1, N2, K) differences of the logarithms, less their mean; first, second : (N1, K),
-        (N2, K) logarithms, less their means. NaN where unknown: such pairs get 0.
+    ratio, total : (E, K) differences and sums of the logarithms, less their means. NaN where
+        unknown: such pairs get 0.
     axes, alike : (K, K), (K,) as in `LogRatioModel.uncorrelated`.
-    wrong : (N1, N2) chance that a measurement says nothing about the bubble.
+    wrong : (E,) chance that a measurement says nothing about the bubble.
     rare : limit of the bubble's rareness (standard deviations); freedom : that of the tails.
     """
-    n, m, many = ratio.shape
-    out = np.zeros((n, m))
+    pairs, many = ratio.shape
+    out = np.zeros(pairs)
     constant = 0.0
     for k in range(many):
         constant += np.log1p(-alike[k] * alike[k])
-    for i in range(n):
-        for j in range(m):
-            odds, tails, known = 0.0, 0.0, True
-            for k in range(many):
-                apart = own = 0.0
-                for c in range(many):
-                    known = known and abs(ratio[i, j, c]) < np.inf
-                    apart += ratio[i, j, c] * axes[c, k]
-                    own += (first[i, c] + second[j, c]) * axes[c, k]
-                own = min(max(0.5 * own, -rare), rare)
-                odds += own * own * alike[k] / (1.0 + alike[k]) + apart * apart / 4.0
-                tails += apart * apart * 0.5 / (1.0 - alike[k])
-            if not known:
-                continue
-            odds -= 0.5 * (freedom + many) * np.log1p(tails / freedom) + 0.5 * constant
-            odds += np.log1p(-wrong[i, j])
-            floor = np.log(wrong[i, j])
-            high, low = max(odds, floor), min(odds, floor)
-            out[i, j] = high + np.log1p(np.exp(low - high))
+    for i in range(pairs):
+        odds, tails, known = 0.0, 0.0, True
+        for k in range(many):
+            apart = own = 0.0
+            for c in range(many):
+                known = known and abs(ratio[i, c]) < np.inf
+                apart += ratio[i, c] * axes[c, k]
+                own += total[i, c] * axes[c, k]
+            own = min(max(0.5 * own, -rare), rare)
+            odds += own * own * alike[k] / (1.0 + alike[k]) + apart * apart / 4.0
+            tails += apart * apart * 0.5 / (1.0 - alike[k])
+        if not known:
+            continue
+        odds -= 0.5 * (freedom + many) * np.log1p(tails / freedom) + 0.5 * constant
+        odds += np.log1p(-wrong[i])
+        floor = np.log(wrong[i])
+        high, low = max(odds, floor), min(odds, floor)
+        out[i] = high + np.log1p(np.exp(low - high))
     return out
 
 
@@ -230,34 +228,33 @@ def track_density(
     size_sd: float,
     size_factor: float,
 ) -> Array:
-    """Return (N1, N2) the density of a pair's point and size, summed over K tracks.
+    """Return (E,) the density of a pair's point and size, summed over K tracks.
 
-    points : (N1, N2, 3) points (mm); added : (N1, N2) variance in every direction (mm^2).
-    log_size, log_expected : (N1, N2), (K,) logarithms of the radii (mm); NaN where unknown.
+    points : (E, 3) points (mm); added : (E,) variance in every direction (mm^2).
+    log_size, log_expected : (E,), (K,) logarithms of the radii (mm); NaN where unknown.
     expected, variances, axes : (K, 3), (K, 3), (K, 3, 3) the tracks' positions (mm), and the
         variances (mm^2) of these along axes, which are the columns of matrices.
     size_sd, size_factor : standard deviation of the logarithms' difference, and the density where
         it is 0. The densities are not below those at the largest Mahalanobis distance.
     """
-    out = np.zeros(added.shape)
-    for i in range(added.shape[0]):
-        for j in range(added.shape[1]):
-            for k in range(expected.shape[0]):
-                distance2, determinant = 0.0, 1.0
-                for axis in range(3):
-                    along = 0.0
-                    for c in range(3):
-                        along += (points[i, j, c] - expected[k, c]) * axes[k, c, axis]
-                    own = variances[k, axis] + added[i, j]
-                    distance2 += along * along / own
-                    determinant *= own
-                off = (log_size[i, j] - log_expected[k]) / size_sd
-                factor = 1.0
-                exponent = min(distance2, LARGEST_MAHALANOBIS2)
-                if abs(off) < np.inf:
-                    exponent += off * off
-                    factor = size_factor
-                out[i, j] += factor * np.exp(-0.5 * exponent) / np.sqrt(determinant)
+    out = np.zeros(added.size)
+    for i in range(added.size):
+        for k in range(expected.shape[0]):
+            distance2, determinant = 0.0, 1.0
+            for axis in range(3):
+                along = 0.0
+                for c in range(3):
+                    along += (points[i, c] - expected[k, c]) * axes[k, c, axis]
+                own = variances[k, axis] + added[i]
+                distance2 += along * along / own
+                determinant *= own
+            off = (log_size[i] - log_expected[k]) / size_sd
+            factor = 1.0
+            exponent = min(distance2, LARGEST_MAHALANOBIS2)
+            if abs(off) < np.inf:
+                exponent += off * off
+                factor = size_factor
+            out[i] += factor * np.exp(-0.5 * exponent) / np.sqrt(determinant)
     out *= (2.0 * np.pi) ** -1.5
     return out
 

@@ -168,8 +168,8 @@ def _likely_pairs(
 def _improved(model: PairModel, geometries: list[PairGeometry], terms: int) -> PairModel:
     """One pass: probabilities of all pairs, then everything that follows from them."""
     found = [common_shift(g, model) for g in geometries]
-    probability = [marginals(odds) for _, _, odds, _ in found]
-    shifts = np.array([shift for *_, shift in found])
+    probability = [marginals(odds) for odds, _ in found]
+    shifts = np.array([shift for _, shift in found])
     total = np.array([p.sum() for p in probability])
     counts = np.array([p.shape for p in probability])
     centred = shifts - np.average(shifts, weights=total + 1e-9)
@@ -295,7 +295,7 @@ def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, floa
     density = np.zeros(len(grid))
     for g in geometries:
         near = np.abs(g.gap_px) < MOST_BIAS_PX + 5
-        odds = appearance_log_odds(g, model)
+        odds = appearance_log_odds(g, model, np.array(g.gap_px.shape))
         share = 1 / (1 + np.exp(-np.clip(odds + np.log(model.span_px / 4), -30.0, 30.0)))
         kernel = np.exp(-0.5 * (g.gap_px[near][:, None] - grid) ** 2)
         density += np.sum(share[near][:, None] * kernel, axis=0)

@@ -81,26 +81,26 @@ class View:
     def __len__(self) -> int:
         return len(self.scatter_factor)
 
-    def of(self, rows: slice | Ints) -> View:
-        """Return some of the detections."""
+    def of(self, rows: slice | Ints | tuple[slice | None, ...]) -> View:
+        """Return some of the detections, or all of them with one more axis."""
         arrays = [getattr(self, field.name)[rows] for field in fields(self)[1:]]
         return View(self.camera, *arrays)
 
 
 @dataclass(frozen=True)
 class PairGeometry:
-    """Compare all combinations of a frame's N1 first and N2 second detections.
+    """Compare first with second detections, in arrays of any shape (...).
 
-    views : the detections of both cameras.
-    gap_px : (N1, N2) position of the first minus that of the second along the shared axis, in px of
+    views : the detections of both cameras, with shapes that broadcast to this one.
+    gap_px : (...) position of the first minus that of the second along the shared axis, in px of
         the first image, including any bias. It is positive along +u or +v of this image, whichever
         is nearer to the axis.
-    variance_px2 : (N1, N2) variance of the gap that follows from the detections' covariances.
-    points_mm : (N1, N2, 3) points midway between the two rays, in the rig frame (mm).
-    size : (N1, N2, 2) logarithms of the ratios first / second of height and width.
-    contrast : (N1, N2, 1) logarithm of the ratio first / second of the contrast.
-    mm_per_px : (N1, N2) length of one pixel of the gap (mm).
-    scatter_factor : (N1, N2) the larger of both detections' factors.
+    variance_px2 : (...) variance of the gap that follows from the detections' covariances.
+    points_mm : (..., 3) points midway between the two rays, in the rig frame (mm).
+    size : (..., 2) logarithms of the ratios first / second of height and width.
+    contrast : (..., 1) logarithm of the ratio first / second of the contrast.
+    mm_per_px : (...) length of one pixel of the gap (mm).
+    scatter_factor : (...) the larger of both detections' factors.
     """
 
     views: tuple[View, View]
@@ -111,6 +111,11 @@ class PairGeometry:
     contrast: Array
     mm_per_px: Array
     scatter_factor: Array
+
+    def of(self, keep: Ints) -> PairGeometry:
+        """Return some of the pairs of a geometry with the shape (E,)."""
+        arrays = [getattr(self, field.name)[keep] for field in fields(self)[1:]]
+        return PairGeometry((self.views[0].of(keep), self.views[1].of(keep)), *arrays)
 
 
 def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
@@ -183,33 +188,33 @@ def views_of(tables: Sequence[pd.DataFrame], camera: Camera, axis: Array) -> lis
 
 
 def pair_geometry(first: View, second: View) -> PairGeometry:
-    """Compare each detection of the first view with each of the second."""
-    views = (first, second)
-    origins = (first.origin_mm[:, None], second.origin_mm[None])
-    directions = (first.direction[:, None], second.direction[None])
-    points, _ = midpoint(origins[0], directions[0], origins[1], directions[1])
-    axis = cross(directions[0], directions[1])
+    """Compare each of N1 first detections with each of N2 second ones: arrays (N1, N2)."""
+    return compared(first.of(np.s_[:, None]), second.of(np.s_[None]))
+
+
+def compared(first: View, second: View) -> PairGeometry:
+    """Compare the detections of two views, whose arrays are broadcast."""
+    points, _ = midpoint(first.origin_mm, first.direction, second.origin_mm, second.direction)
+    axis = cross(first.direction, second.direction)
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
     axis *= np.sign(axis @ shared_axis((first.camera, second.camera)))[..., None]
-    gap = ((origins[0] - origins[1]) * axis).sum(-1)
+    gap = ((first.origin_mm - second.origin_mm) * axis).sum(-1)
     variance, stretch, lengths = np.zeros_like(gap), [], []
-    for c, view in enumerate(views):
+    for sign, view in zip((1, -1), (first, second)):
         pose = view.camera.camera_from_rig
         depth = points @ pose.rotation[2] + pose.translation_mm[2]
         magnified = 1 + view.camera["kappa_per_mm"] * depth
-        per_row = (slice(None), None) if c == 0 else (None, slice(None))
-        across = (axis @ pose.rotation.T)[..., None, :2] @ view.mm_by_px[per_row]
-        across = across[..., 0, :] * magnified[..., None]
-        spread = np.einsum("...i,...ij,...j", across, view.covariance_px2[per_row], across)
-        variance += spread
-        gap += (1 - 2 * c) * view.middle_mm[per_row] * magnified
+        across = ((axis @ pose.rotation.T)[..., None, :2] @ view.mm_by_px)[..., 0, :]
+        across = across * magnified[..., None]
+        variance += np.einsum("...i,...ij,...j", across, view.covariance_px2, across)
+        gap += sign * view.middle_mm * magnified
         stretch.append(np.log(magnified))
         lengths.append(np.linalg.norm(across, axis=-1))
     return PairGeometry(
-        views, gap / lengths[0], variance / lengths[0] ** 2, points,
-        first.log_size[:, None] - second.log_size + (stretch[0] - stretch[1])[..., None],
-        first.log_contrast[:, None] - second.log_contrast,
-        lengths[0], np.maximum(first.scatter_factor[:, None], second.scatter_factor),
+        (first, second), gap / lengths[0], variance / lengths[0] ** 2, points,
+        first.log_size - second.log_size + (stretch[0] - stretch[1])[..., None],
+        first.log_contrast - second.log_contrast,
+        lengths[0], np.maximum(first.scatter_factor, second.scatter_factor),
     )  # fmt: skip
 
 
@@ -468,6 +473,8 @@ _UNKNOWN_SIZE = 2.0
 """Log odds against a pair with a bubble that is cut or merged: its partner is often unseen."""
 _RARE, _FREEDOM = 2.5, 6.0
 
+_COMBINATIONS_AT_ONCE = 50_000
+
 _SEEN = 0.95
 _NEW_SHARE = 0.1
 _TRACK_SIZE_SD = 0.1
@@ -490,9 +497,47 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class Candidates:
+    """Hold the E possible pairs of one frame, of N1 first and N2 second detections.
+
+    views : all detections of both cameras.
+    mm_per_px : length of one pixel of the gap (mm), the median over all combinations.
+    rows : (E, 2) rows of the pairs in both views.
+    gap_px, variance_px2 : (E,) gaps less the model's bias, and their variances.
+    appearance : (E,) log odds from everything but the gaps and the tracks.
+    points_mm, variance_mm2 : (E, 3) points midway between the rays, and (E,) their variance in
+        every direction.
+    log_radius : (E,) mean logarithm of the radius in both views (mm); NaN if unknown.
+    log_height_ratio : (E,) logarithm of the height in the first view over that in the second; NaN
+        if unknown.
+    """
+
+    views: tuple[View, View]
+    mm_per_px: float
+    rows: Ints
+    gap_px: Array
+    variance_px2: Array
+    appearance: Array
+    points_mm: Array
+    variance_mm2: Array
+    log_radius: Array
+    log_height_ratio: Array
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def matrix(self, values: Array, elsewhere: float) -> Array:
+        """Return (N1, N2) the values (E,) of the pairs, and another one for all other rows."""
+        out = np.full([len(view) for view in self.views], elsewhere)
+        out[self.rows[:, 0], self.rows[:, 1]] = values
+        return out
+
+
+@dataclass(frozen=True)
 class Matches:
     """Hold the M pairs of one frame.
 
+    candidate : (M,) positions of the pairs among the frame's `Candidates`.
     first, second : (M,) positions of the pair's rows in the two detection tables, from 0.
     confidence : (M,) posterior probability of the pair.
     gap_px, gap_sigma : (M,) mismatch along the shared axis, first minus second, after the model's
@@ -503,6 +548,7 @@ class Matches:
     frame_shift_px : the shift that all gaps of this frame share, in px of the first image.
     """
 
+    candidate: Ints
     first: Ints
     second: Ints
     confidence: Array
@@ -510,7 +556,7 @@ class Matches:
     gap_sigma: Array
     height_ratio: Array
     ambiguous: Bools
-    frame_shift_px: float = 0.0
+    frame_shift_px: float
 
     def __len__(self) -> int:
         return len(self.first)
@@ -536,166 +582,213 @@ def match_pairs(
     """
     axis = shared_axis(cameras)
     views = (view_of(first, cameras[0], axis), view_of(second, cameras[1], axis))
-    return match_views(views, model, predicted=predicted)
+    (found,) = candidates(views, np.array([[len(view) for view in views]]), model)
+    return match_candidates(found, model, predicted)
 
 
-def match_views(
-    views: tuple[View, View], model: PairModel, *, predicted: Prediction | None = None
+def candidates(views: tuple[View, View], counts: Ints, model: PairModel) -> list[Candidates]:
+    """Return the possible pairs of F frames, whose detections follow each other in the views.
+
+    counts : (F, 2) number of detections in each frame and view.
+
+    A gap may be twice as large as that of a pair, because all gaps of a frame shift together.
+    """
+    out: list[Candidates] = []
+    starts, combinations = np.cumsum(counts, axis=0) - counts, counts.prod(1)
+    while len(out) < len(counts):
+        first = len(out)
+        some = np.searchsorted(np.cumsum(combinations[first:]), _COMBINATIONS_AT_ONCE)
+        frames = np.arange(first, min(first + max(int(some), 1), len(counts)))
+        out += _candidates(views, starts[frames], counts[frames], model)
+    return out
+
+
+def _candidates(
+    views: tuple[View, View], starts: Ints, counts: Ints, model: PairModel
+) -> list[Candidates]:
+    from telerig.estimator.bubbles.pairing import kernels
+
+    many = counts.prod(1)
+    ends = np.cumsum([0, *many])
+    frame = np.repeat(np.arange(len(many)), many)
+    rows = np.stack(np.divmod(np.arange(ends[-1]) - ends[frame], counts[frame, 1]), -1)
+    every = compared(*(v.of(i) for v, i in zip(views, (starts[frame] + rows).T)))
+    gap, variance = _unbiased(every, model)
+    limit2 = (2 * kernels.GATE_SIGMA) ** 2 * (variance + model.frame_px**2 + kernels.MOST_TAIL_PX2)
+    kept = np.flatnonzero(gap**2 < limit2)
+    near = every.of(kept)
+    odds = appearance_log_odds(near, model, counts[frame[kept]])
+    first, second = near.views
+    trace = sum(np.trace(v.covariance_px2, axis1=1, axis2=2) for v in near.views)
+    variance_px2 = model.scatter_px**2 + 0.25 * trace + model.frame_px**2
+    sine2 = 1 - (first.direction * second.direction).sum(-1) ** 2
+    arrays = (
+        rows[kept], gap[kept], variance[kept], odds, near.points_mm,
+        variance_px2 * near.mm_per_px**2 / sine2,
+        0.25 * (first.log_size + second.log_size).sum(-1), near.size[:, 0],
+    )  # fmt: skip
+    cuts, out = np.searchsorted(kept, ends).tolist(), []
+    for f, ((low, high), (start, stop)) in enumerate(zip(pairwise(ends.tolist()), pairwise(cuts))):
+        both = [v.of(slice(s, s + n)) for v, s, n in zip(views, starts[f], counts[f])]
+        length = float(np.median(every.mm_per_px[low:high])) if high > low else 0.0
+        out.append(Candidates((both[0], both[1]), length, *(a[start:stop] for a in arrays)))
+    return out
+
+
+def match_candidates(
+    found: Candidates, model: PairModel, predicted: Prediction | None = None
 ) -> Matches:
-    """Find the pairs among the detections of one frame, as `match_pairs` does."""
-    if not len(views[0]) or not len(views[1]):
-        none, empty = np.zeros(0, np.int64), np.zeros(0)
-        return Matches(none, none, empty, empty, empty, empty, np.zeros(0, bool))
-    geometry = pair_geometry(*views)
-    by_tracks = 0.0 if predicted is None else track_log_odds(geometry, model, predicted)
-    gap, variance, odds, shift = common_shift(geometry, model, by_tracks)
-    pairs = best_assignment(odds)
-    confidence = marginals(odds)[pairs]
+    """Find the pairs among the possible ones of a frame, as `match_pairs` does."""
+    from telerig.estimator.bubbles.pairing import kernels
+
+    odds = found.appearance
+    if predicted is not None and len(predicted.ids) and len(found):
+        odds = odds + track_log_odds(found, model, predicted)
+    total, shift, uncertainty = kernels.common_shift(
+        found.matrix(found.gap_px, np.inf), found.matrix(found.variance_px2, 1.0),
+        found.matrix(odds, 0.0), model.frame_px, model.span_px, NEGLIGIBLE,
+    )  # fmt: skip
+    rows = best_assignment(total)
+    confidence = marginals(total)[rows]
+    at = found.matrix(np.arange(len(found)), -1)[rows].astype(np.int64)
+    gap = found.gap_px[at] - shift
     return Matches(
-        *pairs,
+        at,
+        *rows,
         confidence,
-        gap[pairs],
-        gap[pairs] / np.sqrt(variance[pairs]),
-        np.exp(geometry.size[..., 0][pairs]),
+        gap,
+        gap / np.sqrt(found.variance_px2[at] + uncertainty),
+        np.exp(found.log_height_ratio[at]),
         np.log(confidence) - np.log(np.maximum(1 - confidence, 1e-300)) < SAFE_LOG_ODDS,
         shift,
     )
 
 
-def common_shift(
-    geometry: PairGeometry, model: PairModel, by_tracks: Array | float = 0.0
-) -> tuple[Array, Array, Array, float]:
+def _unbiased(geometry: PairGeometry, model: PairModel) -> tuple[Array, Array]:
+    """Return gaps (px) less the model's bias, and their variances (px^2)."""
+    bias, variance = model.bias(geometry.points_mm)
+    own = geometry.variance_px2 + variance + (model.scatter_px * geometry.scatter_factor) ** 2
+    return geometry.gap_px - bias, own
+
+
+def common_shift(geometry: PairGeometry, model: PairModel) -> tuple[Array, float]:
     """Estimate the shift that all gaps of a frame share.
 
     geometry : all combinations of N1 first and N2 second detections.
-    by_tracks : (N1, N2) log odds from the predicted tracks, or 0.
 
-    Returns four values: the gaps (N1, N2) in px after bias and shift are subtracted, their
-    variances (N1, N2) in px^2, the log odds (N1, N2) of all pairs, and the shift (px). The shift
-    starts as unknown within ``model.frame_px`` and is then the mean over the pairs by their
-    probabilities, with that scatter as its prior.
+    Returns the log odds (N1, N2) of all pairs without tracks, and the shift (px). The shift starts
+    as unknown within ``model.frame_px`` and is then the mean over the pairs by their probabilities,
+    with that scatter as its prior.
     """
     from telerig.estimator.bubbles.pairing import kernels
 
-    bias, bias_variance = model.bias(geometry.points_mm)
-    raw = geometry.gap_px - bias
-    own = geometry.variance_px2 + bias_variance + (model.scatter_px * geometry.scatter_factor) ** 2
-    appearance = appearance_log_odds(geometry, model) + by_tracks
-    odds, shift, uncertainty = kernels.common_shift(
-        raw, own, appearance, model.frame_px, model.span_px, NEGLIGIBLE
+    odds, shift, _ = kernels.common_shift(
+        *_unbiased(geometry, model),
+        appearance_log_odds(geometry, model, np.array(geometry.gap_px.shape)),
+        model.frame_px,
+        model.span_px,
+        NEGLIGIBLE,
     )
-    return raw - shift, own + uncertainty, odds, shift
+    return odds, shift
 
 
-def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
-    """Return the log odds (N1, N2) of all pairs from everything but the gap.
+def appearance_log_odds(geometry: PairGeometry, model: PairModel, counts: Ints) -> Array:
+    """Return the log odds (...) of pairs from everything but the gap.
 
     They come from height, width, contrast and the number of detections. If two heights differ by
     more than any measurement error, the pair is excluded; for flagged detections this limit is
     twice as large.
+
+    counts : (..., 2) or (2,) number of detections in the views of the frame.
     """
     from telerig.estimator.bubbles.pairing import kernels
 
     first, second = geometry.views
-    odds = np.full(
-        geometry.gap_px.shape, _prior_log_odds(len(first), len(second), model.unmatched_share)
-    )
-    wrong = np.where(geometry.scatter_factor > 1, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
-    odds += _ratio_log_odds(model.size, geometry.size, first.log_size, second.log_size, wrong)
+    flagged = geometry.scatter_factor > 1
+    wrong = np.where(flagged, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
+    odds = _ratio_log_odds(model.size, geometry.size, first.log_size + second.log_size, wrong)
+    odds = odds + _prior_log_odds(counts, model.unmatched_share)
     apart = np.abs(geometry.size[..., 0] - model.size.difference[0])
     limit = max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
-    odds[apart > np.where(geometry.scatter_factor > 1, 2 * limit, limit)] = kernels.NEVER
+    odds[apart > np.where(flagged, 2 * limit, limit)] = kernels.NEVER
     odds -= np.where(np.isfinite(apart), 0.0, _UNKNOWN_SIZE)
-    contrasts = (first.log_contrast, second.log_contrast)
-    odds += _ratio_log_odds(model.contrast, geometry.contrast, *contrasts, _WRONG_CONTRAST)
-    return odds
+    contrasts = first.log_contrast + second.log_contrast
+    wrong = np.full(flagged.shape, _WRONG_CONTRAST)
+    return odds + _ratio_log_odds(model.contrast, geometry.contrast, contrasts, wrong)
 
 
-def _prior_log_odds(n1: int, n2: int, unmatched: tuple[float, float]) -> float:
-    """Return the prior log odds of a pair of n1 first and n2 second detections.
+def _prior_log_odds(counts: Ints, unmatched: tuple[float, float]) -> Array:
+    """Return the prior log odds of a pair in a frame.
 
+    counts : (..., 2) detections of the frame in both views.
     unmatched : for each view, the expected share of detections without a partner.
     """
-    alone = (max(n1 * unmatched[0], 1e-3), max(n2 * unmatched[1], 1e-3))
-    pairs = max(np.sqrt(n1 * (1 - unmatched[0]) * n2 * (1 - unmatched[1])), 1e-3)
-    return float(np.log(pairs / (alone[0] * alone[1])))
+    alone = np.maximum(counts * np.array(unmatched), 1e-3)
+    pairs = np.sqrt((counts * (1 - np.array(unmatched))).prod(-1))
+    return np.asarray(np.log(np.maximum(pairs, 1e-3) / alone.prod(-1)))
 
 
-def _ratio_log_odds(
-    expected: LogRatioModel, ratio: Array, first: Array, second: Array, wrong: Array | float
-) -> Array:
-    """Log odds of properties: two noisy images of one bubble, or of two from the population.
+def _ratio_log_odds(expected: LogRatioModel, ratio: Array, total: Array, wrong: Array) -> Array:
+    """Log odds (...) of properties: two noisy images of one bubble, or of two bubbles.
 
     In the axes in which scatter and population are both uncorrelated, two images of one bubble
     have correlation 1 - scatter / 2; the log odds are those of the two normal distributions. How
     rare a bubble is counts to ``_RARE`` standard deviations.
-    wrong : chance that one of the measurements says nothing about the bubble.
+    ratio, total : (..., K) differences and sums of the logarithms.
+    wrong : (...) chance that one of the measurements says nothing about the bubble.
     """
     from telerig.estimator.bubbles.pairing import kernels
 
     axes, alike = expected.uncorrelated
-    known = np.broadcast_to(np.asarray(wrong, float), ratio.shape[:2])
-    return kernels.ratio_log_odds(
-        ratio - expected.difference, first - expected.means[0], second - expected.means[1], axes,
-        alike, known, _RARE, _FREEDOM,
-    )  # fmt: skip
+    many = ratio.shape[-1]
+    ratio = (ratio - expected.difference).reshape(-1, many)
+    total = (total - expected.means.sum(0)).reshape(-1, many)
+    odds = kernels.ratio_log_odds(ratio, total, axes, alike, wrong.ravel(), _RARE, _FREEDOM)
+    return np.asarray(odds.reshape(wrong.shape))
 
 
-def track_log_odds(
-    geometry: PairGeometry, model: PairModel, predicted: Prediction
-) -> Array | float:
-    """Return the log odds (N1, N2) that the predicted tracks add; 0 if there are no tracks.
+def track_log_odds(found: Candidates, model: PairModel, predicted: Prediction) -> Array:
+    """Return the log odds (E,) that the predicted tracks add.
 
     Without tracks pairs lie anywhere in the volume that both cameras see. With them most lie where
     a track is expected (both pixels at once, through the point in space), and so do the
     detections of bubbles that only one camera found; one track cannot be the unmatched detection
     of both cameras.
     """
-    tracks = len(predicted.ids)
-    if not tracks:
-        return 0.0
-    density = _track_density(geometry, model, predicted)
-    expected = (1 - _NEW_SHARE) * _SEEN**2 * density / tracks + _NEW_SHARE
-    cameras = (geometry.views[0].camera, geometry.views[1].camera)
-    seen = stacked_jacobian(cameras, np.asarray(predicted.points_mm, float))
-    near = [_unmatched_density(geometry, model, predicted, seen, c) for c in range(2)]
-    alone = (1 + near[0].sum(1))[:, None] * (1 + near[1].sum(1)) - near[0] @ near[1].T
+    cameras = (found.views[0].camera, found.views[1].camera)
+    points = np.asarray(predicted.points_mm, float)
+    expected = _track_density(found, model, predicted, points) / len(points)
+    expected = (1 - _NEW_SHARE) * _SEEN**2 * expected + _NEW_SHARE
+    seen = stacked_jacobian(cameras, points)
+    first, second = (
+        _unmatched_density(found.views[c], model, predicted, seen, c)[found.rows[:, c]]
+        for c in range(2)
+    )
+    alone = (1 + first.sum(1)) * (1 + second.sum(1)) - (first * second).sum(1)
     return np.asarray(np.log(expected) - np.log(alone))
 
 
-def _track_density(geometry: PairGeometry, model: PairModel, predicted: Prediction) -> Array:
-    """(N1, N2) density of a pair's point and size at the tracks, relative to anywhere."""
+def _track_density(
+    found: Candidates, model: PairModel, predicted: Prediction, points_mm: Array
+) -> Array:
+    """(E,) density of a pair's point and size at the tracks, relative to anywhere."""
     from telerig.estimator.bubbles.pairing import kernels
 
-    first, second = geometry.views
-    pixel = model.scatter_px**2 + 0.25 * (
-        np.trace(first.covariance_px2, axis1=1, axis2=2)[:, None]
-        + np.trace(second.covariance_px2, axis1=1, axis2=2)
-    )
-    pixel = pixel + model.frame_px**2
-    sine2 = 1 - (first.direction @ second.direction.T) ** 2
-    measured = pixel * geometry.mm_per_px**2 / sine2
     variances, axes = np.linalg.eigh(predicted.covariance_mm2)
-    size = 0.25 * (first.log_size.sum(-1)[:, None] + second.log_size.sum(-1))
     with np.errstate(divide="ignore", invalid="ignore"):
         log_expected = np.log(np.asarray(predicted.d_eq_mm, float) / 2)
     population = float(np.sqrt(model.size.spread.mean()))
     sd = min(_TRACK_SIZE_SD, population)
     density = kernels.track_density(
-        geometry.points_mm, measured, size, np.asarray(predicted.points_mm, float), variances,
-        axes, log_expected, sd, population / sd,
+        found.points_mm, found.variance_mm2, found.log_radius, points_mm, variances, axes,
+        log_expected, sd, population / sd,
     )  # fmt: skip
-    widths = [min(v.camera.image_size_px) / v.camera["scale_px_per_mm"] for v in geometry.views]
-    volume_mm3 = widths[0] * widths[1] * model.span_px * np.median(geometry.mm_per_px)
-    return np.asarray(density * volume_mm3)
+    widths = [min(v.camera.image_size_px) / v.camera["scale_px_per_mm"] for v in found.views]
+    return np.asarray(density * (widths[0] * widths[1] * model.span_px * found.mm_per_px))
 
 
 def _unmatched_density(
-    geometry: PairGeometry,
-    model: PairModel,
-    predicted: Prediction,
-    seen: tuple[Array, Array],
-    c: int,
+    view: View, model: PairModel, predicted: Prediction, seen: tuple[Array, Array], c: int
 ) -> Array:
     """(N, K) expected density of detections whose track only this camera sees, over the usual.
 
@@ -703,12 +796,11 @@ def _unmatched_density(
     """
     from telerig.estimator.bubbles.pairing import kernels
 
-    view, (pixels, jacobian) = geometry.views[c], seen
-    rows = jacobian[:, 2 * c : 2 * c + 2]
-    spread = rows @ predicted.covariance_mm2 @ np.swapaxes(rows, 1, 2)
+    pixels, jacobian = (values[:, 2 * c : 2 * c + 2] for values in seen)
+    spread = jacobian @ predicted.covariance_mm2 @ np.swapaxes(jacobian, 1, 2)
     common = model.scatter_px**2 + model.frame_px**2 + model.bias_px[0] ** 2 / 4
     density = kernels.pixel_density(
-        view.uv_px, view.covariance_px2, pixels[:, 2 * c : 2 * c + 2], spread + common * np.eye(2)
+        view.uv_px, view.covariance_px2, pixels, spread + common * np.eye(2)
     )
     width, height = view.camera.image_size_px
     usual = max(len(view) * model.unmatched_share[c], 1e-3)

@@ -64,7 +64,7 @@ def test_an_ellipsoid_has_one_height_in_both_views(angle_deg: float) -> None:
         found = geometry(views[0], views[1], cameras)
         assert found.size[0, 0, 0] == pytest.approx(0, abs=1e-12)
         assert found.gap_px[0, 0] == pytest.approx(0, abs=1e-9)
-        half = np.exp(geometry(views[0], views[0], cameras).views[0].log_size[0, 0])
+        half = np.exp(geometry(views[0], views[0], cameras).views[0].log_size[0, 0, 0])
         assert half == pytest.approx(np.sqrt(body[1, 1]), rel=1e-12)
 
 

@@ -533,9 +533,11 @@ class Association:
 
     def mean_gain(self, others: Sequence[Array]) -> Array | None:
         """(n, 3) mean filter gain of the bubbles that are updated; None if there are none."""
-        p = [self.tracks[i].filter.P[:, POSITION] for i in self.pairs.row[self.picked]]
-        gains = [a @ b for a, b in zip(p, self.pairs.information[self.picked])]
-        return np.mean([*others, *gains], axis=0) if others or gains else None
+        gains = list(others)
+        if len(self.picked):
+            p = np.array([self.tracks[i].filter.P for i in self.pairs.row[self.picked].tolist()])
+            gains.extend(p[..., POSITION] @ self.pairs.information[self.picked])
+        return np.mean(gains, axis=0) if gains else None
 
     def _allowed(self) -> Ints:
         """Pairings inside their gate, the common shift estimated from the other clusters alone."""
@@ -581,10 +583,11 @@ class Association:
         )
 
 
-def children(found: Association, members: Sequence[int], edges: Sequence[int]) -> list[Child]:
+def children(
+    found: Association, members: Sequence[int], edges: Sequence[int], outside: Common
+) -> list[Child]:
     """The likely ways to continue some clusters together, equal recent pasts merged, best first."""
     settings, pairs = found.scan.settings, found.pairs
-    outside = found.outside(members)
     score = pairs.scores(outside.shift_mm)
     by_row: dict[int, list[int]] = {}
     for e in edges:
@@ -621,11 +624,11 @@ def _histories(child: Child, pairs: Pairs, frame: int) -> History:
     }
 
 
-def grow(found: Association, members: Sequence[int], child: Child, mean_gain: Array) -> Branch:
+def grow(found: Association, outside: Common, child: Child, mean_gain: Array) -> Branch:
     """The branch of a child, its tracks updated with the common shift that its pairings imply."""
     pairs, scan = found.pairs, found.scan
     used = np.array([e for e in child.edges if e >= 0], int)
-    common = found.outside(members).informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
+    common = outside.informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
     tracks = [t.copy() for b in child.parents for t in b.tracks]
     columns = [int(pairs.column[e]) if e >= 0 else -1 for e in child.edges]
     continue_tracks(tracks, columns, scan, common, mean_gain)
@@ -667,8 +670,9 @@ def advance(
             columns.append(column)
             out.append(Cluster([Branch(0.0, [track], {track.particle: [(scan.frame, column)]})]))
             continue
-        every = children(found, members, edges)
-        out.append(Cluster([grow(found, members, child, gain) for child in every]))
+        outside = found.outside(members)
+        every = children(found, members, edges, outside)
+        out.append(Cluster([grow(found, outside, child, gain) for child in every]))
     continue_tracks(alone, columns, scan, found.common, gain)
     return out, found.common, mean_gain
 

@@ -504,21 +504,31 @@ def shared_rows(tracks: SmoothedTracks, frames: slice) -> list[dict[str, Any]]:
     behind that outline, so that motion is not counted twice when tracks are smoothed.
     """
     seen = {p for frame in tracks.frames for p in frame.particle.tolist()}
-    out = []
-    for i, frame in list(enumerate(tracks.frames))[frames]:
-        singles = [s for s in frame.hidden() if s.particle in seen]
-        if not singles:
-            continue
-        tracks.prepare(s.particle for s in singles)
-        points, covariances = tracks.at(i, [s.particle for s in singles])
-        known = frame.particle != NO_PARTICLE
-        where, sizes = [*frame.pairs.points_mm[known]], frame.pairs.d_eq_mm[known].tolist()
-        for k in np.argsort(np.trace(covariances, axis1=1, axis2=2), kind="stable").tolist():
-            row = _row(frame, singles[k], points[k], covariances[k], tracks.cameras)
-            if row is not None and not _taken(singles[k], points[k], where, sizes):
-                out.append(row)
-                where.append(points[k])
-                sizes.append(singles[k].d_eq_mm)
+    hidden = [
+        (i, single)
+        for i, frame in list(enumerate(tracks.frames))[frames]
+        for single in frame.hidden()
+        if single.particle in seen
+    ]
+    if not hidden:
+        return []
+    tracks.prepare(single.particle for _, single in hidden)
+    every = [tracks.at(i, [single.particle]) for i, single in hidden]
+    points, covariances = (np.concatenate(values) for values in zip(*every))
+    views = [projected(camera, points, covariances) for camera in tracks.cameras]
+    order = np.lexsort((np.trace(covariances, axis1=1, axis2=2), [i for i, _ in hidden]))
+    out, last = [], None
+    for k in order.tolist():
+        frame, single = tracks.frames[hidden[k][0]], hidden[k][1]
+        if frame is not last:
+            known, last = frame.particle != NO_PARTICLE, frame
+            where, sizes = [*frame.pairs.points_mm[known]], frame.pairs.d_eq_mm[known].tolist()
+        view = _of(views[1 - single.camera], slice(k, k + 1))
+        row = _row(frame, single, points[k], covariances[k], view, tracks.cameras)
+        if row is not None and not _taken(single, points[k], where, sizes):
+            out.append(row)
+            where.append(points[k])
+            sizes.append(single.d_eq_mm)
     return out
 
 
@@ -535,12 +545,15 @@ def _row(
     single: Single,
     point: Array,
     covariance: Array,
+    view: Projected,
     cameras: tuple[Camera, Camera],
 ) -> dict[str, Any] | None:
-    """None where the point is too uncertain, or no other bubble explains why it is not seen."""
+    """None where the point is too uncertain, or no other bubble explains why it is not seen.
+
+    view : the point in the camera that does not see it.
+    """
     seen = single.camera
     other = cameras[1 - seen]
-    view = projected(other, point[None], covariance[None])
     uv, spread = view.uv_px[0] + frame.offset_px[1 - seen], view.covariance_px2[0]
     diameter = single.d_eq_mm * px_per_mm(view.by_point)[0]
     sd = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))

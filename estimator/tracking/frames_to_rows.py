@@ -118,7 +118,7 @@ class RowMaker:
         """
         frames = [np.repeat(np.arange(len(counts)), many) for many in counts.T]
         free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
-        left = np.stack([np.bincount(n[i], minlength=len(counts)) for n, i in zip(frames, free)], -1)
+        left = np.array([np.bincount(n[i], minlength=len(counts)) for n, i in zip(frames, free)]).T
         found = candidates((views[0].of(free[0]), views[1].of(free[1])), left, self.model)
         rows = np.concatenate([f.rows + s for f, s in zip(found, np.cumsum(left, axis=0) - left)])
         rows = np.stack([own[r] for own, r in zip(free, rows.T)], -1)

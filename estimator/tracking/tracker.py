@@ -140,7 +140,7 @@ def born(
     x[POSITION], x[VELOCITY] = point, velocity_mm_s
     out = Track(new_filter(x, covariance), born_frame=scan.frame, history=[(scan.frame, column)])
     out.saw(scan.frame, scan.t_s, float(scan.measured.d_eq_mm[column]))
-    out.parent = _beside(point, tracks)
+    out.parent = Neighbours(tracks).beside(point)
     return out
 
 
@@ -216,12 +216,11 @@ def ended(
     Returns the ids of the ended tracks, and their "death" and "merge" events.
     """
     dead, events = set(), []
-    for track in tracks:
-        if track.seen_frame == scan.frame:
-            continue
+    unseen_now = [t for t in tracks if t.seen_frame != scan.frame]
+    neighbours = Neighbours(confirmed if unseen_now else ())
+    for track in unseen_now:
         if track.near is None:
-            others = [t for t in confirmed if t.particle != track.particle]
-            track.near = _beside(track.point_mm, others)
+            track.near = neighbours.beside(track.point_mm, track)
         unseen, frames = scan.t_s - track.seen_t_s, scan.frame - track.seen_frame
         if unseen > scan.settings.gap_s and frames > scan.settings.gap_frames:
             dead.add(track.particle)
@@ -242,20 +241,26 @@ def _merged_into(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[T
     return [TrackEvent("merge", scan.frame, scan.t_s, (other.particle, track.particle), reason)]
 
 
-def _beside(point_mm: Array, tracks: Sequence[Track]) -> tuple[int, float] | None:
-    """Return the nearest track whose bubble could touch a bubble at a point (3,), as its id and its
-    former diameter in mm; None if no track is near enough.
-    """
-    sized = [t for t in tracks if np.isfinite(t.d_eq_mm)]
-    if not sized:
+class Neighbours:
+    """Find which of some tracks is beside a point."""
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        self._tracks = [t for t in tracks if np.isfinite(t.d_eq_mm)]
+        self._points_mm = np.array([t.point_mm for t in self._tracks]).reshape(-1, 3)
+
+    def beside(self, point_mm: Array, own: Track | None = None) -> tuple[int, float] | None:
+        """Return the nearest track, other than ``own``, whose bubble could touch one at a point.
+
+        It is given as its id and its former diameter in mm; None if no track is near enough.
+        """
+        away = np.sqrt(((self._points_mm - point_mm) ** 2).sum(1))
+        for k in away.argsort()[:2].tolist():
+            track = self._tracks[k]
+            if track is not own:
+                before = track.d_before_mm if np.isfinite(track.d_before_mm) else track.d_eq_mm
+                near = away[k] <= _TOUCHING * track.d_eq_mm
+                return (track.particle, before) if near else None
         return None
-    away = np.linalg.norm([t.point_mm - point_mm for t in sized], axis=1)
-    nearest = int(away.argmin())
-    track = sized[nearest]
-    if away[nearest] > _TOUCHING * track.d_eq_mm:
-        return None
-    before = track.d_before_mm if np.isfinite(track.d_before_mm) else track.d_eq_mm
-    return track.particle, before
 
 
 def _volumes_balance(

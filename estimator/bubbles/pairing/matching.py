@@ -272,11 +272,17 @@ def _trust(table: pd.DataFrame) -> tuple[Bools, Array, Array]:
     Returns three arrays (N,): whether the size is known, the factor on the scatter of the gap, and
     the additional standard deviation of the centre as a share of the major semi-axis.
     """
-    flags = flag_words(table)
-    known = np.array([not any(word in NO_SIZE_FLAGS for word in row) for row in flags], bool)
-    factor = [max((_SCATTER_FACTOR.get(word, 1.0) for word in row), default=1.0) for row in flags]
-    unsure = [max((_UNSURE_SHARE.get(word, 0.0) for word in row), default=0.0) for row in flags]
-    return known, np.array(factor), np.array(unsure)
+    words = [tuple(row) for row in flag_words(table)]
+    trust = {
+        row: (
+            not any(word in NO_SIZE_FLAGS for word in row),
+            max((_SCATTER_FACTOR.get(word, 1.0) for word in row), default=1.0),
+            max((_UNSURE_SHARE.get(word, 0.0) for word in row), default=0.0),
+        )
+        for row in set(words)
+    }
+    known, factor, unsure = np.array([trust[row] for row in words]).reshape(-1, 3).T
+    return known > 0, factor, unsure
 
 
 def _finite(values: Array) -> Array:

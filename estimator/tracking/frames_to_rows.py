@@ -280,9 +280,7 @@ def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
     return out
 
 
-def pair_frame(
-    sight: Sight, model: PairModel, predicted: Prediction | None
-) -> tuple[Pairs, Array]:
+def pair_frame(sight: Sight, model: PairModel, predicted: Prediction | None) -> tuple[Pairs, Array]:
     """Return the pairs of a frame, and the median shift of each camera's pixels.
 
     Detections with given ids are paired by their ids; all others are matched.

@@ -47,7 +47,7 @@ def _product(left: Array, right: Array, out: Array) -> None:
 
 @compiled
 def _divide(matrix: Array, right: Array) -> None:
-    """Replace ``right`` (n, m) by inverse(matrix) @ right, and ``matrix`` by its Cholesky factor."""
+    """Replace ``right`` (n, m) by inverse(matrix) @ right; ``matrix`` is used up."""
     n = len(matrix)
     for i in range(n):
         for j in range(i + 1):

@@ -85,8 +85,10 @@ def smooth_points(
     x[:, POSITION] = np.linalg.solve(total, readings.pull.sum(0)[..., None])[..., 0]
     still = Motion(np.eye(len(prior)), np.zeros_like(prior), np.zeros(len(prior)))
     steps = [still, *(m for m in motions[1:] if m is not None)]
-    moves = (np.array([getattr(s, f.name) for s in steps]) for f in fields(Motion))
-    return kernels.smooth(readings.information, readings.pull, *moves, x, prior)
+    matrices, noises, offsets = (
+        np.array([getattr(step, field.name) for step in steps]) for field in fields(Motion)
+    )
+    return kernels.smooth(readings.information, readings.pull, matrices, noises, offsets, x, prior)
 
 
 Tables = tuple["pd.DataFrame", "pd.DataFrame"]
@@ -120,7 +122,7 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def of(self, keep: Bools | Ints) -> Pairs:
+    def of(self, keep: Bools | Ints | slice) -> Pairs:
         return Pairs(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     def and_also(self, other: Pairs) -> Pairs:

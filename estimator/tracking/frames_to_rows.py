@@ -102,7 +102,10 @@ class RowMaker:
                 ]
             )
         possible = self._possible((views[0], views[1]), pixels, ids, sizes, counts)
-        return [Sight(*zip(*both), *pairs) for both, pairs in zip(zip(*of_cameras), possible)]
+        every: list[tuple[Any, ...]] = [
+            (*zip(*both), *pairs) for *both, pairs in zip(*of_cameras, possible)
+        ]
+        return [Sight(*columns) for columns in every]
 
     def _possible(
         self,
@@ -125,7 +128,7 @@ class RowMaker:
         if any(len(own) < len(i) for own, i in zip(free, ids)):
             named = [np.flatnonzero(i != NO_PARTICLE) for i in ids]
             keys = [n[i] + len(counts) * own[i] for n, own, i in zip(frames, ids, named)]
-            _, first, second = np.intersect1d(*keys, return_indices=True)
+            _, first, second = np.intersect1d(keys[0], keys[1], return_indices=True)
             rows = np.concatenate([np.stack([named[0][first], named[1][second]], -1), rows])
             rows = rows[np.argsort(frames[0][rows[:, 0]], kind="stable")]
         (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))

@@ -21,6 +21,7 @@ from dataclasses import dataclass, fields
 from enum import Enum, auto
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -81,7 +82,7 @@ class View:
     def __len__(self) -> int:
         return len(self.scatter_factor)
 
-    def of(self, rows: slice | Ints | tuple[slice | None, ...]) -> View:
+    def of(self, rows: slice | Ints | tuple[slice | None, ...] | None) -> View:
         """Return some of the detections, or all of them with one more axis."""
         arrays = [getattr(self, field.name)[rows] for field in fields(self)[1:]]
         return View(self.camera, *arrays)
@@ -189,7 +190,7 @@ def views_of(tables: Sequence[pd.DataFrame], camera: Camera, axis: Array) -> lis
 
 def pair_geometry(first: View, second: View) -> PairGeometry:
     """Compare each of N1 first detections with each of N2 second ones: arrays (N1, N2)."""
-    return compared(first.of(np.s_[:, None]), second.of(np.s_[None]))
+    return compared(first.of(np.s_[:, None]), second.of(None))
 
 
 def compared(first: View, second: View) -> PairGeometry:
@@ -532,7 +533,7 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def matrix(self, values: Array, elsewhere: float) -> Array:
+    def matrix(self, values: Array | Ints, elsewhere: float) -> Array:
         """Return (N1, N2) the values (E,) of the pairs, and another one for all other rows."""
         out = np.full([len(view) for view in self.views], elsewhere)
         out[self.rows[:, 0], self.rows[:, 1]] = values
@@ -628,7 +629,7 @@ def _candidates(
     trace = sum(np.trace(v.covariance_px2, axis1=1, axis2=2) for v in near.views)
     variance_px2 = model.scatter_px**2 + 0.25 * trace + model.frame_px**2
     sine2 = 1 - (first.direction * second.direction).sum(-1) ** 2
-    arrays = (
+    arrays: tuple[Any, ...] = (
         rows[kept], gap[kept], variance[kept], odds, near.points_mm,
         variance_px2 * near.mm_per_px**2 / sine2,
         0.25 * (first.log_size + second.log_size).sum(-1), near.size[:, 0],

@@ -10,7 +10,11 @@ test the spheroid.
 In the unit circle of an outline, a deviation of the ellipse is a radial displacement
 g0 + g1 cos 2 phi + g2 sin 2 phi. White noise along the outline gives cos and sin of every order the
 same variance v, and g0 half of it; modes of degree 4 of the body do nearly the same (81/64 and
-45/16 of their variance). v is taken from the stated covariance of the centre, which is of order 1.
+45/16 of their variance), but these are correlated between the views. v is taken from the stated
+covariance of the centre, which is of order 1.
+
+Two effects of second order make outlines larger than the volume: they are corrected, see `_best`
+(docs/decisions/037-bubbles-from-two-outlines.md).
 """
 
 from __future__ import annotations
@@ -23,7 +27,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
-from telerig.estimator.bubbles.shape.volume_centroid import Outlines, outlines_from_table
+from telerig.estimator.bubbles.shape.volume_centroid import (
+    Outlines,
+    learned_sigma,
+    outlines_from_table,
+    rim_excess,
+)
 from telerig.rig import silhouette
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
@@ -34,10 +43,25 @@ about two axes (rad), and the deviation of the equatorial axes."""
 
 DEFAULT_TRIAXIAL = 0.01
 _DEFAULT_WEIGHT = 1.0  # in outlines' pairs, of the default in what a run learns
-_LEAST_EXCESS = 3e-4
+_LEAST_EXCESS = 1.5e-4
+_WHITE = np.diag([0.5, 1.0, 1.0, 0.5, 1.0, 1.0])
+_BODY = np.array(
+    [
+        [324.0, 0.0, 0.0, 121.5, -270.0, 0.0],
+        [0.0, 720.0, 0.0, -270.0, 360.0, 0.0],
+        [0.0, 0.0, 720.0, 0.0, 0.0, 0.0],
+        [121.5, -270.0, 0.0, 324.0, 0.0, 0.0],
+        [-270.0, 360.0, 0.0, 0.0, 720.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 720.0],
+    ]
+) / 735.0  # fmt: skip
+"""Covariances of g0, g1, g2 of both outlines: of white noise in each of them, and of independent
+modes of degree 4 seen at right angles, from 9 P4(cos phi cos phi'). Extents along the shared
+coordinate differ by a variance of 3 in both."""
 _LEAST_FOR_LEARNING = 8
 _TRIM, _TRIMMED = 0.02, 0.873
 """Share of squares that is left out, and the mean of the others for normal errors."""
+_CONTRADICTION = 4.0
 _STEPS, _SMALL_STEP = 15, 1e-5
 _MOST_FOR_LEARNING, _PIECE = 4_000, 20_000
 _PROLATE_COST = 8.0
@@ -123,11 +147,12 @@ def fit_spheroids(
     deviations : None to learn them from these outlines.
     """
     good = np.flatnonzero(outlines[0].entire & outlines[1].entire & np.isfinite(points_mm).all(-1))
+    sigma = learned_sigma(outlines)
 
     def views_of(rows: NDArray[Any]) -> _Views:
         pair = (outlines[0].rows(rows), outlines[1].rows(rows))
         _, jacobian = stacked_jacobian(cameras, points_mm[rows])
-        return _Views.of(pair, (jacobian[:, :2], jacobian[:, 2:]))
+        return _Views.of(pair, (jacobian[:, :2], jacobian[:, 2:]), sigma)
 
     if deviations is None:
         some = np.linspace(0, len(good) - 1, min(len(good), _MOST_FOR_LEARNING)).astype(int)
@@ -143,15 +168,16 @@ class _Views:
 
     measure : (M, 6, 9) linear map from the nine moments A A^T of a body to g0, g1, g2 of its first
     outline and of its second, in the unit circles of the measured ones. noise : two (M,), variance
-    of g1. ellipses : the pair in mm.
+    of g1. ellipses : the pair in mm. rim_excess : (M,) of `rim_excess`.
     """
 
     measure: Array
     noise: tuple[Array, Array]
     ellipses: silhouette.EllipsePair
+    rim_excess: Array
 
     @staticmethod
-    def of(pair: tuple[Outlines, Outlines], jacobians: tuple[Array, Array]) -> _Views:
+    def of(pair: tuple[Outlines, Outlines], jacobians: tuple[Array, Array], sigma: Array) -> _Views:
         inverse = [np.linalg.inv(o.axes_px) for o in pair]
         noise = [
             np.einsum("mij,mjk,mik->m", a, o.covariance_px2, a) / 2 for a, o in zip(inverse, pair)
@@ -163,13 +189,25 @@ class _Views:
             parts += [(uu + vv) / 4, (uu - vv) / 4, uv / 2]
         measure = np.stack(parts, 1).reshape(-1, 6, 9)
         ellipses = silhouette.ellipse_pair(jacobians, (pair[0].axes_px, pair[1].axes_px))
-        return _Views(measure, (noise[0], noise[1]), ellipses)
+        return _Views(measure, (noise[0], noise[1]), ellipses, rim_excess(pair, sigma))
+
+    def extents(self) -> tuple[Array, Array]:
+        """(M,) log ratio of the extents along the shared coordinate, the variance that noise gives
+        it: along one direction a displacement is g0 plus a unit combination of g1 and g2, 3/2 v."""
+        first, second = (np.log(m[..., 0, 0]) / 2 for m in self.ellipses.moments_mm2)
+        return first - second, 1.5 * (self.noise[0] + self.noise[1])
 
     def precision(self, deviations: Deviations) -> Array:
-        """(M, 6) inverse variances of the deviations g of both outlines."""
-        excess2 = deviations.excess**2
-        each = [1 / (n + excess2)[:, None] * np.array([2.0, 1.0, 1.0]) for n in self.noise]
-        return np.concatenate(each, -1)
+        """(M, 6, 6) inverse covariance of the deviations g of both outlines.
+
+        Extents that contradict each other show errors that were not stated, as of an outline that
+        is partly another bubble's.
+        """
+        ratio, variance = self.extents()
+        contradicted = ratio**2 > _CONTRADICTION**2 * (variance + 3 * deviations.excess**2)
+        noise = np.stack(self.noise, -1) + np.where(contradicted, ratio**2 / 3, 0.0)[:, None]
+        noise = np.repeat(noise, 3, -1)
+        return np.linalg.inv(noise[:, None, :] * _WHITE + deviations.excess**2 * _BODY)
 
     def deviation(self, moments: Array) -> Array:
         """(M, 6) g of both outlines for bodies of these moments A A^T (M, 3, 3), or (M, 6, k) for k
@@ -247,9 +285,9 @@ def _fit(views: _Views, start: tuple[Array, Array, Array], deviations: Deviation
         moments = _moments(frame[live], value[live])
         miss, certain = _ROUND - some.deviation(moments), weight[live]
         slope = some.deviation(_tangents(frame[live], moments))
-        normal = slope.mT @ (certain[..., None] * slope) + np.diag(prior)
-        covariance[live] = np.linalg.inv(normal)
-        right = (slope.mT @ (certain * miss)[..., None])[..., 0]
+        weighted = slope.mT @ certain
+        covariance[live] = np.linalg.inv(weighted @ slope + np.diag(prior))
+        right = (weighted @ miss[..., None])[..., 0]
         right[:, 1] -= prior[1] * value[live, 1]
         right[:, 4:] -= prior[4:] * value[live, 2:]
         step = np.clip((covariance[live] @ right[..., None])[..., 0], -0.5, 0.5)
@@ -262,7 +300,7 @@ def _fit(views: _Views, start: tuple[Array, Array, Array], deviations: Deviation
         if not len(live):
             break
     miss = _ROUND - views.deviation(_moments(frame, value))
-    cost = (weight * miss**2).sum(-1) + (prior[4:] * value[:, 2:] ** 2).sum(-1)
+    cost = np.einsum("mi,mij,mj->m", miss, weight, miss) + (prior[4:] * value[:, 2:] ** 2).sum(-1)
     return _Fit(frame, value, covariance, cost)
 
 
@@ -313,6 +351,13 @@ def _best(views: _Views, deviations: Deviations, up: Array) -> Spheroids:
     blur = _NEAR_SPHERE * chosen.covariance[:, 1, 1] / np.maximum(aspect**2, 1e-12)
     covariance[:, 1, 1] += np.minimum(blur, 1.0) ** 2 * aspect**2
     covariance[:, [2, 3], [2, 3]] += np.minimum(blur, 1.0)[:, None] ** 2
+    # a rim reaches farther than the body's mean surface, by an amount as uncertain as it is large
+    covariance[:, 0, 0] += views.rim_excess**2
+    # what t is left open makes the expected moments of the equator larger than those at its mean
+    unseen = np.trace(chosen.covariance[:, 4:, 4:], axis1=1, axis2=2)
+    wider = np.array([2 / 3, 1.0]) * unseen[:, None]
+    covariance[:, :2, :2] += 2 * wider[:, :, None] * wider[:, None, :]
+    size, aspect = size - views.rim_excess - wider[:, 0], aspect - wider[:, 1]
     chi2 = np.min([_spheroid_misfit(views, f, deviations)[0] for f in fits[:2]], 0)
     return Spheroids(
         2 * np.exp(size), np.exp(aspect), chosen.frame[:, :, 2], chosen.frame, covariance, chi2
@@ -337,11 +382,12 @@ def _spheroid_misfit(views: _Views, fit: _Fit, deviations: Deviations) -> tuple[
     changes = _tangents(fit.frame, moments)
     slope = views.deviation(changes)
     body, odd = slope[..., :4], slope[..., 4:]
-    normal = np.linalg.inv(body.mT @ (weight[..., None] * body) + np.diag(_LOOSE))
+    normal = np.linalg.inv(body.mT @ weight @ body + np.diag(_LOOSE))
 
     def left(part: Array) -> Array:
-        solved = body @ (normal @ (body.mT @ (weight[..., None] * part)))
-        return np.asarray((weight[..., None] * part * (part - solved)).sum((-1, -2)))
+        weighted = weight @ part
+        rest = part - body @ (normal @ (body.mT @ weighted))
+        return np.asarray((weighted * rest).sum((-1, -2)))
 
     return left(miss[..., None]), left(odd)
 
@@ -355,13 +401,12 @@ def learn_deviations(views: _Views, up: Array) -> Deviations:
     count = len(views.noise[0])
     if count < _LEAST_FOR_LEARNING:
         return Deviations(pairs=count)
-    extents = [np.log(m[..., 0, 0]) / 2 for m in views.ellipses.moments_mm2]
-    # along one direction the displacement is g0 plus a unit combination of g1 and g2: 3/2 v
-    noise = 1.5 * (views.noise[0] + views.noise[1])
-    excess2 = _excess_variance((extents[0] - extents[1]) ** 2, noise, np.full(count, 3.0))
+    ratio, noise = views.extents()
+    excess2 = _excess_variance(ratio**2, noise, np.full(count, 3.0))
     excess = float(np.sqrt(max(excess2, _LEAST_EXCESS**2)))
     strict, rough = Deviations(1e-5, excess, count), Deviations(excess=excess)
-    fits = [_fit(views, start, strict) for start in _starts(views.ellipses)]
+    # a prolate body on its side would explain any t of an upright one
+    fits = [_fit(views, start, strict) for start in _starts(views.ellipses)[:2]]
     misfits = [_spheroid_misfit(views, f, rough) for f in fits]
     better = np.argmin([m[0] + _unusual(f, up) for m, f in zip(misfits, fits)], 0)
     chi2, gain = (np.choose(better, [m[i] for m in misfits]) for i in range(2))

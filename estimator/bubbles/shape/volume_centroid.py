@@ -331,7 +331,7 @@ def fit_bodies(
     Raises InputError for tables of unequal length or a shape_sigma that is not positive.
     """
     outlines = _paired(first, second, cameras)
-    sigma = _learned_sigma(outlines) if shape_sigma is None else _checked_sigma(shape_sigma)
+    sigma = learned_sigma(outlines) if shape_sigma is None else _checked_sigma(shape_sigma)
     located = outlines[0].located & outlines[1].located
     bodies = _empty(len(located))
     _fill_points(bodies, outlines, cameras, located)
@@ -355,7 +355,7 @@ def estimate_shape_sigma(
     Empirical Bayes: the mean square of the outlines' third and fourth harmonics, less their noise,
     with a little of `DEFAULT_SHAPE_SIGMA`. Raises InputError for tables of unequal length.
     """
-    return _learned_sigma(_paired(first, second, cameras))
+    return learned_sigma(_paired(first, second, cameras))
 
 
 def _paired(
@@ -383,7 +383,8 @@ def _checked_sigma(shape_sigma: ArrayLike) -> Array:
     return np.broadcast_to(sigma, (2,))
 
 
-def _learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
+def learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
+    """`estimate_shape_sigma` of outlines."""
     whole = outlines[0].whole & outlines[1].whole
     out = []
     for degree, part, default in zip((3, 4), (slice(2, 4), slice(4, 6)), DEFAULT_SHAPE_SIGMA):
@@ -605,6 +606,27 @@ def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
     return np.asarray(np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 2)))
 
 
+_RIM_EXCESS = (15.3, 37.4)
+"""How much larger than the volume's the outlines' size is, over the variances of the shape's
+coefficients of degree 3 and 4: a rim is where the body reaches farthest (decision 037)."""
+_RUN_SHARE = 2.0  # harmonics' worth of the run's variances against a bubble's own four
+
+
+def rim_excess(pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
+    """(M,) log of the outlines' size over the volume's, by the third and fourth harmonics.
+
+    sigma : (2,) of the run. Its standard deviation is as large as itself. 0 where no harmonics are
+    known.
+    """
+    excess = np.zeros(len(pair[0].uv_px))
+    whole = pair[0].whole & pair[1].whole
+    for k, part, factor in zip(range(2), (slice(2, 4), slice(4, 6)), _RIM_EXCESS):
+        own = np.sum([2 * _variance(o, 3 + k, part) for o in pair], 0)
+        variance = (_RUN_SHARE * sigma[k] ** 2 + own) / (_RUN_SHARE + 4)
+        excess += factor * np.where(whole, np.maximum(variance, 0), 0.0)
+    return excess
+
+
 def _diameter(
     shapes: _Ellipsoids, pair: tuple[Outlines, Outlines], sigma: Array
 ) -> tuple[Array, Array]:
@@ -612,11 +634,11 @@ def _diameter(
 
     Three things are open: the coupling of the viewing directions (the mean of the most spherical
     ellipsoid and the oblate spheroid is taken), the fourth degree's share of the ellipses, and the
-    outlines' noise.
+    outlines' noise. The rims' excess is taken off.
     """
     logs = [np.log(np.linalg.det(m)) / 6 for m in (shapes.moments_mm2, shapes.oblate_mm2)]
     unseen = np.hypot((logs[1] - logs[0]) / 2, shapes.coupling_sigma**2 / np.sqrt(18))
-    diameter = 2 * np.exp((logs[0] + logs[1]) / 2)
+    diameter = 2 * np.exp((logs[0] + logs[1]) / 2 - rim_excess(pair, sigma))
     relative2 = (
         unseen**2 + 0.8 * sigma[1] ** 2 + (30 * sigma[0] ** 2) ** 2 + _relative_noise2(pair) / 8
     )

@@ -123,6 +123,33 @@ def test_errors_are_as_large_as_stated(low: float, high: float, triaxial: float)
         assert found.chi2.mean() > 5  # two views refute the spheroid
 
 
+def test_an_unequal_equator_does_not_make_bubbles_larger() -> None:
+    """Without the correction 2/3 of the variance of t: 0.001."""
+    rng = np.random.default_rng(6)
+    _, moments = bodies(rng, np.full(1500, 1.6), 10.0, 0.04)
+    found, known = fitted(moments, rng, 0.001)
+    off = np.log(found.d_eq_mm / 4.0)
+    assert known.triaxial == pytest.approx(0.04, rel=0.1)
+    assert abs(off.mean()) < 2e-4
+
+
+def test_outlines_that_contradict_each_other_are_stated_to_be_wrong() -> None:
+    rng = np.random.default_rng(8)
+    _, moments = bodies(rng, np.full(200, 1.5), 20.0, 0.01)
+    rig = cameras()
+    tables = [table(moments, SCALE * c.camera_from_rig.rotation[:2], rng, 0.001) for c in rig]
+    spoilt = np.arange(0, 200, 67)
+    tables[1].loc[spoilt, ["a_px", "b_px"]] *= 1.05
+    found, known = fit_spheroids(
+        paired_outlines(tables[0], tables[1], rig), np.zeros((200, 3)), rig, UP
+    )
+    sd, wrong = np.sqrt(found.covariance[:, 0, 0]), np.isin(np.arange(200), spoilt)
+    off = np.abs(np.log(found.d_eq_mm / 4.0)) / sd
+    assert np.median(sd[wrong]) > 0.01 and np.median(sd[~wrong]) < 0.0015
+    assert off[wrong].max() < 3
+    assert known.triaxial == pytest.approx(0.01, rel=0.3)
+
+
 def test_a_prolate_bubble_that_rises_along_its_axis_is_not_taken_for_a_coin() -> None:
     rng = np.random.default_rng(3)
     _, moments = bodies(rng, np.full(300, 0.75), 15.0, 0.005)

@@ -207,7 +207,8 @@ class _Views:
         contradicted = ratio**2 > _CONTRADICTION**2 * (variance + 3 * deviations.excess**2)
         noise = np.stack(self.noise, -1) + np.where(contradicted, ratio**2 / 3, 0.0)[:, None]
         noise = np.repeat(noise, 3, -1)
-        return np.linalg.inv(noise[:, None, :] * _WHITE + deviations.excess**2 * _BODY)
+        covariance = noise[:, None, :] * _WHITE + deviations.excess**2 * _BODY
+        return np.asarray(np.linalg.inv(covariance))
 
     def deviation(self, moments: Array) -> Array:
         """(M, 6) g of both outlines for bodies of these moments A A^T (M, 3, 3), or (M, 6, k) for k

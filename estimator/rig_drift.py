@@ -587,6 +587,7 @@ _FAR_SIGMAS = 6.0
 _OUTLIER_SIGMAS = 4.5
 _LEAST = 4
 """With fewer frames in a run, or fewer pairs in a stretch, nothing is estimated."""
+_MOST_COLLECTED = 100_000
 _MOST_ROWS = 520
 _MOST_STRETCHES = 10
 _STRETCH_S = 2.0
@@ -597,16 +598,32 @@ _SHAPE_PX = 0.02
 
 
 class PairCollector:
-    """Collects the reliable pairs of a run while it is tracked, and estimates a movement."""
+    """Collects the reliable pairs of a run while it is tracked, and estimates a movement.
+
+    Of a long run it keeps the pairs of every second, fourth, ... frame, since `stretches` use no
+    more than some thousand of all.
+    """
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self.parts: list[pd.DataFrame] = []
+        self.every, self.first = 1, 0
 
     def add(self, tracks: pd.DataFrame) -> None:
         """Add the reliable pairs of a part of the tracks."""
+        import pandas as pd
+
         names = pair_columns([c.name for c in self.calibration.cameras])
-        self.parts.append(tracks.loc[_reliable(tracks), [n for n in names if n in tracks]])
+        found = tracks.loc[_reliable(tracks), [n for n in names if n in tracks]]
+        if not self.parts and len(found):
+            self.first = int(found["frame"].iloc[0])
+        self.parts.append(self._thinned(found))
+        if sum(map(len, self.parts)) > _MOST_COLLECTED:
+            self.every *= 2
+            self.parts = [self._thinned(pd.concat(self.parts, ignore_index=True))]
+
+    def _thinned(self, pairs: pd.DataFrame) -> pd.DataFrame:
+        return pairs[(pairs["frame"] - self.first) % self.every == 0]
 
     def found(self) -> RigChange | None:
         """Return the movement that all collected pairs give, or None if there are too few."""

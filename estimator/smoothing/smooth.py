@@ -30,6 +30,7 @@ from telerig.estimator.smoothing.learning.window import MOST_FRAMES
 from telerig.estimator.smoothing.phases import Phases
 from telerig.estimator.smoothing.pieces import Constants, Piece, pieces_of, solved_pieces
 from telerig.estimator.smoothing.problem.problem import (
+    Bubble,
     Observations,
     ShakeModel,
     SmoothingProblem,
@@ -512,9 +513,10 @@ def problem_of(
         positions = np.interp(at_frames, record.t_s, record.position_mm)
     marks, seen, found = references_of(references, cameras, at_frames, positions, axis)
     findings += found
-    bubbles = () if tracked is None else bubbles_of(tracked, positions, axis)
+    bubbles: tuple[Bubble, ...] = ()
     share = None
     if tracked is not None:
+        bubbles, tracked = bubbles_of(tracked, positions, axis), replace(tracked, places=[])
         points = tracked.sample[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         some = points[np.linspace(0, len(points) - 1, min(len(points), 200)).astype(int)]
         step = len(tracked.observations) // _MOST_PIXELS + 1

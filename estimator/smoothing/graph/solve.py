@@ -46,7 +46,7 @@ Progress = Callable[[str, float], None]
 T = TypeVar("T")
 
 _CLOCK_PASSES = 6
-_OUTLIER_SIGMAS, _SUSPICIOUS_SIGMAS = 4.0, 5.0
+_OUTLIER_SIGMAS, _SUSPICIOUS_SIGMAS, _FALSE_ALARMS = 4.0, 5.0, 0.05
 _LEAST_KEPT = 0.7
 _SAMPLE_OUTLIER, _SAMPLE_SUSPICIOUS, _BACK = 12.0, 20.0, 0.9
 _PEAK_SAMPLES, _DISPUTED = 8, 3
@@ -217,15 +217,16 @@ def _solve(
         if done > options.passes + rejection.rounds and not moving:
             break
         progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
-        last = made = _linear_solve(graph, state, weights, samples)
-        leap = 0.0 if exact else made.largest_px
-        state = moved(graph, state, made.done.vector)
+        last = None  # two passes at a time would double the memory
+        last = _linear_solve(graph, state, weights, samples)
+        leap = 0.0 if exact else last.largest_px
+        state = moved(graph, state, last.done.vector)
         residuals = pixel_residuals(graph, state)
         samples, changed = rejection.update(samples, sample_residuals(graph, state))
         fresh = weights
         if not changed:
             fresh, changed = robust.update(weights, residuals)
-        still = made.largest_px < options.tolerance_px and not delays_have_moved(graph, state)
+        still = last.largest_px < options.tolerance_px and not delays_have_moved(graph, state)
         if (still or exact) and not changed and (done > 1 or start is not None or exact):
             break
         weights = fresh
@@ -455,7 +456,8 @@ def _frame_basis(graph: GraphLayout, frame: Ints) -> Array:
 class Truncation:
     """Truncated least squares by graduated non-convexity (Yang et al., RA-L 5:1127, 2020).
 
-    Nothing is touched as long as no residual is suspicious.
+    Nothing is touched as long as no residual is suspicious: larger than those of normal noise are,
+    but for one in twenty runs, however many pixels these have.
     """
 
     def __init__(self, wanted: bool) -> None:
@@ -471,8 +473,10 @@ class Truncation:
         """
         squares = [(r**2).sum(-1) for r in residuals]
         largest = max((float(s.max(initial=0.0)) for s in squares), default=0.0)
-        bound = _OUTLIER_SIGMAS**2
-        if not self.wanted or (self.control == 0 and largest < _SUSPICIOUS_SIGMAS**2):
+        bound, count = _OUTLIER_SIGMAS**2, sum(map(len, squares))
+        # of two components the square exceeds s with probability exp(-s / 2)
+        suspicious = max(_SUSPICIOUS_SIGMAS**2, 2 * np.log(max(count, 1) / _FALSE_ALARMS))
+        if not self.wanted or (self.control == 0 and largest < suspicious):
             return weights, False
         if self.control == 0:
             self.control = bound / max(2 * largest - bound, bound)

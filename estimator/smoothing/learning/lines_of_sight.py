@@ -19,7 +19,8 @@ from telerig.estimator.smoothing.problem.problem import Observations, SmoothingP
 from telerig.factors.measurements import image_of_point
 
 MOST_BUBBLES = 6
-"""So many bubbles, those seen longest, are what the rig's shake is learned from."""
+"""So many bubbles, those seen longest, are what the rig's shake is learned from, or all that are
+seen nearly always: their mean and their differences cost as much as two bubbles."""
 _PARALLEL = 0.02
 _ACROSS = 0.2
 PRESENT = 0.75
@@ -91,30 +92,30 @@ def _signed(direction: Array) -> Array:
     return np.asarray(direction * np.sign(direction[np.abs(direction).argmax()]))
 
 
-def signals_of(
-    problem: SmoothingProblem,
-    weights: tuple[Array, Array] | None = None,
-    *,
-    fixed: bool = False,
-    most_bubbles: int = MOST_BUBBLES,
-) -> tuple[Signal, ...]:
-    """Return the problem's signals, of the bubbles that were seen longest and all marks.
+def signals_of(problem: SmoothingProblem, *, fixed: bool = False) -> tuple[Signal, ...]:
+    """Return the problem's signals, of its marks and of the bubbles that are learned from.
 
-    weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. fixed : the
-    tracks are those of a target at rest.
+    fixed : the tracks are those of a target at rest.
     """
-    bubbles, marks = problem.observations, problem.references
-    if weights is not None:
-        bubbles, marks = bubbles.of(weights[0] > 0.5), marks.of(weights[1] > 0.5)
-    seen = np.bincount(bubbles.item, minlength=len(problem.bubbles))
-    chosen = np.sort(np.argsort(-seen, kind="stable")[:most_bubbles])
-    position = problem.encoder_mm
+    chosen, position = _chosen(problem, fixed), problem.encoder_mm
     out = []
     for direction, cameras in sight_directions(problem):
-        parts = [_bubble_rows(problem, bubbles, chosen, position, direction, cameras)]
-        parts.append(_mark_rows(problem, marks, len(chosen), position, direction, cameras))
+        parts = [
+            _bubble_rows(problem, problem.observations, chosen, position, direction, cameras),
+            _mark_rows(problem, problem.references, len(chosen), position, direction, cameras),
+        ]
         out.append(_signal(problem, direction, cameras, parts, chosen, fixed))
     return tuple(out)
+
+
+def _chosen(problem: SmoothingProblem, fixed: bool) -> Ints:
+    """Return the bubbles that were seen longest, or, where they are `pooled`, all of these."""
+    seen = np.zeros((len(problem.bubbles), len(problem.cameras)), np.int64)
+    np.add.at(seen, (problem.observations.item, problem.observations.camera), 1)
+    present = np.flatnonzero(seen.min(1) >= PRESENT * len(problem.t_s))
+    if len(present) > MOST_BUBBLES and not (fixed or problem.marks):
+        return present
+    return np.sort(np.argsort(-seen.sum(1), kind="stable")[:MOST_BUBBLES])
 
 
 _Rows = tuple[Ints, Ints, Ints, Array, Array]

@@ -16,6 +16,7 @@ from telerig.estimator import rig_drift
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator import rig_drift
 from telerig.estimator.rig_drift import (
     DriftPrior,
     Noise,
@@ -307,6 +308,25 @@ def test_words_say_it_once() -> None:
     assert "--refine-rig" in said["words"][-1] and "positions are off" in said["words"][-1]
     assert with_change(model, still.found(), known)["words"] == model.sentences()
     assert PairCollector(known).found() is None
+
+
+def test_a_long_run_is_collected_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig_drift, "_MOST_COLLECTED", 400)
+    cameras, known = rig(), calibration(rig())
+    true = along_perpendicular(cameras, 0.08, 0, 0)
+    tracks = Run(frames=1500, rate_hz=500.0).tracks(
+        cameras, moved(cameras, true), np.random.default_rng(12)
+    )
+    pairs = PairCollector(known)
+    for first in range(0, len(tracks), 50):
+        pairs.add(tracks.iloc[first : first + 50])
+        assert sum(map(len, pairs.parts)) <= 400
+    kept = np.concatenate([part["frame"] for part in pairs.parts])
+    assert np.array_equal(kept, np.arange(0, 1500, 4))
+    found, every = pairs.found(), rig_change(tracks, known)
+    assert found is not None and every is not None and found.moved
+    assert np.all(np.abs(found.values - [0.08, 0, 0]) < 3 * found.sigmas)
+    assert np.all(found.sigmas < 1.5 * every[0].sigmas)
 
 
 def test_numbers_are_cut_where_their_deviation_has_two_digits() -> None:

@@ -14,6 +14,7 @@ from telerig.estimator.smoothing.graph.layout import GraphLayout, State
 from telerig.estimator.smoothing.graph.solve import (
     Options,
     Solution,
+    Truncation,
     _check_converged,
     drawn,
     solve,
@@ -108,6 +109,19 @@ def test_so_many_outliers_are_none() -> None:
     share = np.where(np.arange(len(solution.weights[1])) % 10 < 8, 0.0, 1.0)
     found = found_in(replace(solution, weights=(solution.weights[0], share)))
     assert any(o.source == "marks" and o.test == Disagreement.OUTLIERS for o in found)
+
+
+def test_normal_noise_of_many_pixels_has_no_outliers() -> None:
+    """The largest of a million is above five standard deviations, and is none."""
+    rng, weights = np.random.default_rng(8), (np.ones(1_000_000), np.zeros(0))
+    touched = 0
+    for _ in range(10):
+        residuals = (rng.standard_normal((len(weights[0]), 2)), np.zeros((0, 2)))
+        touched += Truncation(True).update(weights, residuals)[1]
+    assert touched <= 3  # one in twenty is expected
+    residuals[0][7] = [6.5, 0.0]
+    (fresh, _), changed = Truncation(True).update(weights, residuals)
+    assert changed and fresh[7] < fresh[:7].min()
 
 
 @pytest.mark.parametrize(("rise", "word"), [(-50.0, "sink"), (0.0, "hover"), (50.0, "")])

@@ -90,6 +90,16 @@ def test_mean_and_differences_of_alike_bubbles_have_the_whole_likelihood() -> No
     )
 
 
+def test_all_bubbles_are_learned_from_where_they_cost_as_much_as_two() -> None:
+    rng = np.random.default_rng(9)
+    seen, _, _ = run(rng, bubbles=10, seconds=0.5)
+    half, _, _ = run(rng, bubbles=10, seconds=0.5, kept=0.5)
+    marked, _, _ = run(rng, bubbles=10, seconds=0.5, marks=1)
+    for problem, count in ((seen, 10), (half, 6), (marked, 6)):
+        assert [int(s.moving.sum()) for s in signals_of(problem)] == [count] * 3
+    assert [len(pooled(signal)) for signal in signals_of(seen)] == [2] * 3
+
+
 def test_density_integrates_to_the_variance() -> None:
     f = np.arange(0.01, 1000, 0.02)
     for part in (oscillator(0.3, 8, 0.05), driven_mode(0.3, 8, 0.05), broad_band(0.3)):

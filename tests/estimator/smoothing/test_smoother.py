@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from scipy.linalg import expm
 
 from telerig.estimator.smoothing.graph import layout
+from telerig.estimator.smoothing.graph import solve as solver
 from telerig.estimator.smoothing.graph.layout import graph_layout
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.problem.problem import (
@@ -361,3 +363,23 @@ def test_the_path_is_found_among_other_processes_of_a_bubble(
     np.testing.assert_array_equal(found.path_position, [0, 3, 6])
     assert all(found.position[axis, 3 * axis] == 1 for axis in range(3))
     np.testing.assert_array_equal(found.velocity[:, found.path_velocity], np.eye(3))
+
+
+def test_a_pass_is_freed_before_the_next(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An outlier takes several passes, each of which may fill the memory."""
+    given, made, alive = problem(rng), list[weakref.ref[Any]](), list[int]()
+
+    def counted(*arguments: Any) -> Any:
+        alive.append(sum(one() is not None for one in made))
+        found = of_graph(*arguments)
+        made.append(weakref.ref(found))
+        return found
+
+    of_graph = solver._linear_solve
+    monkeypatch.setattr(solver, "_linear_solve", counted)
+    given.observations.uv_px[5] += 20.0
+    found = solve(given, MODEL)
+    assert found.weights[0][5] == 0
+    assert len(alive) > 2 and not any(alive)

@@ -1,13 +1,15 @@
 """How does the cost of smoothing grow with frames and with bubbles in sight?
 
 Usage: python benchmarks/smoothing_many.py [--frames 1000,3000,10000] [--bubbles 5,10,20,40]
-       [--tracks 50,250,500] [--against-joint] [--seeds 3] [--out FILE.md]
+       [--tracks 50,250,500] [--against-joint] [--across 0,0.03,0.12] [--seeds 3] [--out FILE.md]
 `telerig.smooth` on a table of tracks, images alone, modes learned: processor seconds by phase and
 peak memory, a process for each case, one thread. All frames with 20 bubbles, all numbers of bubbles
 with 1,000 frames, 40 bubbles with the middle number of frames, and 2,000 frames with 20 bubbles in
 sight whose tracks last so many frames in the mean.
 --against-joint: instead, estimates and standard deviations against those of the joint graph, 20
 bubbles in 400 frames with the true modes.
+--across: instead, 1,000 frames with 5 and with 20 bubbles, modes learned, in which the rig shakes
+by so many mm across the vertical (0.2 mm along it).
 """
 
 from __future__ import annotations
@@ -62,10 +64,12 @@ def table_of(problem: SmoothingProblem) -> pd.DataFrame:
 
 
 def tracked(
-    rng: np.random.Generator, frames: int, bubbles: int, track: int
+    rng: np.random.Generator, frames: int, bubbles: int, track: int, across_mm: float = 0.0
 ) -> tuple[SmoothingProblem, Array]:
     """A problem and the true places (rows, 3); ``track`` frames a track in the mean, 0 for all."""
-    problem, lab, _ = crowded(rng, bubbles=bubbles, seconds=frames / RATE_HZ, rate_hz=RATE_HZ)
+    problem, lab, _ = crowded(
+        rng, bubbles=bubbles, seconds=frames / RATE_HZ, rate_hz=RATE_HZ, across_mm=across_mm
+    )
     if not track:
         return problem, lab.reshape(-1, 3)
     cut = with_comings_and_goings(problem, rng, track)
@@ -75,10 +79,12 @@ def tracked(
     )
 
 
-def measured(frames: int, bubbles: int, track: int) -> dict[str, Any]:
-    """Processor seconds by phase, peak memory of this process in GB, errors (um) and NEES."""
-    rng = np.random.default_rng(1)
-    problem, lab = tracked(rng, frames, bubbles, track)
+def measured(
+    frames: int, bubbles: int, track: int, seed: int = 1, across_um: int = 0
+) -> dict[str, Any]:
+    """Processor seconds by phase, peak memory of this process in GB, errors and sd (um), NEES."""
+    rng = np.random.default_rng(seed)
+    problem, lab = tracked(rng, frames, bubbles, track, 1e-3 * across_um)
     short = simulate(Case(replace(SCENARIOS["S2"], frames=60)), rng)
     calibration = replace(short.inputs("one")["calibration"], cameras=CAMERAS)
     table = table_of(problem)
@@ -94,10 +100,30 @@ def measured(frames: int, bubbles: int, track: int) -> dict[str, Any]:
     found = smooth(table, calibration, t_s=problem.t_s, progress=progress).trajectories
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     off = found[["x_mm", "y_mm", "z_mm"]].to_numpy() - lab
-    nees = float(np.mean((off / found[["sx_mm", "sy_mm", "sz_mm"]].to_numpy()) ** 2))
-    um = (1e3 * np.sqrt((off**2).mean(0))).tolist()
-    return {"seconds": seconds, "total": sum(seconds.values()), "gb": peak, "first": first_line[0],
-            "um": um, "nees": nees}  # fmt: skip
+    sd = found[["sx_mm", "sy_mm", "sz_mm"]].to_numpy()
+    um, sd_um = ((1e3 * np.sqrt((a**2).mean(0))).tolist() for a in (off, sd))
+    nees = ((off / sd) ** 2).mean(0)
+    return {
+        "seconds": seconds, "total": sum(seconds.values()), "gb": peak, "first": first_line[0],
+        "um": um, "sd_um": sd_um, "nees_axes": nees.tolist(), "nees": float(nees.mean()),
+    }  # fmt: skip
+
+
+def across(millimetres: list[float], seeds: int) -> list[str]:
+    """Rows of a table: errors and standard deviations where the rig shakes across, too."""
+    lines = [
+        "| shake across, mm | bubbles | seed | RMS error x, y, z, um | sd, um | NEES x, y, z |",
+        "|---|---|---|---|---|---|",
+    ]
+    for mm in millimetres:
+        for bubbles in (5, 20):
+            for seed in range(1, seeds + 1):
+                one = in_a_process((1000, bubbles, 0, seed, round(1e3 * mm)))
+                um, sd = (", ".join(f"{v:.1f}" for v in one[n]) for n in ("um", "sd_um"))
+                nees = ", ".join(f"{v:.2f}" for v in one["nees_axes"])
+                lines.append(f"| {mm:g} | {bubbles} | {seed} | {um} | {sd} | {nees} |")
+                print(lines[-1], flush=True)
+    return lines
 
 
 def against_joint(seeds: int) -> list[str]:
@@ -138,7 +164,7 @@ def against_joint(seeds: int) -> list[str]:
     return lines
 
 
-def in_a_process(case: tuple[int, int, int]) -> dict[str, Any]:
+def in_a_process(case: tuple[int, ...]) -> dict[str, Any]:
     command = [sys.executable, __file__, "--case", ",".join(map(str, case))]
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     done = subprocess.run(
@@ -159,6 +185,7 @@ def main() -> None:
     parser.add_argument("--bubbles", default="5,10,20,40")
     parser.add_argument("--tracks", default="50,250,500")
     parser.add_argument("--against-joint", action="store_true")
+    parser.add_argument("--across", type=lambda a: [float(v) for v in a.split(",")])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--case")
     parser.add_argument("--out", type=Path)
@@ -166,7 +193,9 @@ def main() -> None:
     if args.case:
         print(json.dumps(measured(*map(int, args.case.split(",")))))
         return
-    if args.against_joint:
+    if args.across:
+        lines = ["# A rig that shakes across the vertical", "", *across(args.across, args.seeds)]
+    elif args.against_joint:
         lines = ["# The crowd's solution against the joint graph's", "", *against_joint(args.seeds)]
     else:
         frames, bubbles, tracks = (

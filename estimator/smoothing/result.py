@@ -415,7 +415,8 @@ def load_smoothing(folder: str | Path) -> Smoothing:
     """Read the files that `telerig smooth` or `Smoothing.save` wrote into a folder.
 
     Returns a `Smoothing` without ``solution``; its name is that of the folder. Without results.h5,
-    ``states`` is empty.
+    ``states`` is empty. Of a run that was smoothed in pieces, the tables are read from results.h5
+    when they are asked for.
     Raises InputError when trajectories.csv, shake.csv or smoothing.json is missing, when a file
     cannot be read, or when the files belong to different results.
     """
@@ -428,15 +429,19 @@ def load_smoothing(folder: str | Path) -> Smoothing:
     from telerig.io.results.smoothing import TRAJECTORIES, SmoothingFile, shake_columns
 
     place = Path(folder)
+    tables: Tables | StoredTables = StoredTables(place)
     names = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5", "bubbles.csv")
     with reading(place, names):
         record = SmoothingFile.read(place / "smoothing.json")
-        paths = read_table(place / names[0], TRAJECTORIES, extra=True, empty=True)
-        offsets = read_table(place / names[1], shake_columns(record.cameras), extra=True)
         file = place / "results.h5"
-        states = read_arrays(file, "states") if file.is_file() else {}
-        file = place / "bubbles.csv"
-        bodies = read_table(file, BUBBLES)[BODY_COLUMNS] if file.is_file() else None
+        if not (file.is_file() and StoredTables(place).of_pieces()):
+            states = read_arrays(file, "states") if file.is_file() else {}
+            paths = read_table(place / names[0], TRAJECTORIES, extra=True, empty=True)
+            offsets = read_table(place / names[1], shake_columns(record.cameras), extra=True)
+            file = place / "bubbles.csv"
+            bodies = read_table(file, BUBBLES)[BODY_COLUMNS] if file.is_file() else None
+            paths, offsets = (table.reset_index(drop=True) for table in (paths, offsets))
+            tables = Tables(paths, offsets, states, bodies)
     content = record.content()
     verdict = {name: content.pop(name) for name in record.VERDICT if name in content}
     try:
@@ -447,8 +452,6 @@ def load_smoothing(folder: str | Path) -> Smoothing:
             where=str(place / "smoothing.json"),
             todo=SmoothingFile.AGAIN,
         ) from error
-    paths, offsets = paths.reset_index(drop=True), offsets.reset_index(drop=True)
-    tables = Tables(paths, offsets, states, bodies)
     return Smoothing(verdict, content, model, tables, name=place.resolve().name)
 
 

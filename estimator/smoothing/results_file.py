@@ -179,6 +179,11 @@ class StoredTables:
         found = [part.bodies for part in self.parts() if part.bodies is not None]
         return pd.concat(found, ignore_index=True) if found else None
 
+    def of_pieces(self) -> bool:
+        """Return whether the file holds the tables of a run that was smoothed in pieces."""
+        with self._open() as file:
+            return set(TABLES) <= set(file) and np.size(file.attrs.get("rows_of_pieces")) > 1
+
     def sizes(self) -> tuple[int, int]:
         """Return the number of bubbles and of frames."""
         with self._open() as file:

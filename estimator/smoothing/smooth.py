@@ -17,7 +17,7 @@ from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
-from telerig.estimator.smoothing.graph.accelerations import accelerations_of
+from telerig.estimator.smoothing.graph.accelerations import LEARNED_ROWS, accelerations_of
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import carriage, travel_of
 from telerig.estimator.smoothing.learning.cross_validation import learning_record
@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from telerig.estimator.bubbles.shape.spheroid import Deviations
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.rig_drift import DriftPrior
+    from telerig.factors.bubble_motion import Inertia
     from telerig.io.dataset.run import RunData
     from telerig.io.rig_file.description import RigDescription
 
@@ -303,12 +304,13 @@ class _Run:
         """Smooth it piece by piece, each of which is written as it comes.
 
         Hyper-parameters that are not given are set by the piece in the middle, which is solved
-        again at the end for what the verdict takes from the middle of a run.
+        again at the end for what the verdict takes from the middle of a run. The low-pass of the
+        accelerations is that of the first piece with enough bubbles.
         """
         from telerig.estimator.smoothing.verdict.judge import judge
 
         problem, model, parts = self.problem, self.model, list[Evidence]()
-        deviations = swarm = None
+        deviations = swarm = inertia = moved = None
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
             middle = len(pieces) // 2
             if not self.given:
@@ -320,7 +322,10 @@ class _Run:
                 for piece, window, solution in solved_pieces(
                     problem, model, pieces, self.options, step, constants
                 ):
-                    widened = _with_accelerations(with_hyperparameter_uncertainty(solution))
+                    widened = with_hyperparameter_uncertainty(solution)
+                    widened = _with_accelerations(widened, inertia)
+                    if widened.accelerations and widened.graph.rows >= LEARNED_ROWS:
+                        inertia = widened.accelerations.inertia
                     span = Span(piece.own, piece.low, problem.t_s)
                     parts.append(Evidence.of(widened, drawn(widened), span))
                     paths, offsets = self._tables(piece, window, widened, span)
@@ -330,6 +335,7 @@ class _Run:
                     file.append(paths, offsets, states_of(widened, span), _beside(paths, bodies))
                     if piece == pieces[middle]:
                         deviations, swarm = found, self._swarm(widened, paths, bodies, span)
+                        moved = widened.accelerations
                     del solution, widened
                 with self.phases.phase("verdict", "judging the result"):
                     evidence = evidence_of(parts)
@@ -338,7 +344,8 @@ class _Run:
                             problem, model, pieces, self.options, _silent, constants, [middle]
                         )
                     )
-                    solution = _with_accelerations(with_hyperparameter_uncertainty(solution))
+                    solution = with_hyperparameter_uncertainty(solution)
+                    solution = replace(solution, accelerations=moved)
                     verdict = judge(window.problem, model, solution, evidence)
                 inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
                 file.widen(inflation)
@@ -363,11 +370,14 @@ class _Run:
         return paths, offsets
 
 
-def _with_accelerations(solution: Solution) -> Solution:
-    """The solution with accelerations, where there are bubbles and covariances."""
+def _with_accelerations(solution: Solution, inertia: Inertia | None = None) -> Solution:
+    """The solution with accelerations, where there are bubbles and covariances.
+
+    inertia : of the bubbles' forces; None to learn it.
+    """
     if not solution.graph.problem.bubbles or solution.covariances is None:
         return solution
-    return replace(solution, accelerations=accelerations_of(solution, drawn(solution)))
+    return replace(solution, accelerations=accelerations_of(solution, drawn(solution), inertia))
 
 
 def _beside(paths: pd.DataFrame, bodies: pd.DataFrame | None) -> pd.DataFrame | None:

@@ -63,17 +63,19 @@ def run(
     common_hz: float = COMMON_HZ,
     force_hz: float = 60.0,
     hidden_mm: float = 0.0,
+    across_mm: float = 0.0,
 ) -> tuple[SmoothingProblem, Array, Array]:
     """A problem, the truth (bubbles, F, 3) and the shake (2, F, 3); the stage stands still.
 
     marks : features of each camera fixed to the tank.  still : bubbles do not move either.
     kept : share of pixels that are not lost.  common_hz, force_hz : of the rig's shake.
     hidden_mm : RMS of one more line of the rig, of the same frequency as the bubbles'.
+    across_mm : RMS of the shake along x and z.
     """
     frames = round(seconds * rate_hz)
     t = np.arange(frames) / rate_hz
     shake = rig_shake(
-        1 / rate_hz, frames, rng, cameras=2, rms_mm=[0.0, shake_mm, 0.0],
+        1 / rate_hz, frames, rng, cameras=2, rms_mm=[across_mm, shake_mm, across_mm],
         frequency_hz=common_hz, arm_ratio=ARM_HZ / COMMON_HZ, force_hz=force_hz,
     ).offset_mm  # fmt: skip
     if hidden_mm > 0:

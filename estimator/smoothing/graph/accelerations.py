@@ -38,7 +38,7 @@ from telerig.factors.linear_factors import LinearFactors, product, transposed_pr
 from telerig.factors.state_space import Component
 
 _ROWS_AT_ONCE = 20_000
-_PIECE_FRAMES, _LEARNED_ROWS, _LEARNED_DRAWS = 150, 2400, 2
+_PIECE_FRAMES, LEARNED_ROWS, _LEARNED_DRAWS = 150, 2400, 2
 """The low-pass is learned from pieces of tracks of at most so many frames, so many together, and
 with so many draws of the rig."""
 _MOST_TRIALS = 40
@@ -49,16 +49,18 @@ _LOWEST_HZ, _FREQUENCIES, _ABOVE = 1e-2, 6000, 1e3
 """Of the spectra: the lowest frequency, their number, and the highest one over the low-pass's."""
 
 
-def accelerations_of(solution: Solution, draws: Draws) -> Accelerations | None:
+def accelerations_of(
+    solution: Solution, draws: Draws, inertia: Inertia | None = None
+) -> Accelerations | None:
     """Return the bubbles' accelerations at a solution; None without bubbles or covariances.
 
-    draws : at the solution.
+    draws : at the solution.  inertia : the low-pass; None to learn it.
     """
     graph, found = solution.graph, solution.covariances
     if found is None or not graph.rows:
         return None
     rig = _rig_errors(solution, draws)
-    inertia = _learned(solution, rig)
+    inertia = inertia or _learned(solution, rig)
     value, covariance = np.empty((graph.rows, 3)), np.empty((graph.rows, 3, 3))
     ends = graph.first_row[1:]
     portions = np.split(
@@ -206,7 +208,7 @@ def _learned(solution: Solution, rig: _RigErrors) -> Inertia:
         for a, b in pairwise(graph.first_row.tolist())
     ]
     pieces = [piece for cut in cuts for piece in cut]
-    count = min(len(pieces), -(-_LEARNED_ROWS * len(pieces) // graph.rows))
+    count = min(len(pieces), -(-LEARNED_ROWS * len(pieces) // graph.rows))
     chosen = np.unique(np.linspace(0, len(pieces) - 1, count).astype(int))
     some = [pieces[i] for i in chosen]
     few = (rig[0][..., :_LEARNED_DRAWS], rig[1][..., :_LEARNED_DRAWS])

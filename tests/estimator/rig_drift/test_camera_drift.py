@@ -16,7 +16,6 @@ from telerig.estimator import rig_drift
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator import rig_drift
 from telerig.estimator.rig_drift import (
     DriftPrior,
     Noise,

@@ -23,6 +23,7 @@ from telerig.estimator.smoothing.problem.problem import (
     ShakeModel,
     SmoothingProblem,
 )
+from telerig.estimator.smoothing.results_file import StoredTables
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
 
 Array = NDArray[np.float64]
@@ -169,6 +170,10 @@ def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
     for found, place in ((whole, tmp_path / "whole"), (parts, tmp_path / "parts")):
         found.save(place)
     again = telerig.load_smoothing(tmp_path / "parts")
+    assert isinstance(again.tables, StoredTables)
+    for name in ("trajectories", "shake"):
+        written = pd.read_csv(tmp_path / "parts" / f"{name}.csv")
+        pd.testing.assert_frame_equal(getattr(again, name), written, rtol=1e-8)
     np.testing.assert_array_equal(again.trajectories["x_mm"], parts.trajectories["x_mm"])
     assert set(again.states) == set(whole.states)
     np.testing.assert_array_equal(again.states["bubbles"], parts.states["bubbles"])

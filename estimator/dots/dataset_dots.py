@@ -86,9 +86,10 @@ def _described_otherwise(
 
 
 def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
-    """Number the target's dots among the measured ones; ``numbering.ambiguous`` may be True.
+    """Find out which dot of the target each measured dot of an image is.
 
-    Raises DetectionError if the dots cannot be numbered at all.
+    If several numberings fit equally well, one of them is returned and ``numbering.ambiguous`` is
+    True. Raises DetectionError if no numbering fits.
     """
     numbering = number_dots(measured.dots, target)
     rows = measured.dots.iloc[numbering.table["index"].to_numpy()][MEASURED]
@@ -101,10 +102,10 @@ def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
 
 
 def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
-    """Return (not raise) the error for a numbering that is not unique."""
+    """Return the error that the caller may raise for a numbering that is not unique."""
     found, wanted = len(numbering.marks_found), len(target.marks)
     hands = set(numbering.equivalent_handedness.tolist())
-    mirrored = "; some of them take the image for a mirrored one" if len(hands) > 1 else ""
+    mirrored = "; some of these need the image to be mirrored" if len(hands) > 1 else ""
     count = len(numbering.equivalents)
     return DetectionError(
         f"the {len(numbering.table)} dots can be numbered in {count} ways that fit the image about "
@@ -114,14 +115,18 @@ def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
 
 
 def rejected_table(measured: DotMeasurement, index: Any, reason: Any) -> pd.DataFrame:
-    """Return an image's rejected candidates: blobs, and dots at ``index`` for their reasons."""
+    """Return a table of the blobs and dots of an image that are not dots of the target.
+
+    index : positions in ``measured.dots`` of the dots that are rejected. reason : why, for each.
+    Returns the columns u_px, v_px, a_px, b_px, angle_rad and reason.
+    """
     dots = measured.dots.iloc[index].assign(reason=reason)[REJECTED]
     parts = [part for part in (measured.rejected, dots) if len(part)]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=REJECTED)
 
 
 REACH = 1.7
-"""Half the width of the patch in semi-major axes, to which 5 px are added."""
+"""Half the width of the example's patch is this many semi-major axes plus 5 px."""
 
 
 def dot_example(
@@ -168,7 +173,7 @@ def _with_levels(patch: Array, covered: Array, du: Array, dv: Array) -> Array:
 Progress = Callable[[int, int], None]
 
 MEGAPIXELS_FOR_WORKERS = 40
-"""Below this, starting fresh worker processes costs more than it saves."""
+"""Number of pixels below which starting worker processes takes longer than they save."""
 
 OVERLAY_WIDTH_PX = 900
 
@@ -177,11 +182,13 @@ NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
 
 @dataclass(frozen=True)
 class ImageDots:
-    """What was found in one image.
+    """What was found in one image of the target.
 
-    dots, rejected : see `TargetDetection`. handedness : +1; -1 if the image shows the target
-    mirrored; 0 if the target was not found. failure : why the image was left out, or "". overlay :
-    JPEG data of the image with dots and candidates, or empty.
+    dots, rejected : ``table`` and ``rejected`` of `TargetDetection`.
+    handedness : -1 if the image shows the target mirrored, +1 if not, 0 if no target was found.
+    failure : why the image was left out, or "".
+    notes : sentences for the user.
+    overlay : JPEG data of the image with the dots and rejected candidates drawn, or empty.
     """
 
     view: str
@@ -198,7 +205,8 @@ class ImageDots:
 class DatasetDots:
     """What was found in all images of a dataset, in the order of views and cameras.
 
-    dots, rejected : tables of all images, with view and camera. example : as `dot_example`.
+    dots, rejected : tables of all images, each row with its view and camera.
+    example : the fit of one typical dot, as `dot_example` returns it; empty without overlays.
     """
 
     dots: pd.DataFrame
@@ -216,12 +224,15 @@ def detect_dataset(
     overlays: bool = False,
     meanwhile: Callable[[], object] | None = None,
 ) -> DatasetDots:
-    """Detect the target in every calibration image of a dataset, by ``workers`` processes.
+    """Detect the target in every calibration image of a dataset.
 
-    progress : is called with (images done, images in all). overlays : draw the overlay of each
-    image, and fit one dot as an example. meanwhile : is called in this process while others work.
-    Raises InputError for images that cannot be read, DetectionError when no image shows the target
-    or when images contradict each other's handedness.
+    progress : is called with (number of images done, number of images).
+    workers : number of processes; None chooses it from the number of images.
+    overlays : whether to draw the overlay of each image, and to fit one dot as an example.
+    meanwhile : is called in this process while the worker processes detect.
+
+    Raises InputError for an image that cannot be read, and DetectionError if no image shows the
+    target or if some images are mirrored and others are not.
     """
     tasks = [(view, camera) for view in dataset.views for camera in view.image_paths]
     count = _workers(dataset, len(tasks)) if workers is None else workers
@@ -248,9 +259,10 @@ def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str
 
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:
-    """Read one image of a dataset and detect the target in it; the result may have a ``failure``.
+    """Read one image of a dataset and detect the target in it.
 
-    Raises InputError if the image cannot be read.
+    If the target is not found, ``failure`` of the result says why. overlay : whether to draw the
+    overlay. Raises InputError if the image cannot be read.
     """
     image = dataset.image(view, camera)
     found = _numbered_image(dataset, image, view, camera)
@@ -267,7 +279,7 @@ def _detect_task(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> Ima
 
 
 def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
-    """Put the results of all images together.
+    """Return the results of all images of a dataset as one.
 
     Raises DetectionError if no image shows the target, or if only some of them are mirrored.
     """
@@ -302,7 +314,10 @@ def _notes_once(found: list[ImageDots]) -> list[str]:
 
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
-    """Add the fit of a typical dot, the one with the median chi-square; its image is read."""
+    """Return the result with an example added: the fit of the dot with the median chi-square.
+
+    The image of this dot is read again.
+    """
     from telerig.estimator.dots.dataset_dots import dot_example
 
     order = np.argsort(detected.dots["chi2_dof"].to_numpy())

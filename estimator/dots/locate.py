@@ -67,7 +67,11 @@ _MOVED_SD = 0.1
 
 @dataclass(frozen=True)
 class DotMeasurement:
-    """The dots of one image, candidates that are no dots, the noise, and the polarity used."""
+    """What was measured in one image.
+
+    dots : as `locate_dots` returns them. rejected : the candidates that are no dots: u_px, v_px,
+    a_px, b_px, angle_rad, reason. noise : noise of the grey levels. polarity : of the dots.
+    """
 
     dots: pd.DataFrame
     rejected: pd.DataFrame
@@ -103,7 +107,10 @@ def measure_dots(
     min_diameter_px: float = 5.0,
     max_diameter_px: float = np.inf,
 ) -> DotMeasurement:
-    """Find dots like :func:`locate_dots`; return rejected candidates and the noise, too."""
+    """Find the dots of an image as `locate_dots` does, and return more about the image.
+
+    max_diameter_px : larger dots are rejected.
+    """
     grey = _checked(image, polarity, min_diameter_px)
     keep_freed_memory()
     response = high_pass(grey)

@@ -23,8 +23,10 @@ MOST_IMAGES = 6
 class TargetProposal:
     """What the images of one camera or several show.
 
-    cameras : name, (width, height) in px and scale in px/mm. pitch_px : the larger pitch, without
-    foreshortening, in the first camera. lines : of [target]. words : for the user.
+    cameras : for each camera its name, (width, height) in px and scale in px/mm.
+    pitch_px : distance of neighbouring dots in the first camera along the axis on which it is
+    larger, for a target that faces the camera.
+    lines : content of the table [target] of rig.toml. words : sentences for the user.
     """
 
     cameras: tuple[tuple[str, tuple[int, int], float], ...]

@@ -30,9 +30,13 @@ _CLIPPED_SHARE = 0.01
 class NoiseModel:
     """The variance of a pixel's grey level is ``alpha + beta * level``, in grey levels squared.
 
-    It is never less than that of rounding to ``step`` (0 for floats), nor less than at any level,
-    from lowest to highest, at which it was measured. relative_error : of the variance. black, white
-    : grey levels at which the image is clipped; infinite where it is not.
+    The variance is never less than that of rounding to whole steps, nor less than its smallest
+    value between ``lowest`` and ``highest``.
+
+    step : distance between grey levels; 0 for floats.
+    relative_error : relative standard deviation of the estimated variance.
+    lowest, highest : range of the grey levels at which the noise was measured.
+    black, white : grey levels at which the image is clipped; infinite where it is not.
     """
 
     alpha: float
@@ -45,7 +49,10 @@ class NoiseModel:
     white: float = np.inf
 
     def is_clipped(self, grey: Array, model: Array) -> Bools:
-        """Return where a pixel is clipped, or its expected level is within 2 sd of clipping."""
+        """Return which pixels are clipped, or expected within 2 standard deviations of clipping.
+
+        grey, model : measured and expected grey levels, of equal shape.
+        """
         reach = 2.0 * np.sqrt(self.variance(model))
         low = np.minimum(grey, model - reach) <= self.black
         return np.asarray(low | (np.maximum(grey, model + reach) >= self.white))
@@ -86,11 +93,14 @@ def with_inner_level(
 
 
 def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
-    """Return the factor by which the noise variance has to be multiplied.
+    """Return the factor by which an image's noise variance has to be multiplied.
 
-    chi2_dof, dof : (N,) of N fits. Images with many edges have few flat areas, but there the fits'
-    residuals show the noise: the median of chi2_dof is averaged with the estimate if both agree to
-    3 standard deviations. If not, the factor is 1; without flat areas it is the median.
+    An image with many edges has few flat areas from which the noise can be estimated, but the
+    residuals of the dots' fits show the noise as well. If both agree within 3 standard deviations,
+    the factor is their weighted mean. If they disagree, it is 1. Without flat areas it is the
+    median of chi2_dof.
+
+    chi2_dof, dof : (N,) chi-square per degree of freedom, and degrees of freedom, of N dots' fits.
     """
     if chi2_dof.size == 0:
         return 1.0
@@ -105,7 +115,11 @@ def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
 
 
 def grey_step(image: NDArray[np.generic]) -> float:
-    """Return the distance between grey levels, 0 for floats, 16 for 12 bits stored in 16."""
+    """Return the distance between neighbouring grey levels of an image.
+
+    It is 0 for an array of floats, and 16 for 12-bit levels that are stored in the upper bits of
+    16-bit numbers.
+    """
     if not np.issubdtype(image.dtype, np.integer):
         return 0.0
     levels = np.unique(image[:: max(1, image.shape[0] // 256)]).astype(np.int64)
@@ -113,7 +127,11 @@ def grey_step(image: NDArray[np.generic]) -> float:
 
 
 def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
-    """Return the sd of values (N,) around 0 without outliers, not quantised to grey levels."""
+    """Return the standard deviation about 0 of values (N,) without those beyond 3 sd.
+
+    Unlike the median of absolute values, it does not take only discrete values if the grey levels
+    are whole numbers. rounds : most iterations.
+    """
     sigma = float(np.std(values))
     for _ in range(rounds):
         kept = values[np.abs(values) <= _CLIP * sigma]
@@ -127,13 +145,21 @@ def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
 
 
 def high_pass(image: Float32) -> Float32:
-    """Return an image without what is locally a plane; white noise keeps its variance."""
+    """Return the image after a filter of second differences along both axes.
+
+    Grey levels that are locally a plane become 0; the variance of white noise stays the same.
+    """
     kernel = _SECOND_DIFFERENCES.astype(np.float32)
     return np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT))
 
 
 def rough_sigma(response: Float32) -> float:
-    """Return a first estimate of the noise: of the fifth of the 8 x 8 tiles that varies least."""
+    """Return a first estimate of the standard deviation of the noise.
+
+    The image is divided into 8 x 8 tiles, and the fifth of the tiles that vary least is used.
+
+    response : the image after `high_pass`.
+    """
     rows, columns = (n // 8 * 8 for n in response.shape)
     tiles = response[:rows, :columns].reshape(rows // 8, 8, columns // 8, 8)
     tiles = tiles[:: max(1, response.size // _MAX_SAMPLES)]

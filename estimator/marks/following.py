@@ -25,10 +25,12 @@ from telerig.rig.camera import Camera
 
 @dataclass(frozen=True)
 class TankView:
-    """Coordinates (2,) in mm along and across the travel that one camera sees.
+    """Coordinates of the tank as one camera sees it: (2,) in mm, along and across the travel.
 
-    basis : (2, 3) unit vectors in rig axes, perpendicular to the camera's middle ray. origin :
-    (3,).
+    axis_rig : (3,) direction of the stage's travel in rig axes.
+    basis : (2, 3) unit vectors of the coordinates in rig axes, perpendicular to the ray of the
+    image's middle.
+    origin : (3,) point of this ray in the rig frame, in mm.
     """
 
     camera: Camera
@@ -38,7 +40,10 @@ class TankView:
 
     @staticmethod
     def of(camera: Camera, axis_rig: Array) -> TankView:
-        """Return the view of a camera. Raises GeometryError for one that looks along the travel."""
+        """Return the coordinates for a camera.
+
+        Raises GeometryError for a camera that looks along the travel.
+        """
         width, height = camera.image_size_px
         origin, ray = camera.unproject(np.array([(width - 1) / 2, (height - 1) / 2]))
         along = axis_rig - ray * (axis_rig @ ray)
@@ -53,27 +58,33 @@ class TankView:
 
     @property
     def px_per_mm(self) -> float:
-        """Return the scale in the middle of the image."""
+        """The scale in px/mm in the middle of the image."""
         steps = self.origin + 1e-2 * np.concatenate([self.basis, -self.basis])
         uv = self.camera.project(steps)
         return float(np.sqrt(abs(np.linalg.det((uv[:2] - uv[2:]) / 2e-2))))
 
     @property
     def travel_px_per_mm(self) -> Array:
-        """Return the motion (2,) in px of the tank per mm of travel, in the image's middle."""
+        """How far the tank moves in the image, (2,) in px, per mm of travel, in its middle."""
         step_mm = 1e-3
         before, after = (self.origin + s * step_mm * self.axis_rig for s in (1, -1))
         return (self.camera.project(after) - self.camera.project(before)) / (2 * step_mm)
 
     def lab_mm(self, uv_px: Array, position_mm: float) -> Array:
-        """Return the places (n, 2) in the laboratory of pixels (n, 2)."""
+        """Return the places (n, 2) in mm on the tank of pixels (n, 2).
+
+        position_mm : position of the stage.
+        """
         if not len(uv_px):
             return np.zeros((0, 2))
         rig = self.camera.unproject(uv_px)[0] - self.origin
         return np.asarray((rig + self.axis_rig * position_mm) @ self.basis.T)
 
     def pixels(self, lab_mm: Array, position_mm: float) -> Array:
-        """Return the pixels (n, 2) of places (n, 2) in the laboratory."""
+        """Return the pixels (n, 2) of places (n, 2) in mm on the tank.
+
+        position_mm : position of the stage.
+        """
         if not len(lab_mm):
             return np.zeros((0, 2))
         across = lab_mm - self.basis @ self.axis_rig * position_mm
@@ -116,10 +127,13 @@ _TOO_MANY_LOST = 2
 
 @dataclass
 class Mark:
-    """A dot of the strip: its place (2,) in the lab in mm, and how often and where it was seen.
+    """A dot of the strip that is fixed to the tank.
 
-    epoch : of its following. low_px, high_px : (2,) range of its pixels. left_out : number of
-    frames without a measurement, by the reason.
+    number : a name of its own. place_mm : (2,) on the tank, see `TankView`.
+    epoch : index of the part of the run in which it is followed without a break.
+    last_frame : the last frame in which it was measured. sightings : number of such frames.
+    low_px, high_px : (2,) smallest and largest pixel coordinates at which it was measured.
+    left_out : number of frames in which it was not measured, by reason.
     """
 
     number: int
@@ -137,7 +151,7 @@ class Mark:
 
     @property
     def always_seen(self) -> bool:
-        """Whether it was seen whenever it was whole in the image."""
+        """Whether the dot was measured in every frame in which it was whole in the image."""
         return not self.left_out[HIDDEN]
 
 
@@ -151,7 +165,11 @@ class _Shift:
 
 
 class Follower:
-    """One camera's dots, frame by frame; margin_px from the border is the least for a whole dot."""
+    """Follows the dots of the strip through the frames of one camera.
+
+    diameter_mm : diameter of a dot. margin_px : least distance of a whole dot's centre from the
+    border of the image.
+    """
 
     def __init__(
         self, view: TankView, *, diameter_mm: float, margin_px: float, frame_count: int
@@ -172,7 +190,12 @@ class Follower:
     def add(
         self, frame: int, dots: DotSightings, position_mm: float | None
     ) -> list[tuple[int, int]]:
-        """Return (dot, mark's number) of a frame's dots that are marks. Frames come in order."""
+        """Take the dots of the next frame, and return which of them are which marks.
+
+        Frames have to come in order. dots : the n dots of the frame. position_mm : position of the
+        stage, None or NaN if unknown.
+        Returns pairs (index of the dot, number of the mark).
+        """
         known = position_mm is not None and bool(np.isfinite(position_mm))
         if known and position_mm is not None:
             self._held_mm = position_mm
@@ -197,7 +220,11 @@ class Follower:
         return self._new_marks(frame, place - predicted, dots, range(len(place)))
 
     def kept(self, *, moved: bool) -> list[Mark]:
-        """Return the marks that stayed at one place of the tank while it passed the image."""
+        """Return the marks that stayed at one place of the tank while the tank passed the image.
+
+        moved : whether the stage moved. A mark must then have moved through the image by a dot's
+        diameter, or have been measured whenever it was whole in the image.
+        """
         far = self.diameter_mm * self._scale if moved else 0.0
         return [
             m
@@ -206,9 +233,10 @@ class Follower:
         ]
 
     def brief(self, kept: list[Mark]) -> list[Mark]:
-        """Return dots in line with the kept marks, never missed but seen too rarely to be kept.
+        """Return further dots of the strip, which were seen in too few frames to be kept.
 
-        Such are those at a run's ends.
+        They lie in line with the kept marks and were measured whenever they were whole in the
+        image. They occur at the beginning and at the end of a run.
         """
         if not kept:
             return []
@@ -371,10 +399,13 @@ _PAD_PX = 2.0
 
 @dataclass(frozen=True)
 class StripInImages:
-    """Where one camera sees the strip's dots, whether whole or not, measured or not.
+    """Where one camera sees the K dots of the strip in F frames, also those not measured.
 
-    places_mm : (K, 2) lab; epochs : (K,), in which a place is valid; epoch_starts : first frames.
-    shift_mm : (F, 2). position_mm : (F,). line_mm : least and greatest place across the travel.
+    places_mm : (K, 2) on the tank, see `TankView`.
+    epochs : (K,) index of the part of the run in which each place is valid. epoch_starts : first
+    frame of each part.
+    shift_mm : (F, 2) shift of the whole strip in each frame. position_mm : (F,) of the stage.
+    line_mm : smallest and largest place of a dot across the travel. diameter_mm : of a dot.
     """
 
     view: TankView
@@ -391,7 +422,10 @@ class StripInImages:
     def of(
         follower: Follower, look: DotLook, kept: list[Mark], position_mm: Array
     ) -> StripInImages:
-        """Return the strip of the kept marks, of which there must be at least one."""
+        """Return the strip of the kept marks, of which there must be at least one.
+
+        position_mm : (F,) position of the stage in each frame.
+        """
         marks = [*kept, *follower.brief(kept)]
         across = [float(m.place_mm[1]) for m in kept]
         shift, starts = follower.shift_mm.copy(), [*follower.epoch_starts, len(position_mm)]
@@ -420,9 +454,9 @@ class StripInImages:
         return self.view.in_image(places, float(self.position_mm[frame]), margin)[1]
 
     def erased(self, image: NDArray[Any], frame: int) -> NDArray[Any]:
-        """Return a copy with the screen's level in place of the dots.
+        """Return a copy of an image in which the strip's dots have the grey level of the screen.
 
-        Dots that something dark touches stay.
+        A dot stays if something dark, such as a bubble, touches it.
         """
         centres = self.centres_px(frame)
         if not len(centres):
@@ -434,7 +468,11 @@ class StripInImages:
         return out
 
     def are_dots(self, frame: int, bubbles: pd.DataFrame) -> Bools:
-        """Return (n,) which detections are dots of the strip, by place and size, or by its line."""
+        """Return (n,) which of n detected bubbles are in truth dots of the strip.
+
+        They are small and lie at the place of a dot; or they are cut by the image's border and lie
+        on the line of the strip.
+        """
         uv = bubbles[["u_px", "v_px"]].to_numpy(float)
         size, centres = bubbles["d_eq_px"].to_numpy(float), self.centres_px(frame)
         if not len(uv):

@@ -37,9 +37,11 @@ _RING_TAIL, _RING_STEP = 0.1, 0.25
 class DotLook:
     """The appearance of a strip's dots in one camera, and where in the image they may be.
 
-    windows : image parts that the strip passes through. Others are medians over the dots: a_px >=
-    b_px semi-axes; contrast : grey step over the brighter level; chi2_dof : of the luminance fit;
-    blur_px.
+    windows : parts of the image through which the strip passes. diameter_px : nominal diameter.
+    The other numbers are medians over the dots. a_px, b_px : longer and shorter semi-axis.
+    contrast : difference of the grey levels of dot and screen, divided by the brighter one.
+    chi2_dof : chi-square per degree of freedom of the luminance fit. blur_px : standard deviation
+    of the blur.
     """
 
     polarity: Polarity
@@ -59,7 +61,8 @@ class DotLook:
 
 @dataclass(frozen=True)
 class DotSightings:
-    """uv_px (n, 2) and the isotropic standard deviation sigma_px (n,) of a frame's dots."""
+    """The n dots of one frame: centres uv_px (n, 2), and sigma_px (n,), the standard deviation of
+    each centre along u and along v."""
 
     uv_px: Array
     sigma_px: Array
@@ -72,9 +75,13 @@ def learn_look(
     polarity: Polarity,
     diameter_px: float,
 ) -> DotLook | None:
-    """Return the appearance of the strip's dots in a sample of images; None where none is seen.
+    """Return how the strip's dots look in a sample of images; None if no strip is seen.
 
-    Its dots lie at the same distance from the line of travel ``travel_px`` (2,) in several images.
+    Dots of a strip move along the travel, so they lie at the same distance across it in several
+    images.
+
+    travel_px : (2,) direction in which the tank moves through the image.
+    polarity, diameter_px : nominal ones of the dots.
     """
     across = np.array([-travel_px[1], travel_px[0]]) / np.linalg.norm(travel_px)
     rows, shape, count = [], (0, 0), 0
@@ -98,7 +105,7 @@ def learn_look(
 
 
 def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
-    """Return the whole dots of one frame that look like the strip's."""
+    """Return the dots of one frame that look like the strip's and are whole in the image."""
     parts = [np.zeros((0, len(_COLUMNS)))]
     for window in look.windows:
         found = _round_dots(image[window], look.polarity, look.diameter_px)

@@ -22,7 +22,10 @@ _DEEP_SIGMA = 6.0
 
 
 def shape_from_axes(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> Array:
-    """Return (m11, m12, m22) (..., 3) of M from semi-axes and the angle of a from +u to +v."""
+    """Return the shape numbers (m11, m12, m22) (..., 3) of ellipses.
+
+    a_px, b_px : semi-axes (...). angle_rad : angle (...) of the semi-axis a, from +u towards +v.
+    """
     a, b, angle = (np.asarray(x, dtype=np.float64) for x in (a_px, b_px, angle_rad))
     mean, half = 0.5 * (a + b), 0.5 * (a - b)
     c, s = half * np.cos(2.0 * angle), half * np.sin(2.0 * angle)
@@ -30,19 +33,28 @@ def shape_from_axes(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> A
 
 
 def axes_from_shape(shape_px: ArrayLike) -> Array:
-    """Return (..., 3) semi-axes a >= b and angle in (-pi/2, pi/2] from (..., 3) shape numbers."""
+    """Return the semi-axes a >= b (px) and the angle of a in (-pi/2, pi/2], as one array (..., 3).
+
+    shape_px : (..., 3) shape numbers (m11, m12, m22).
+    """
     shape = np.asarray(shape_px, dtype=np.float64)
     angle = 0.5 * np.arctan2(shape[..., 1], 0.5 * (shape[..., 0] - shape[..., 2]))
     return np.stack([*semi_axes(shape), angle], axis=-1)
 
 
 def extent_px(shape_px: Array) -> Array:
-    """Return (..., 2) half width and half height of the ellipse's upright bounding box."""
+    """Return half the width and half the height (..., 2) in px of ellipses' bounding boxes.
+
+    shape_px : (..., 3) shape numbers. The sides of the boxes are parallel to u and v.
+    """
     return np.hypot(shape_px[..., :2], shape_px[..., 1:])
 
 
 def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Array:
-    """Return signed distance to ellipses (..., 3) to first order, positive outside, at (..., P)."""
+    """Return the distances (px) of pixels from ellipses, to first order; positive outside.
+
+    shape_px : (..., 3) shape numbers. du_px, dv_px : (..., P) offsets from the centre.
+    """
     m11, m12, m22 = _columns(shape_px)
     determinant = m11 * m22 - m12 * m12
     x, y = (m22 * du_px - m12 * dv_px) / determinant, (m11 * dv_px - m12 * du_px) / determinant
@@ -77,16 +89,24 @@ def _row_kernel(z: Array, sigma: Array) -> tuple[Array, Array]:
 
 
 def quadrature_nodes(a_sigma: float) -> int:
-    """Number of nodes round a contour that make the trapezoid rule exact to about 1e-6."""
+    """Return the number of nodes round a contour that make the trapezoid rule exact to about 1e-6.
+
+    a_sigma : longest semi-axis in units of the blur's sigma.
+    """
     return max(24, int(np.ceil(2.0 * np.pi * a_sigma / _NODE_SPACING_SIGMA)))
 
 
 def coverage_on_grid(
     u_px: Array, v_px: Array, centre_px: ArrayLike, shape_px: ArrayLike, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
-    """Return exact coverage of the pixels at columns ``u_px`` (..., U) and rows ``v_px`` (..., V).
+    """Return how much of each pixel's blurred footprint an ellipse covers, exactly.
 
-    Returns ``F`` (..., V, U) and its derivatives (..., 6, V, U) by centre (2), shape (3), sigma.
+    u_px, v_px : columns (..., U) and rows (..., V) of the pixels. centre_px : (..., 2).
+    shape_px : (..., 3). sigma_px : (...) standard deviation of the blur.
+
+    Returns the coverage F (..., V, U), 0 to 1, and its derivatives (..., 6, V, U) with respect to
+    centre (2), shape (3) and sigma.
+
     By Gauss's theorem with the field (P(x - u) p(y - v), 0), p the one-dimensional point spread and
     P its integral, the convolution over the ellipse's area is an integral round its contour of a
     smooth periodic function: the trapezoid rule converges exponentially, and the sum of products of
@@ -127,11 +147,15 @@ def coverage_on_grid(
 def foot_points(
     shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 2
 ) -> tuple[Array, Array]:
-    """Return (cos t, sin t) of the nearest points M (cos t, sin t) of ellipses to offsets.
+    """Return the point of an ellipse that is nearest to each given point.
 
-    Ellipses (..., 3), offsets (..., P). Newton on (p - x(t)) . x'(t) = 0 from the radial start, for
-    points nearer than the smallest radius of curvature. Steps turn the unit vector, which saves the
-    trigonometry.
+    shape_px : (..., 3) shape numbers of M. du_px, dv_px : (..., P) the points, as offsets from the
+    centre.
+
+    Returns cos t and sin t (..., P) of the nearest points x(t) = M (cos t, sin t). Newton's method
+    on (p - x(t)) . x'(t) = 0 starts in the direction of the point p. It converges for points that
+    are nearer to the ellipse than its smallest radius of curvature. Its steps turn the unit vector
+    (cos t, sin t), which saves the trigonometric functions.
     """
     m11, m12, m22 = _columns(shape_px)
     c, s = m22 * du_px - m12 * dv_px, m11 * dv_px - m12 * du_px
@@ -155,10 +179,16 @@ def foot_points(
 def coverage_near_edge(
     du_px: Array, dv_px: Array, shape_px: Array, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
-    """Return coverage (..., P) and derivatives (..., 6, P) at offsets (..., P) from centres.
+    """Return the coverage of pixels as `coverage_on_grid` does, by a faster expansion.
 
-    ``shape_px`` (..., 3), ``sigma_px`` (...). An expansion to third order in the blur over the
-    edge's radius of curvature. With z = d / s the exact signed distance, k the curvature and k''
+    du_px, dv_px : (..., P) offsets of the pixels from the centre. shape_px : (..., 3). sigma_px :
+    (...) standard deviation s of the blur.
+
+    Returns the coverage F (..., P) and its derivatives (..., 6, P) with respect to centre (2),
+    shape (3) and sigma.
+
+    The expansion is of third order in the blur divided by the edge's radius of curvature. With
+    z = d / s the exact signed distance from the edge over the blur, k the curvature and k''
     its second derivative along the edge, both in units of s, the edge lies h = k x^2 / 2
     + k' x^3 / 6 + (k'' + 3 k^3) x^4 / 24 inside its tangent, and F is the mean of Phi(-z - h) over
     a normal x:

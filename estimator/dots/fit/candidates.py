@@ -41,7 +41,14 @@ _MIN_PIECE_PIXELS = 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """A blob: ellipse of its moments, area, holes (N, 2), and why it is no dot, or ""."""
+    """A connected region of bright or dark pixels that may be a dot.
+
+    label : value of its pixels in ``Candidates.labels``.
+    centre_px, shape_px : (2,), (3,) of the ellipse with the same second moments, see
+    ``blurred_ellipse``.
+    holes : outlines (N, 2) of the holes in the region, in px.
+    reason : why the region cannot be a dot; None if it may be one.
+    """
 
     label: int
     centre_px: Array
@@ -53,7 +60,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Candidates:
-    """All blobs of one polarity and the image (rows, columns) of their labels, 0 for none."""
+    """All blobs of one polarity in an image.
+
+    labels : (rows, columns) the label of the blob to which each pixel belongs, 0 for none.
+    """
 
     polarity: Polarity
     blobs: tuple[Candidate, ...]
@@ -64,7 +74,7 @@ class Candidates:
         return tuple(blob for blob in self.blobs if not blob.reason)
 
     def up_to(self, diameter_px: float) -> Candidates:
-        """Return the same, with a reason against those that are larger."""
+        """Return the candidates; those larger than this diameter are marked as too large."""
         if np.isinf(diameter_px):
             return self
         most = np.pi / 4 * diameter_px**2
@@ -76,7 +86,12 @@ class Candidates:
 
 @dataclass(frozen=True)
 class EdgeMap:
-    """The smoothed image, its threshold surface, and where the image is flat (no edge near)."""
+    """The edges of an image; all arrays have its shape (rows, columns).
+
+    smooth : smoothed grey levels. threshold : the grey level that separates dots from background
+    at each pixel. flat : whether there is no edge near the pixel. has_edges : whether the image has
+    any edge.
+    """
 
     smooth: Float32
     threshold: Float32
@@ -85,7 +100,10 @@ class EdgeMap:
 
 
 def edge_map(image: Float32, sigma: float) -> EdgeMap:
-    """Return the threshold surface of ``image`` (rows, columns), whose noise is about ``sigma``."""
+    """Return the edges and the threshold surface of an image.
+
+    image : (rows, columns) grey levels. sigma : approximate standard deviation of their noise.
+    """
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     rows, columns = image.shape
     missing = (-rows % _BLOCK, -columns % _BLOCK)
@@ -144,7 +162,11 @@ def _spread(values: Float32, weight: Float32) -> Float32:
 
 
 def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) -> Candidates:
-    """Return every blob of one polarity, with the reason why it cannot be a dot if there is one."""
+    """Return every blob of one polarity in an image.
+
+    A blob that cannot be a dot, for example because it is smaller than ``min_diameter_px``, has a
+    ``reason``.
+    """
     sign = 1.0 if polarity == "white_on_black" else -1.0
     labels = np.zeros(edges.smooth.shape, np.int32)
     if not edges.has_edges:
@@ -192,7 +214,11 @@ def _with_pieces(shown: list[_Look], above: Float32, min_diameter_px: float) -> 
 
 
 def fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) -> None:
-    """Fill the inside of the first outline, without that of the others, which are its holes."""
+    """Set the pixels inside the first outline to a value, in place.
+
+    The further outlines are holes in the first one; their pixels stay as they are. Each outline is
+    (N, 2) in px.
+    """
     cv2.drawContours(canvas, [o.reshape(-1, 1, 2) for o in outlines], -1, value, cv2.FILLED)
 
 
@@ -282,7 +308,10 @@ def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
 
 
 def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
-    """Return the shape numbers of the uniform ellipse with these second moments (uu, uv, vv)."""
+    """Return the shape numbers (3,) of the uniform ellipse with the given second moments.
+
+    variance : (uu, uv, vv) in px^2.
+    """
     uu, uv, vv = variance
     mean, half = 0.5 * (uu + vv), hypot(0.5 * (uu - vv), uv)
     a, b = 2.0 * sqrt(mean + half), 2.0 * sqrt(max(mean - half, 0.05))
@@ -315,7 +344,10 @@ _LARGEST_RATIO = 2.5
 
 
 def reference_radius_px(found: Candidates) -> float:
-    """Return the radius of a blob of the promising blobs' median area; 0 where there are none."""
+    """Return the radius in px of a typical dot; 0 if no blob may be a dot.
+
+    It follows from the median area of the blobs that may be dots, weighted by area.
+    """
     areas = np.sort([blob.area_px2 for blob in found.promising])
     if areas.size == 0:
         return 0.0
@@ -324,7 +356,7 @@ def reference_radius_px(found: Candidates) -> float:
 
 
 def is_ring(blob: Candidate) -> bool:
-    """Whether holes make up a notable part of the blob, rather than specks of dust in it."""
+    """Return whether a blob is a ring: its holes are too large for specks of dust."""
     holes = sum(float(cv2.contourArea(hole.reshape(-1, 1, 2))) for hole in blob.holes)
     return holes > _MIN_HOLE_SHARE * blob.area_px2
 
@@ -332,7 +364,8 @@ def is_ring(blob: Candidate) -> bool:
 def saturation_level(grey: Float32) -> float:
     """Return the grey level at which the sensor saturates.
 
-    That is the top level if more pixels have it than the levels next below it, else infinity.
+    It is the highest level of the image if more pixels have this level than the levels just below
+    it; otherwise infinity.
     """
     top = float(grey.max())
     at_top, lower = grey == top, grey[grey < top]
@@ -371,7 +404,10 @@ def _one_sided_saturation(
 def reason_against_blob(
     blob: Candidate, grey: Float32, reference_px: float, saturation: float
 ) -> Reason | None:
-    """Return the reason to leave a blob out before any fit; None for a blob that may be a dot."""
+    """Return why a blob is left out before any fit; None for a blob that may be a dot.
+
+    reference_px : radius of a typical dot. saturation : grey level at which the sensor saturates.
+    """
     if blob.reason == Reason.TOUCHES_BORDER:
         return Reason.TOUCHES_BORDER
     if np.sqrt(blob.area_px2 / np.pi) < _MIN_RELATIVE_RADIUS * reference_px:
@@ -399,7 +435,11 @@ def reason_against_fit(
     usual_contrast: float,
     saturation: float,
 ) -> Reason | None:
-    """Return the reason to leave a dot out that was fitted to a blob; None for a good one."""
+    """Return why a dot is left out after the luminance model was fitted to it; None for a good fit.
+
+    usual_contrast : median contrast of the image's dots. saturation : grey level at which the
+    sensor saturates.
+    """
     if fit.pixels <= PARAMETERS:
         return Reason.HIDDEN
     if not np.all(np.isfinite(fit.covariance_px2)) or semi_axes(fit.shape_px)[1] <= 0.0:

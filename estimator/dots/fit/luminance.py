@@ -61,9 +61,12 @@ class Reason(StrEnum):
 class Prior:
     """Prior knowledge about one dot, from the image's other dots.
 
-    u_per_px, v_per_px : relative contrast gradient (dC/du)/C, (dC/dv)/C, with sd ``sigma_per_px``.
-    tie_to_background : take the background's own relative gradient instead, as the same light falls
-    on both. edge_px : sigma of the blurred edge, with sd ``edge_spread_px``, infinite if unknown.
+    u_per_px, v_per_px : relative gradient of the contrast, (dC/du)/C and (dC/dv)/C.
+    sigma_per_px : standard deviation of both.
+    tie_to_background : whether the background's relative gradient is taken instead, because the
+    same light falls on both.
+    edge_px : standard deviation of the edge's Gaussian blur. edge_spread_px : standard deviation of
+    this number; infinite if it is unknown.
     """
 
     u_per_px: float = 0.0
@@ -76,7 +79,11 @@ class Prior:
 
 @dataclass(frozen=True)
 class Window:
-    """Pixels of a fit: grey levels (V, U) of a crop, its first pixel, a mask (V, U) of the used."""
+    """The part of an image to which one dot is fitted.
+
+    grey : (V, U) grey levels. first_u, first_v : the image's pixel at grey[0, 0]. mask : (V, U)
+    whether a pixel is used in the fit.
+    """
 
     grey: Array
     first_u: int
@@ -86,7 +93,11 @@ class Window:
 
 @dataclass(frozen=True)
 class Start:
-    """Start of a fit: centre (2,), shape (3,), edge sigma, and an earlier fit's grey levels."""
+    """Start values of a fit.
+
+    centre_px : (2,). shape_px : (3,), see ``blurred_ellipse``. sigma_px : standard deviation of the
+    edge's blur. previous : an earlier fit, whose grey levels are the start values of the levels.
+    """
 
     centre_px: Array
     shape_px: Array
@@ -98,11 +109,15 @@ class Start:
 class DotFit:
     """One fitted dot.
 
-    centre_px (2,), shape_px (3,) (see ``blurred_ellipse``), sigma_px of the edge. levels : (6,) B0,
-    B1, B2, C, C1, C2 about the window's middle origin_px (2,) in units of radius_px.
-    covariance_px2 : (2, 2) of the centre. contrast_sigma : of C. dropped : number of pixels left
-    out as outliers or clipped. edge_residual : RMS residual in the band of the edge over C.
-    inner_chi2 : mean whitened square residual of the inner_pixels that the dot covers.
+    centre_px : (2,). shape_px : (3,), see ``blurred_ellipse``. sigma_px : standard deviation of the
+    edge's blur.
+    levels : (6,) grey levels: background B0 + B1 x + B2 y and contrast C + C1 x + C2 y, where
+    (x, y) is the offset from origin_px (2,), the middle of the window, divided by radius_px.
+    covariance_px2 : (2, 2) of the centre. contrast_sigma : standard deviation of C.
+    chi2_dof : chi-square per degree of freedom. pixels : number of pixels in the mask. dropped :
+    how many of these were left out as outliers or as clipped.
+    edge_residual : RMS residual near the edge, divided by C.
+    inner_chi2 : mean squared whitened residual of the inner_pixels pixels that the dot covers.
     """
 
     centre_px: Array
@@ -127,12 +142,13 @@ class DotFit:
 
     @property
     def inflated_covariance_px2(self) -> Array:
-        """The centre's covariance (2, 2), times chi2_dof where that is significantly above 1."""
+        """The centre's covariance (2, 2), multiplied by chi2_dof if chi2_dof is significantly above
+        1."""
         significant = self.chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / self.dof)
         return self.covariance_px2 * (self.chi2_dof if significant else 1.0)
 
     def under_noise(self, factor: float) -> DotFit:
-        """Return the same fit for a noise variance ``factor`` times as large."""
+        """Return the fit as it would be if the noise variance were ``factor`` times as large."""
         return replace(
             self,
             covariance_px2=self.covariance_px2 * factor,
@@ -157,20 +173,26 @@ class DotFit:
 
 
 _FEW_PIXELS = 1e-9
-"""Weight of grey level 0 against one pixel, so that too few pixels still have a solution."""
+"""Weight of a prior of 0 for each grey level, relative to one pixel, so that too few pixels still
+have a solution."""
 EDGE_EXPANSION_LIMIT = 0.25
-"""Curvature times sigma up to which centres agree with the exact sum to 1e-5 px, levels to 5e-4."""
+"""Curvature times sigma up to which the expansion agrees with the exact sum: centres to 1e-5 px,
+coverages to 5e-4."""
 _PRIOR = np.dtype([(f.name, type(f.default)) for f in fields(Prior)])
 _prior_values = attrgetter(*(f.name for f in fields(Prior)))
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels of D fits, padded to P: offsets x, y from the origin pixel, and grey levels, (D, P).
+    """The pixels of D fits, padded to the largest number P of pixels in one fit.
 
-    there : (D, P) False for padding. counts : (D,). columns (D, U), rows (D, V) : offsets of the
-    windows' columns and rows, padded by counting on. cell : (D, P) place of each pixel in its
-    window. origin : (D, 2). radius : (D,) px. prior : (D,) with the fields of `Prior`.
+    x, y : (D, P) offsets in px from the middle of the window. grey : (D, P) grey levels.
+    there : (D, P) False for padding. counts : (D,) number of pixels of each fit.
+    columns, rows : (D, U), (D, V) offsets in px of the windows' columns and rows; those of smaller
+    windows are continued.
+    cell : (D, P) index of each pixel in the grid of rows and columns, row by row.
+    origin : (D, 2) middle of the window in px. radius : (D,) radius of the dot in px.
+    prior : (D,) with the fields of `Prior`.
     """
 
     x: Array
@@ -197,7 +219,7 @@ class Pixels:
 def gather(
     windows: Sequence[Window], starts: Sequence[Start], noise: NoiseModel, priors: Sequence[Prior]
 ) -> Pixels:
-    """Return the pixels that each window's mask shows, padded to the largest number."""
+    """Return the pixels of all windows that are True in the windows' masks, as padded arrays."""
     counts = np.array([np.count_nonzero(w.mask) for w in windows])
     sizes = np.array([w.mask.shape for w in windows])
     height, width = sizes.max(axis=0)
@@ -250,11 +272,17 @@ def _exact_coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
 
 
 def grey_levels(pixels: Pixels, theta: Array, levels: Array) -> tuple[Array, Array, Array]:
-    """Return grey levels (D, P), derivatives (D, 12, P), levels (D, 6), fitted where they are NaN.
+    """Return the grey levels that the luminance model predicts for the pixels of D fits.
 
-    The contrast gradient acts before the blur: the Gaussian of x F_sharp is x F + sigma^2 dF/dx.
-    Without that term a centre would shift by sigma^2 times the relative gradient; its derivatives
-    by theta are neglected.
+    theta : (D, 6) centre (2), shape (3) and sigma. levels : (D, 6); rows of NaN are replaced by a
+    linear fit to the pixels.
+
+    Returns grey levels (D, P), their derivatives (D, 12, P) with respect to theta and the levels,
+    and the levels (D, 6).
+
+    The contrast gradient acts before the blur: the Gaussian blur of x F_sharp is x F + sigma^2
+    dF/dx. Without the second term a centre would shift by sigma^2 times the relative gradient. The
+    derivatives of this term with respect to theta are neglected.
     """
     coverage, gradient = _coverage(pixels, theta)
     radius = pixels.radius[:, None]
@@ -283,7 +311,11 @@ def _first_levels(pixels: Pixels, jacobian: Array) -> Array:
 
 
 def prior_rows(pixels: Pixels, parameters: Array) -> tuple[Array, Array]:
-    """Return three whitened prior rows: Jacobian (D, 3, 12) by the parameters, residual (D, 3)."""
+    """Return the whitened equations of the priors on two contrast gradients and the edge's blur.
+
+    parameters : (D, 12) theta and the levels. Returns Jacobians (D, 3, 12) and the right-hand sides
+    (D, 3), prior minus present value.
+    """
     prior, radius, levels = pixels.prior, pixels.radius, parameters[:, 6:]
     tied = prior["tie_to_background"]
     weight = 1.0 / (prior["sigma_per_px"] * radius * np.maximum(np.abs(levels[:, 3]), 1e-12))
@@ -438,7 +470,11 @@ def fit_dots(
 ) -> list[DotFit]:
     """Fit the luminance model of each dot to the pixels of its window.
 
-    A few pixels more than 5 sigma off (sigma widened by the fit's own spread) are left out.
+    windows, starts, priors : one for each dot. Pixels whose residual exceeds 5 standard deviations
+    are left out, if they are few; the standard deviation is enlarged if the fit as a whole is
+    worse than the noise.
+    iterations : largest number of steps. tolerance : a fit has converged if one more step would
+    lower chi-square by less than this. outlier_rounds : how many times outliers are searched.
     """
     fits: dict[int, DotFit] = {}
     for some in _chunks(windows):

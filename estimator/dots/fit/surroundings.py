@@ -39,13 +39,17 @@ def dot_window(
     coarse: bool = False,
     known: Sequence[int] = (),
 ) -> Window:
-    """Return crop and mask round one dot: its edge, its inside, and free background.
+    """Return the part of an image to which one dot is fitted: its edge, inside, and background.
 
-    Pixels nearer to another blob, or near a hole, are left out. Of a large dot only the
-    surroundings of the edge are used, and of those beyond the blur one pixel in four (coarse :
-    everywhere).
-    known : labels of blobs whose light is subtracted later, so that pixels which their blur shares
-    stay. Without those pixels a third of the precision would be lost.
+    grey : (rows, columns) grey levels. labels : see `Candidates`. blob : the dot. start : its
+    approximate ellipse.
+    coarse : whether only one pixel in four is used everywhere, for a fast first fit.
+    known : labels of neighbouring blobs whose light is subtracted before the fit. Pixels that are
+    blurred together with these blobs stay in the mask; without them a third of the precision would
+    be lost.
+
+    Pixels that are nearer to another blob, or near a hole, are left out. Of a large dot only the
+    surroundings of the edge are used, and beyond the edge's blur one pixel in four.
     """
     a, b = semi_axes(start.shape_px)
     reach = 4.0 * start.sigma_px + 2.0
@@ -107,7 +111,7 @@ def _distance_to_others(
 
 
 def close_neighbours(fits: list[DotFit]) -> list[list[int]]:
-    """Return for each dot the positions of the dots whose blur overlaps its own."""
+    """Return for each dot the indices in ``fits`` of the other dots whose blur overlaps its own."""
     from scipy.spatial import cKDTree
 
     if not fits:
@@ -159,10 +163,13 @@ _BLUR_SPREAD = 0.1
 
 
 def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
-    """Return the relative contrast gradient expected at each fitted dot.
+    """Return a prior for each fitted dot: the contrast gradient that the other dots show.
 
-    A quadratic is fitted robustly to log |contrast|, with a prior (light changes by about exp(0.4)
-    over 1000 px). Below 6 dots a bright background tells more: see `background_tie`.
+    A quadratic surface is fitted robustly to log |contrast| over the image, with a prior (the light
+    changes by about a factor exp(0.4) over 1000 px). With fewer than 6 dots, `background_tie` gives
+    the priors.
+
+    image_shape : (rows, columns).
     """
     if len(fits) < _ENOUGH_DOTS:
         return [background_tie(fit) for fit in fits]
@@ -177,7 +184,11 @@ def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list
 
 
 def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
-    """Return the priors with the median edge sigma, for dots no larger than the blur."""
+    """Return the priors with the dots' median edge blur as prior of each dot's edge blur.
+
+    It is used for dots that are no larger than the blur. With fewer than 6 dots the priors stay as
+    they are.
+    """
     if len(fits) < _ENOUGH_DOTS:
         return priors
     sigmas = np.array([fit.sigma_px for fit in fits])
@@ -187,7 +198,11 @@ def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
 
 
 def background_tie(fit: DotFit) -> Prior:
-    """Return a single dot's prior: the background's relative gradient if that is bright."""
+    """Return the prior of a dot's contrast gradient from its own background.
+
+    It is the relative gradient of the background if the background is bright, otherwise 0 with a
+    large standard deviation.
+    """
     if fit.levels[0] > 0.5 * abs(fit.levels[3]):
         return Prior(sigma_per_px=1e-4, tie_to_background=True)
     return Prior(sigma_per_px=PRIOR_GRADIENT_PER_PX)

@@ -33,9 +33,9 @@ _REFINED = 12
 
 @dataclass(frozen=True)
 class PointMatch:
-    """One assignment of the target's points to the dots.
+    """One assignment of the target's points to the dots of an image.
 
-    dot : (n,) positions of the matched dots; point : (n,) the target's point of each.
+    dot : (n,) indices of the matched dots. point : (n,) index of the target's point for each.
     handedness : +1, or -1 when the image is mirrored.
     """
 
@@ -57,7 +57,10 @@ def match_points(
     *,
     dot_radius_mm: float,
 ) -> list[PointMatch]:
-    """Return distinct matches of dots (M, 2), shapes (M, 2, 2), to points (N, 2), best first.
+    """Return the ways to match the dots of an image with the listed points of a target, best first.
+
+    points_px : (M, 2) centres of the dots. shapes_px2 : (M, 2, 2), see `shape_matrix`.
+    points_mm : (N, 2) points of the target. dot_radius_mm : radius of its dots.
 
     Raises DetectionError when there are fewer than 6 dots or no map explains half of them.
     """

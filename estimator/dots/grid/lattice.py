@@ -32,11 +32,14 @@ _HOLD = 0.05
 def fit_neighbours(
     at: Ints, values: Array, places: Ints, basis: Array, *, itself: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Return weighted affine fit of the values at the occupied places round each of (C, 2) places.
+    """Fit an affine function to the values of the dots round each of C places of a grid.
 
-    at : dot at each place or -1. values : (N, 2). basis : (N, 2, 2) pitch vectors, towards which
-    the fit is pulled weakly. itself : use the place's own dot too. Returns value (C, 2), pitch
-    vectors (C, 2, 2) and variance (C,) of the value for dots of unit variance.
+    at : (H, W) index of the dot at each place of the grid, -1 for none. values : (N, 2) of the N
+    dots. places : (C, 2) indices into ``at``. basis : (N, 2, 2) pitch vectors of each dot, towards
+    which the fit is pulled weakly. itself : whether the dot at the place itself is used, too.
+
+    Returns for each place the fitted value (C, 2), its change (C, 2, 2) per step of the grid, and
+    the variance (C,) of the fitted value if the values of the dots have unit variance.
     """
     steps = np.concatenate([NEIGHBOURS, [[0, 0]]]) if itself else NEIGHBOURS
     dots = at[places[:, :1] + steps[:, 0], places[:, 1:] + steps[:, 1]]
@@ -57,9 +60,11 @@ def fit_neighbours(
 
 
 def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
-    """Return (C,) distances of the places' residuals from their predictions by the neighbours.
+    """Return how far each dot's residual is from the value that its neighbours predict.
 
-    The unit is a dot's standard deviation if that is 1.
+    at : (H, W) index of the dot at each place, -1 for none. residuals : (N, 2) of the N dots, in
+    standard deviations. places : (C, 2) indices into ``at`` of the dots that are tested.
+    Returns the distances (C,) in standard deviations.
     """
     flat = np.zeros((len(residuals), 2, 2))
     expected, _, spread = fit_neighbours(at, residuals, places, flat)
@@ -68,7 +73,10 @@ def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
 
 
 def fit_homography(source: ArrayLike, target: ArrayLike) -> Array:
-    """Return the homography H (3, 3), target ~ H source, of (N, 2) pairs; affine if few."""
+    """Return the homography H (3, 3) with target ~ H source that fits N pairs of points best.
+
+    source, target : (N, 2). With few pairs the map is affine.
+    """
     homography, _ = cv2.findHomography(np.asarray(source, float), np.asarray(target, float))
     return fit_affine(source, target) if homography is None else np.asarray(homography)
 
@@ -82,7 +90,7 @@ def apply_homography(homography: Array, points: ArrayLike) -> Array:
 
 
 def fit_affine(source: ArrayLike, target: ArrayLike) -> Array:
-    """Return the affine map (3, 3) of (N, 2) pairs by least squares, as a homography."""
+    """Return the affine map, as a homography (3, 3), that fits N pairs of points (N, 2) best."""
     a, b = np.asarray(source, float), np.asarray(target, float)
     solved, *_ = np.linalg.lstsq(np.column_stack([a, np.ones(len(a))]), b, rcond=None)
     return np.vstack([solved.T, [0.0, 0.0, 1.0]])
@@ -106,7 +114,7 @@ _SEEDS = 4
 
 @dataclass(frozen=True)
 class Cell:
-    """Shape of a grid's cell, whatever its size and direction.
+    """Shape of a grid's cell, without its size and direction.
 
     ratio : of the longer to the shorter pitch.
     cosine : of the acute angle between the pitch vectors; 0 for a rectangle, 1/2 for a hexagonal
@@ -172,10 +180,11 @@ def grow_lattice(
     cell: Cell = SQUARE,
     floor_px: float = 0.3,
 ) -> Lattice:
-    """Find the largest grid among (N, 2) dots of shapes (N, 2, 2).
+    """Find the largest grid among the N dots of an image.
 
-    cell : shape of the grid's cell; which axis is x need not be known.
-    floor_px : dots within this distance of their place are never taken for false ones.
+    points_px : (N, 2) centres. shapes_px2 : (N, 2, 2), see `shape_matrix`.
+    cell : shape of the grid's cell; it does not say which axis is x.
+    floor_px : a dot within this distance of its place on the grid always belongs to the grid.
 
     Raises DetectionError when fewer than 6 dots lie on a common grid.
     """
@@ -229,8 +238,10 @@ def _bases(flat: Array, cell: Cell) -> list[Array]:
 
 
 def frequent_cell(points: Array) -> Array | None:
-    """Return the two shortest frequent steps (2, 2) between near ones of N points (N, 2), as rows;
-    None if there is only one direction.
+    """Return the pitch vectors (2, 2), as rows, of a grid among N points (N, 2).
+
+    They are the two shortest steps that are frequent between neighbouring points. Returns None if
+    all frequent steps have one direction.
     """
     if len(points) < MIN_DOTS:
         return None
@@ -308,7 +319,7 @@ class _Growth:
         return len(dots) * full * float(np.exp(-((skew / 0.3) ** 2) - (stretch / 0.3) ** 2))
 
     def grow(self) -> None:
-        """Add dots round by round until no place within two steps of the grid has one."""
+        """Add dots round by round until no dot is left at a place within two steps of the grid."""
         front = self.place[self.placed()]
         while len(front):
             front = self._round(front, NEIGHBOURS[np.abs(NEIGHBOURS).sum(1) == 1])

@@ -36,33 +36,41 @@ from telerig.rig.target import Target
 from telerig.statistics import robust_sd
 
 LOG_MISSED_MARK = -4.0
-"""A mark that is seen as a plain dot."""
+"""Log-probability that a mark is seen as a plain dot."""
 LOG_FALSE_MARK = -7.5
-"""A plain dot that is seen as a mark."""
+"""Log-probability that a plain dot is seen as a mark."""
 LOG_UNSEEN_MARK = -2.0
-"""A mark where the image shows no lattice place, or the dot of a mark is lost."""
+"""Log-likelihood ratio of a mark at a place where the image shows no dot."""
 LOG_FILLED_GAP = -5.0
-"""A dot (dirt, say) at the place of a mark of the style "missing"."""
+"""Log-likelihood ratio of a mark of the style "missing" at a place where there is a dot (dirt)."""
 LOG_UNSURE_GAP = -0.7
-"""A mark of the style "missing" at an empty place that has too few dots round it to be a gap."""
+"""Log-likelihood ratio of a mark of the style "missing" at an empty place that has too few dots
+round it for a clear decision."""
 
 
 @dataclass(frozen=True)
 class MarkEvidence:
-    """Log-likelihood ratios (H, W) of mark to dot, place (i, j) at [i + 1, j + 1]; seen marks."""
+    """What an image shows about where the marks are on the lattice of its dots.
+
+    gain : (H, W) log-likelihood ratio of a mark to a plain dot at each place; that of the place
+    (i, j) is gain[i + 1, j + 1]. seen : (k, 2) places that look like marks.
+    """
 
     gain: Array
     seen: Ints
 
     def at(self, places: Ints) -> Array:
-        """Return the log-likelihood ratio (...,) at (..., 2) places; unseen outside the lattice."""
+        """Return the log-likelihood ratios (...) of a mark to a plain dot at places (..., 2).
+
+        Outside the lattice it is `LOG_UNSEEN_MARK`.
+        """
         shifted = places + 1
         inside = np.all((shifted >= 0) & (shifted < self.gain.shape), axis=-1)
         clipped = np.clip(shifted, 0, np.array(self.gain.shape) - 1)
         return np.where(inside, self.gain[clipped[..., 0], clipped[..., 1]], LOG_UNSEEN_MARK)
 
     def is_seen(self, places: Ints) -> Bools:
-        """Return (...,) whether each of the (..., 2) places looks like a mark."""
+        """Return whether each of the places (..., 2) looks like a mark, as booleans (...)."""
         if not len(self.seen):
             return np.zeros(places.shape[:-1], bool)
         return np.asarray(np.any(np.all(places[..., None, :] == self.seen, axis=-1), axis=-1))
@@ -75,7 +83,10 @@ def relative_diameter(lattice: Lattice) -> Array:
 
 
 def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
-    """Return the probability (n,) that each dot is a mark; rings (n,) whether it has a hole."""
+    """Return the probability (n,) that each of the lattice's n dots is a mark.
+
+    rings : (n,) whether the dot has a hole.
+    """
     if target.mark_style == "ring":
         return rings.astype(float)
     size = np.log(relative_diameter(lattice))
@@ -89,7 +100,10 @@ def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
 
 
 def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidence:
-    """Return the evidence at all places of the lattice and of a border one place wide."""
+    """Return the evidence for marks at all places of the lattice and of a border one place wide.
+
+    rings : (n,) whether each of the lattice's n dots has a hole.
+    """
     shape = lattice.places.max(0) + 3
     occupied = np.zeros(shape, bool)
     occupied[tuple((lattice.places + 1).T)] = True
@@ -107,7 +121,10 @@ def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidenc
 
 
 def mark_gain(likeness: Array) -> Array:
-    """Return the log-likelihood ratio (n,) of mark to plain dot, from `mark_likeness` (n,)."""
+    """Return the log-likelihood ratios (n,) of a mark to a plain dot.
+
+    likeness : (n,) probabilities that the dots look like marks, see `mark_likeness`.
+    """
     missed, false = np.exp(LOG_MISSED_MARK), np.exp(LOG_FALSE_MARK)
     as_mark = np.log(likeness * (1 - missed) + (1 - likeness) * missed)
     as_plain = np.log(likeness * false + (1 - likeness) * (1 - false))
@@ -115,7 +132,11 @@ def mark_gain(likeness: Array) -> Array:
 
 
 def gaps(occupied: Bools, bounded: bool) -> Bools:
-    """Return empty places among dots; at the border of a bounded grid fewer dots are enough."""
+    """Return (H, W) which places of a grid are empty although dots surround them.
+
+    occupied : (H, W) whether there is a dot at each place. bounded : whether the grid ends inside
+    the image; places on its border then need fewer dots round them.
+    """
     around = _count_around(occupied)
     if not bounded:
         return np.asarray(~occupied & (around >= 6))
@@ -136,22 +157,23 @@ def _count_around(places: Bools) -> Ints:
 LOG_DOT_OUTSIDE = -6.0
 """Log-likelihood of a dot on the lattice where the target has none."""
 MARGIN = 4.0
-"""Placements within this log-likelihood of the best are taken as equally good."""
+"""Placements whose log-likelihood is less than this below the best one count as equally good."""
 MAX_TIED = 64
 
 _MIN_ASPECT_SIGMA = 0.03
 _LEAST_LIKELY = 100.0
 _NEAR_CELL = 0.3
-"""Ways to lay the lattice on the target are tried whose cell is distorted by as much more."""
+"""Maps from the lattice to the target are tried if they distort the cell by at most this much more
+than the best map does."""
 
 
 @dataclass(frozen=True)
 class TargetLattice:
-    """The places of the target's dots on its own lattice.
+    """The places of the target's dots on its own lattice. For a grid they are (column, row).
 
-    cell_mm : (2, 2) pitch vectors as rows. Places of a grid are its (column, row).
-    places : (N, 2) of all dots of a bounded target, by id, also where a mark is a missing dot; None
-        for an unbounded grid.
+    cell_mm : (2, 2) pitch vectors as rows.
+    places : (N, 2) place of each dot of a bounded target, by id, missing dots included; None for an
+        unbounded grid.
     marks : (K, 2) places of the marks.
     mirrored : whether the target differs from its mirror image.
     """
@@ -163,7 +185,7 @@ class TargetLattice:
 
     @classmethod
     def of(cls, target: Target) -> TargetLattice | None:
-        """Return the target's lattice; None for listed points that lie on none."""
+        """Return the target's lattice; None for listed points that do not lie on a lattice."""
         if target.layout == "points":
             listed = np.asarray(target.points_mm, float)
             found = listed_lattice(listed.tobytes())
@@ -218,10 +240,13 @@ def listed_lattice(points_mm: bytes) -> tuple[Array, Ints] | None:
 
 @dataclass(frozen=True)
 class Placements:
-    """K placements of the grid on a lattice, best first: (column, row) = turn @ place - shift.
+    """K ways to place the target on the lattice of an image's dots, best first.
 
-    turn : (K, 2, 2), det -1 where the image is mirrored. shift : (K, 2). score : (K,)
-    log-likelihoods.
+    In each, the dot at a place of the lattice has (column, row) = turn @ place - shift on the
+    target.
+
+    turn : (K, 2, 2), with determinant -1 where the image is mirrored. shift : (K, 2).
+    score : (K,) log-likelihoods.
     """
 
     turn: Ints
@@ -229,12 +254,12 @@ class Placements:
     score: Array
 
     def columns_rows(self, places: Ints) -> Ints:
-        """Return column and row (K, n, 2) on the target of places (n, 2) by each placement."""
+        """Return (column, row) on the target of n places of the lattice (n, 2), as (K, n, 2)."""
         turned = np.einsum("kab,nb->kna", self.turn, places)
         return np.asarray(turned - self.shift[:, None])
 
     def places(self, columns_rows: Ints) -> Ints:
-        """Return the places (K, m, 2) of (m, 2) columns and rows: the inverse of `columns_rows`."""
+        """Return the places (K, m, 2) on the lattice of m pairs (column, row) (m, 2)."""
         shifted = columns_rows + self.shift[:, None]
         return np.asarray(np.einsum("kab,knb->kna", inverse_of(self.turn), shifted))
 
@@ -248,12 +273,13 @@ def inverse_of(turn: Ints) -> Ints:
 
 
 def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: TargetLattice) -> Placements:
-    """Return all placements within `MARGIN` of the best, best first, unmirrored before mirrored.
+    """Return all placements whose log-likelihood is within `MARGIN` of the best one, best first.
 
-    Mirrored images are considered where the target tells them apart.
+    Among equals, those without mirroring come first. Mirrored placements are tried only for a
+    target that differs from its mirror image.
 
-    Raises DetectionError when the image shows none of the marks that an unbounded grid needs,
-    InputError when an unbounded grid has no marks.
+    Raises DetectionError if the image shows none of the marks that an unbounded grid needs, and
+    InputError if an unbounded grid has no marks.
     """
     turns, fit = _turns(lattice, target)
     parts = []
@@ -274,7 +300,8 @@ def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: TargetLatt
 _UNIMODULAR: Ints = np.array(
     [t for t in product((1, 0, -1), repeat=4) if abs(t[0] * t[3] - t[1] * t[2]) == 1], np.int64
 ).reshape(-1, 2, 2)
-"""The maps between two lattices whose cells are nearly the same, by small whole numbers."""
+"""All integer matrices of entries -1, 0 and 1 and determinant +-1: candidates for the map between
+two lattices whose cells are nearly the same."""
 
 
 def _turns(lattice: Lattice, target: TargetLattice) -> tuple[Ints, Array]:
@@ -348,7 +375,7 @@ def _bounded_shifts(turned: Ints, places: Ints) -> tuple[Ints, Array]:
 
 
 def related_by_symmetry(placements: Placements, target: TargetLattice) -> bool:
-    """Whether the placements differ only by rotations that leave the target unchanged."""
+    """Return whether the placements differ only by rotations that leave the target unchanged."""
     hands = np.linalg.det(placements.turn)
     if np.any(hands != hands[0]):
         return False
@@ -363,7 +390,8 @@ def related_by_symmetry(placements: Placements, target: TargetLattice) -> bool:
 NEEDED = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 OUTSIDE = "on the grid, outside the target's rows and columns"
 CLEAR_LEAD = 0.8
-"""The second-best match of points must explain fewer than this share of the best match's dots."""
+"""A match of points is unique if the second-best match explains fewer dots than this share of those
+of the best one."""
 AT_A_GAP = "at the place of a missing mark"
 
 
@@ -371,12 +399,15 @@ AT_A_GAP = "at the place of a missing mark"
 class Numbering:
     """Which dot of the target each located dot is.
 
-    table : dot, row, column, index (position in the frame of dots). unplaced : index, reason.
-    handedness : +1 when the target's x and y turn as u and v, -1 when mirrored, 0 when the image
-    cannot tell; +1 is assumed for targets equal to their mirror image.
-    equivalents : (K, n) dot ids of the table's n rows under each numbering that fits as well; row 0
-    is the table's own, -1 is no dot of the target. equivalent_handedness : (K,).
-    ambiguous : the numberings differ by more than the target's own symmetry. marks_found : dot ids.
+    table : one row for each of n numbered dots: dot (id), row, column, and index, the row of the
+    given table of dots. unplaced : the other dots: index, and reason why they have no number.
+    handedness : +1, -1 if the image shows the target mirrored, 0 if the image does not reveal it;
+    for a target that equals its mirror image, +1 is assumed.
+    equivalents : (K, n) ids of the n dots under each of the K numberings that fit equally well; row
+    0 is that of the table, -1 means that the target has no dot there.
+    equivalent_handedness : (K,) handedness under each of these numberings.
+    ambiguous : whether these numberings differ by more than rotations that leave the target
+    unchanged. marks_found : ids of the marks that the image shows.
     """
 
     table: pd.DataFrame
@@ -389,15 +420,19 @@ class Numbering:
 
 
 def number_dots(dots: pd.DataFrame, target: Target) -> Numbering:
-    """Number unordered dots (u_px, v_px, a_px, b_px, angle_rad[, ring]) of one image.
+    """Find out which dot of the target each located dot of an image is.
 
-    Raises DetectionError when there are too few dots, no grid, no marks, or too many candidates,
-    InputError when a column is missing or a value is not finite.
+    dots : table with the columns u_px, v_px, a_px, b_px, angle_rad and, for ring marks, ring, as
+    `locate_dots` returns it; the order of its rows does not matter.
+
+    Raises DetectionError if there are too few dots, no grid, no marks, or too many numberings that
+    fit equally well, and InputError if a column is missing or a value is not finite.
     """
     if not len(dots):
         raise DetectionError(
             "no dots found",
-            todo="check the exposure, [target] polarity in rig.toml, and that it is in view",
+            todo="check the exposure, [target] polarity in rig.toml, and that the target is in "
+            "view",
         )
     _check_columns(dots)
     points = dots[["u_px", "v_px"]].to_numpy(float)
@@ -430,7 +465,11 @@ def _check_columns(dots: pd.DataFrame) -> None:
 
 
 def check_handedness(handedness_by_image: Mapping[tuple[str, str], int], two_sided: bool) -> None:
-    """Raise DetectionError when the images (view, camera) of an opaque plate disagree."""
+    """Raise DetectionError if only some of the images show the target mirrored.
+
+    handedness_by_image : for each (view, camera) +1, -1 for a mirrored image, 0 for unknown.
+    two_sided : whether the plate may be seen from both sides; nothing is raised then.
+    """
     signs = {image: hand for image, hand in handedness_by_image.items() if hand}
     if two_sided or len(set(signs.values())) < 2:
         return
@@ -438,8 +477,9 @@ def check_handedness(handedness_by_image: Mapping[tuple[str, str], int], two_sid
     usual = first if sum(hand == first for hand in signs.values()) * 2 >= len(signs) else -first
     odd = [image for image, hand in signs.items() if hand != usual]
     todo = (
-        "a camera or an export flips the image: undo it; or the plate is transparent and seen "
-        "from behind: set [target] two_sided = true with its thickness and index"
+        "if a camera or an export flips the image, undo this; if the plate is transparent and "
+        "seen from behind, set two_sided = true, plate_thickness_mm and plate_index in rig.toml "
+        "[target]"
     )
     whole = _mirrored_camera(signs, odd)
     if whole:

@@ -51,7 +51,7 @@ class SeenTarget:
     diameter_px: float
 
     def turned(self, quarter: int) -> SeenTarget:
-        """Return the same target, counted after this many quarter turns."""
+        """Return the same target with rows and columns counted after ``quarter`` quarter turns."""
         odd = quarter % 2 == 1
         size = (self.rows, self.columns)[:: -1 if odd else 1]
         corners = np.array([[0, 0], [self.columns - 1, self.rows - 1]]) @ QUARTER_TURNS[quarter].T
@@ -61,10 +61,12 @@ class SeenTarget:
         return replace(self, rows=size[0], columns=size[1], marks=placed, pitch=pitch)
 
     def counted(self, like: Places = ()) -> SeenTarget:
-        """Return it counted so that most marks are at places of ``like``.
+        """Return the same target, turned by quarter turns into a standard orientation.
 
-        Otherwise it has at least as many columns as rows, and the first mark as early as can be.
-        The marks of a grid that is seen in part are counted from the first mark.
+        like : (row, column) of marks; the orientation with most marks at these places is chosen.
+        Without ``like``, the result has at least as many columns as rows, and the marks come as
+        early as possible in the order of rows. If the grid is seen only in part, rows and columns
+        of its marks are counted from the first mark.
         """
         every = [self.turned(quarter) for quarter in range(4)]
         if not self.whole:
@@ -73,7 +75,7 @@ class SeenTarget:
         return min(wide, key=lambda one: (-len({*one.marks} & {*like}), one.marks, -one.columns))
 
     def lines(self) -> list[str]:
-        """Return the lines of the table [target] that need no measure in mm."""
+        """Return the lines of rig.toml, table [target], that contain no lengths."""
         found = [f"rows = {self.rows}", f"columns = {self.columns}"]
         if self.marks:
             marks = ", ".join(f"[{row}, {column}]" for row, column in self.marks)
@@ -90,7 +92,10 @@ def _from_first(marks: Places) -> Places:
 
 
 def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
-    """Describe the grid among the dots (`locate_dots`) of an image; DetectionError without one."""
+    """Describe the grid of dots that an image shows. Raises DetectionError if there is no grid.
+
+    dots : what `locate_dots` returns. image_shape : (rows, columns) of the image.
+    """
     points = dots[["u_px", "v_px"]].to_numpy(float)
     shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
     lattice = _best_lattice(points, shapes)
@@ -166,10 +171,11 @@ def _marks(places: Ints, rings: Bools, large: Bools, empty: Ints) -> tuple[MarkS
 
 
 def agreed_target(seen: Sequence[SeenTarget]) -> SeenTarget:
-    """Return the description that most images agree with.
+    """Return the description of the target with which most images agree.
 
-    A grid that every third image shows as a whole, or that has no marks, is bounded. Of one that is
-    seen in part the most frequent of the largest sets of marks is taken.
+    seen : the description by each image. The grid counts as bounded if at least a third of the
+    images show it as a whole, or if no image shows marks. The marks of an unbounded grid are those
+    of the images that show most marks; among these the most frequent set is taken.
     """
     whole = [one for one in seen if one.whole]
     bounded = 3 * len(whole) >= len(seen) or not any(one.marks for one in seen)
@@ -191,7 +197,10 @@ def agreed_target(seen: Sequence[SeenTarget]) -> SeenTarget:
 
 
 def contradiction(seen: SeenTarget, target: Target) -> str:
-    """Say where the image shows the target's marks, if `rig.toml` has them elsewhere; else ""."""
+    """Return a sentence if an image contradicts the target that `rig.toml` states; otherwise "".
+
+    Its marks and its size are compared. seen : what the image shows. target : what rig.toml states.
+    """
     words, lines = [], []
     stated = _as_places(target.marks_column_row()[:, ::-1])
     counted = seen.counted(like=stated)
@@ -199,7 +208,7 @@ def contradiction(seen: SeenTarget, target: Target) -> str:
         kind = {"ring": "ring marks", "large": "large dots", "missing": "empty places"}
         style = kind[seen.mark_style or "large"]
         theirs = f"{target.mark_style} marks at {_words(stated)}" if stated else "no marks"
-        frame = "of the grid" if seen.whole else "counted from the first"
+        frame = "of the grid" if seen.whole else "counted from the first mark"
         words.append(
             f"the image shows {len(seen.marks)} {style} at (row, column) {_words(counted.marks)} "
             f"{frame}; rig.toml says {theirs}"

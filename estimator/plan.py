@@ -72,13 +72,16 @@ class Experiment:
 
     rate_hz, seconds : frame rate, and duration of the run.
     bubbles : number of bubbles in sight.
-    diameter_mm : of a bubble; it gives the noise of its centre (`centre_sigma_px`).
-    sigma_px : standard deviation of a centre in px; None for that of the diameter.
-    rise_mm_s : rise velocity, which the stage follows.
+    diameter_mm : diameter of a bubble.
+    sigma_px : standard deviation of the centre of a bubble's outline in px; None takes the one that
+    `centre_sigma_px` gives for the diameter.
+    rise_mm_s : rise velocity, with which the stage follows the bubbles.
     zigzag_hz, zigzag_mm : frequency and RMS of the path's zigzag across the vertical.
-    shake_hz, shake_mm : frequency and RMS along the vertical of the rig's shake; across it, half.
-    marks : number of marks in each view that are fixed to the tank; mark_sigma_px : their noise.
-    arms : whether each camera's arm carries an accelerometer, besides those of rig.toml.
+    shake_hz, shake_mm : frequency of the rig's shake, and its RMS along the vertical; the RMS
+    across the vertical is half of this.
+    marks : number of marks in each view that are fixed to the tank. mark_sigma_px : standard
+    deviation of a mark's centre.
+    arms : whether each camera's arm carries an accelerometer in addition to those of rig.toml.
     """
 
     rate_hz: float = 500.0
@@ -123,12 +126,15 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Expected:
-    """Hold what a planned run is expected to reach; medians without the first and last tenth.
+    """Hold the standard deviations that a planned run is expected to have.
 
-    verdict : of the worst axis.
-    position_um, velocity_mm_s : (3,) standard deviations along the rig's axes.
-    known_um : (3,) those of positions if the shake were known.
-    sigma_px : noise of a bubble's centre that was used.
+    All are medians over the run without its first and last tenth.
+
+    verdict : the verdict on the worst axis.
+    position_um, velocity_mm_s : (3,) standard deviations of positions and velocities along the
+    rig's axes.
+    known_um : (3,) standard deviations that positions would have if the shake were known.
+    sigma_px : standard deviation of a bubble's centre in the images that was assumed.
     """
 
     verdict: Verdict
@@ -141,9 +147,9 @@ class Expected:
 def centre_sigma_px(diameter_px: float) -> float:
     """Return the standard deviation in px of the centre of a bubble's outline.
 
-    It is the Cramer-Rao bound for a blurred disc in white noise of 1 % of the contrast with a blur
-    of 1 px, and 1 % of the radius for the shape: the centre of an outline wanders when the body
-    oscillates (docs/decisions/007).
+    It consists of two parts. One is the Cramer-Rao bound for a disc with a blur of 1 px in white
+    noise of 1 % of the contrast. The other is 1 % of the radius, because the centre of an outline
+    wanders when the body oscillates (docs/decisions/007).
     """
     radius, blur = diameter_px / 2, np.hypot(_BLUR_PX, np.sqrt(1 / 12))
     noise = _IMAGE_NOISE * np.sqrt(2 * blur / (np.sqrt(np.pi) * radius))
@@ -155,8 +161,10 @@ def expected_calibration(
 ) -> Calibration:
     """Return the calibration that hand-held views of the target of rig.toml are expected to give.
 
-    Its cameras are the nominal ones and its covariance is the Cramer-Rao bound: that of exact dots
-    whose stated noise is ``sigma_px``.
+    The cameras are the nominal ones, and the covariance is the Cramer-Rao bound.
+
+    views : number of views. sigma_px : standard deviation of a dot's centre. seed : of the random
+    poses of the target.
 
     Raises InputError if the target does not fit into the views.
     """
@@ -255,9 +263,11 @@ def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -
 def planned_problem(
     rig: RigDescription, calibration: Calibration, planned: Experiment, sigma_px: float
 ) -> SmoothingProblem:
-    """Return the smoothing problem of a run without noise in which nothing shakes.
+    """Return the smoothing problem of a simulated run without noise and without shake.
 
-    The stage follows the bubbles, which rise straight, at places spread over the field.
+    The bubbles rise along straight lines at places spread over the field of view, and the stage
+    follows them.
+    sigma_px : standard deviation that is stated for a bubble's centre.
     """
     cameras, travel = calibration.cameras, travel_of(calibration.stage, rig.stage)
     mounting = Mounting.of(rig.stage, travel.axis)
@@ -350,7 +360,7 @@ def _accelerometers(
 def planned_model(
     problem: SmoothingProblem, rig: RigDescription, planned: Experiment
 ) -> ShakeModel:
-    """Return the true hyper-parameters of the planned run."""
+    """Return the hyper-parameters of the planned run, which count as true."""
     across, up = 1 - np.abs(problem.up), np.abs(problem.up)
 
     def triple(values: Array) -> tuple[float, float, float]:
@@ -420,7 +430,10 @@ def variants(rig: RigDescription, planned: Experiment) -> dict[str, Experiment]:
 
 
 def plan_table(expected: dict[str, Expected]) -> pd.DataFrame:
-    """Return the expectations as a table: variant, verdict, standard deviations along each axis."""
+    """Return a table with a row for each variant: its verdict and standard deviations per axis.
+
+    expected : what `expect` returned, by the name of the variant.
+    """
     rows = [
         {
             "variant": name, "verdict": str(one.verdict), "sigma_px": one.sigma_px,

@@ -66,10 +66,13 @@ _MOST_APART = 4
 
 @dataclass(frozen=True)
 class Series:
-    """M ray misses in time, which are linear in K unknowns of unit prior variance.
+    """M ray misses in time, which are linear in K unknown numbers of unit prior variance.
 
-    frame, bubble : (M,) indices. t_s, miss_mm : (M,). relative : (M,) variance over the median
-    variance. by_unknowns : (M, K).
+    The unknowns are the errors of the calibration and the movement.
+
+    frame, bubble : (M,) indices. t_s : (M,) times. miss_mm : (M,) ray misses.
+    relative : (M,) variance of each ray miss due to its pixels, divided by the median of these.
+    by_unknowns : (M, K) derivative of the ray misses with respect to the unknowns, in mm.
     """
 
     frame: Ints
@@ -86,7 +89,7 @@ class Series:
         return Series(*(getattr(self, column.name)[keep] for column in fields(self)))
 
     def residuals(self) -> Array:
-        """Return the ray misses (M,) minus their least-squares fit by the unknowns."""
+        """Return the ray misses (M,) in mm minus what a least-squares fit of the unknowns gives."""
         fit = np.linalg.lstsq(self.by_unknowns, self.miss_mm, rcond=None)[0]
         return np.asarray(self.miss_mm - self.by_unknowns @ fit)
 
@@ -95,9 +98,11 @@ class Series:
 class Noise:
     """The hyper-parameters of the noise of ray misses.
 
-    white_mm : standard deviation of a pair's white noise. wander_mm, wander_s : of each bubble's
-    Ornstein-Uhlenbeck process. shake : RMS (mm), decay time (s) and frequency (Hz) of each
-    oscillation that all pairs share.
+    white_mm : standard deviation of each pair's white noise.
+    wander_mm, wander_s : RMS and correlation time of each bubble's Ornstein-Uhlenbeck process, the
+    wander of its outline's centre.
+    shake : RMS (mm), decay time (s) and frequency (Hz) of each oscillation that all pairs of a
+    frame share.
     """
 
     white_mm: float
@@ -106,11 +111,14 @@ class Noise:
     shake: tuple[tuple[float, float, float], ...] = ()
 
     def own(self, lag_s: Array) -> Array:
-        """Return the autocovariance of a bubble's wander at the lags, in mm^2."""
+        """Return the autocovariance (mm^2) of a bubble's wander at the lags (s), in their shape."""
         return np.asarray(self.wander_mm**2 * np.exp(-np.abs(lag_s) / self.wander_s))
 
     def common(self, lag_s: Array) -> Array:
-        """Return the autocovariance (mm^2) of the shake at the lags: damped resonators."""
+        """Return the autocovariance (mm^2) of the shake at the lags (s), in their shape.
+
+        The shake is a sum of damped resonators.
+        """
         out = np.zeros_like(lag_s)
         for rms, decay, hz in self.shake:
             lag, turn = np.abs(lag_s), 2 * np.pi * hz
@@ -119,7 +127,11 @@ class Noise:
         return out
 
     def slopes(self, lag_s: Array) -> tuple[Array, Array]:
-        """Return derivatives of `own` (2, L) and `common` (3 n, L) by logarithms of numbers."""
+        """Return the derivatives of `own` and `common` with respect to the hyper-parameters.
+
+        They are with respect to the logarithms of (wander_mm, wander_s), as (2, L) at L lags, and
+        of (RMS, decay time, frequency) of each of n oscillations, as (3 n, L).
+        """
         lag, own = np.abs(lag_s), self.own(lag_s)
         common = []
         for rms, decay, hz in self.shake:
@@ -132,7 +144,7 @@ class Noise:
         return np.array([2 * own, own * lag / self.wander_s]), np.reshape(common, (-1, len(lag)))
 
     def covariance(self, series: Series) -> Array:
-        """Return the covariance (M, M) of the ray misses, with the unknowns held fixed."""
+        """Return the covariance (M, M) in mm^2 of M ray misses for fixed unknowns."""
         t, index = np.unique(series.t_s, return_inverse=True)
         at = np.ix_(index, index)
         lag = t[:, None] - t
@@ -190,10 +202,11 @@ class _Spectrum:
 
 
 def learned_noise(parts: list[Series]) -> Noise:
-    """Return the noise model with the largest posterior, from the spectra of stretches' residuals.
+    """Return the most probable noise model of the ray misses of a run.
 
-    At most two oscillations (one for the arm of each camera) are added, as long as each raises the
-    log posterior by `_LEAST_LOG_RATIO`.
+    parts : stretches of the run; the spectra of their residuals are used. At most two oscillations
+    (one for the arm of each camera) are added, as long as each raises the log posterior by
+    `_LEAST_LOG_RATIO`.
     """
     spread = max(float(np.concatenate([p.residuals() for p in parts]).std()), 1e-7)
     start = np.log([spread / 2, spread / 4, _WANDER_S])
@@ -284,9 +297,11 @@ def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
 
 
 def information(series: Series, noise: Noise) -> tuple[Array, Array, Array]:
-    """Return the normal equations (K, K), (K,) without prior, and leave-one-out residuals (M,).
+    """Return what a stretch of M ray misses says about the K unknowns.
 
-    The residuals are in standard deviations, at the best unknowns of this stretch.
+    Returns the matrix (K, K) and right-hand side (K,) of the normal equations, without the prior,
+    and the leave-one-out residuals (M,) in standard deviations, for the unknowns that fit this
+    stretch best.
     """
     from scipy.linalg import cho_solve, cholesky
 
@@ -321,7 +336,10 @@ _LEAST_SINE = 0.05
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """Wide prior standard deviations of a movement; InputError for values that are not positive."""
+    """Prior standard deviations of a movement of the second camera, along and about each axis.
+
+    They are wide. Raises InputError for values that are not positive.
+    """
 
     rotation_rad: float = 5e-3
     translation_mm: float = 0.2
@@ -329,8 +347,9 @@ class DriftPrior:
     def __post_init__(self) -> None:
         if not (self.rotation_rad > 0 and self.translation_mm > 0):
             raise InputError(
-                f"a drift prior of {self.rotation_rad} rad and {self.translation_mm} mm",
-                todo="give positive standard deviations",
+                f"the prior standard deviations of a movement are {self.rotation_rad} rad and "
+                f"{self.translation_mm} mm",
+                todo="give two positive numbers",
             )
 
 
@@ -338,12 +357,14 @@ class DriftPrior:
 class RigChange:
     """The movement of the second camera relative to the first since the calibration.
 
-    tangent, covariance : (6,), (6, 6) of rig_from_<camera> with the components `POSE_COMPONENTS`, 0
-    in directions that ray misses do not identify. place_mm : (3,) mean position of the bubbles, to
-    which the offset refers.
-    values, sigmas, prior_sigmas : (3,) offset along n (mm), roll and pitch (rad). chance : p-value
-    of no movement. pairs : number of pairs used. refined : pose rig_from_<camera> that calibration
-    and run give together, or None.
+    camera : name of the second camera.
+    tangent, covariance : (6,), (6, 6) movement as a tangent of the pose rig_from_<camera>, with the
+    components `POSE_COMPONENTS`; 0 in directions that ray misses do not identify.
+    place_mm : (3,) mean position of the bubbles in the rig frame, to which the offset refers.
+    values, sigmas, prior_sigmas : (3,) estimate, standard deviation and prior standard deviation of
+    the offset along the common perpendicular (mm), the roll and the pitch (rad).
+    chance : p-value of the hypothesis that nothing has moved. pairs : number of pairs used.
+    refined : pose rig_from_<camera> that calibration and run give together, or None.
     """
 
     camera: str
@@ -403,9 +424,11 @@ def _rounded(value: float, sd: float) -> str:
 
 
 def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
-    """Return the unit vector n (3,), first x second line of sight, and the rig point (3,) closest.
+    """Return the common perpendicular of the two lines of sight.
 
-    Raises CalibrationError for cameras that look along one line.
+    Returns its unit vector n (3,), in the direction of first x second line of sight, and the point
+    (3,) in mm midway between the two lines where they come closest, both in the rig frame. Raises
+    CalibrationError for cameras that look along one line.
     """
     rays = [c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2) for c in cameras]
     cross = np.cross(rays[0][1], rays[1][1])[0]
@@ -421,7 +444,11 @@ def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class RayMisses:
-    """M ray misses along n (mm), their variances due to pixels, and derivatives (M, P)."""
+    """M ray misses along the common perpendicular.
+
+    miss_mm : (M,). variance_mm2 : (M,) variances due to the pixels' noise. by_rig : (M, P)
+    derivatives with respect to the P parameters of the rig, see `rig_jacobian`.
+    """
 
     miss_mm: Array
     variance_mm2: Array
@@ -435,12 +462,16 @@ def ray_misses(
     uv_px: Array | None = None,
     covariance_px2: Array | None = None,
 ) -> RayMisses:
-    """Return the ray misses of M pairs, linearised at rig points (M, 3) near them.
+    """Return the ray misses of M pairs of pixels.
+
+    free : for each camera the names of its free intrinsics.
+    points_mm : (M, 3) points in the rig frame near the pairs, at which the cameras are linearised.
+    uv_px : (M, 2, 2) the pixels (u, v) of each pair in both cameras; None sets the misses to 0.
+    covariance_px2 : (M, 2, 2, 2) of these pixels; None sets the variances to 0.
 
     The left null vector of the projection's Jacobian combines a pair's four pixel coordinates such
-    that the point does not matter; it is scaled to the shift of the second camera along n.
-    free : for each camera its free intrinsics. uv_px : (M, 2, 2); covariance_px2 : (M, 2, 2, 2);
-    without them ray misses and variances are 0.
+    that the position of the point has no effect. It is scaled such that the ray miss equals the
+    shift of the second camera along the common perpendicular.
     """
     n, _ = common_perpendicular(cameras)
     predicted, by_point = stacked_jacobian(cameras, points_mm)
@@ -458,9 +489,10 @@ def ray_misses(
 
 
 def drift_covariance(cameras: Pair, prior: DriftPrior) -> Array:
-    """Return the prior covariance (6, 6) of a movement in directions that cause ray misses.
+    """Return the prior covariance (6, 6) of a movement of the second camera.
 
-    They are compared over the volume that both cameras see.
+    Directions of movement that cause hardly any ray misses in the volume that both cameras see have
+    the variance 0. The components are `POSE_COMPONENTS` (rad, mm).
     """
     _, middle = common_perpendicular(cameras)
     reach = min(min(c.image_size_px) / c["scale_px_per_mm"] / 2 for c in cameras)
@@ -481,7 +513,11 @@ def rig_change_from(
     pairs: int,
     refined: Pose | None = None,
 ) -> RigChange:
-    """Return a movement with offset (at ``place_mm``), roll and pitch, from its tangent (6,)."""
+    """Return a movement with offset, roll and pitch, from its tangent.
+
+    tangent, covariance, prior : (6,), (6, 6), (6, 6) estimate, its covariance and the covariance of
+    its prior. place_mm : (3,) point to which the offset refers. pairs, refined : see `RigChange`.
+    """
     rows = offset_roll_pitch(cameras, place_mm)
     sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
     return RigChange(
@@ -491,7 +527,11 @@ def rig_change_from(
 
 
 def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
-    """Return the matrix (3, 6) from the tangent of rig_from_second to offset, roll and pitch."""
+    """Return the matrix (3, 6) that gives offset (mm), roll and pitch (rad) of a movement.
+
+    It is applied to the movement's tangent (6,) of the second camera's pose rig_from_camera.
+    place_mm : (3,) point in the rig frame to which the offset refers.
+    """
     n, _ = common_perpendicular(cameras)
     pose = cameras[1].camera_from_rig
     across = pose.rotation @ n
@@ -503,10 +543,13 @@ def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
 
 
 def p_value_of(tangent: Array, covariance: Array, prior: Array) -> float:
-    """Return the p-value of an estimate under the hypothesis of no movement.
+    """Return the p-value of an estimated movement under the hypothesis that nothing has moved.
 
-    It is a chi-square test over the directions that the prior leaves free. The prior shrinks the
+    It is a chi-square test over the directions with a prior variance above 0. The prior shrinks the
     estimate towards 0, so the true p-value is smaller.
+
+    tangent, covariance, prior : (6,), (6, 6), (6, 6) estimate, its covariance and the covariance of
+    its prior.
     """
     from scipy.special import chdtrc
 
@@ -519,9 +562,9 @@ def p_value_of(tangent: Array, covariance: Array, prior: Array) -> float:
 
 
 def covariance_root(covariance: Array, singular: float = _SINGULAR) -> Array:
-    """Return a square root (P, k) of a covariance (P, P): its k directions of non-zero variance.
+    """Return a matrix R (P, k) with R R^T = covariance (P, P) of rank k.
 
-    singular : share of the largest eigenvalue of the correlation matrix that counts as 0.
+    singular : eigenvalues of the correlation matrix below this share of the largest one count as 0.
     """
     unit = _scale(covariance)
     values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
@@ -536,7 +579,12 @@ def _scale(covariance: Array) -> Array:
 
 
 def rig_block(calibration: Calibration) -> tuple[Array, Free]:
-    """Return the covariance of the cameras' parameters (zero if none), and the free intrinsics."""
+    """Return the covariance (P, P) of the cameras' parameters, and for each camera the names of its
+    free intrinsics.
+
+    The P parameters are ordered as in `rig_jacobian`. A calibration without a covariance gives a
+    matrix of zeros and no free intrinsics.
+    """
     if calibration.covariance.size:
         return calibration.covariance, calibration.free
     return np.zeros((POSE, POSE)), ((), ())
@@ -555,11 +603,14 @@ def with_drift(covariance: Array, drift: Array) -> Array:
 def drift_posterior(
     rig: Array, rig_covariance: Array, prior_rig: Array, drift: Array
 ) -> tuple[Array, Array]:
-    """Return the movement (6,) in an error of the cameras' parameters, and its covariance.
+    """Return the movement (6,) of the second camera, and its covariance (6, 6).
 
-    By Gaussian conditioning it is a gain times the sum of calibration error and movement, whose
-    posterior is rig (P,), rig_covariance (P, P). prior_rig : (P, P) of the calibration. drift : (6,
-    6).
+    A run determines only the sum of the calibration's error and the movement. By Gaussian
+    conditioning, the movement is a gain times this sum.
+
+    rig, rig_covariance : (P,), (P, P) posterior of the sum, for the cameras' P parameters.
+    prior_rig : (P, P) covariance of the calibration. drift : (6, 6) prior covariance of the
+    movement.
     """
     total = with_drift(prior_rig, drift)
     unit = _scale(total)
@@ -594,7 +645,8 @@ _STRETCH_S = 2.0
 _LEARNED_FROM = 2
 _PASSES = 3
 _SHAPE_PX = 0.02
-"""Constant error of each bubble's centre in each view that its outline does not reveal."""
+"""Standard deviation of the constant error of each bubble's centre in each view that its outline
+does not reveal."""
 
 
 class PairCollector:
@@ -635,7 +687,7 @@ class PairCollector:
 
 
 def pair_columns(cameras: Sequence[str]) -> list[str]:
-    """Return the names of the columns of tracks.csv that the estimate needs."""
+    """Return the names of the columns of tracks.csv that `rig_change` uses."""
     pixels = ("u_px", "v_px", "du_px", "dv_px", "suu_px2", "suv_px2", "svv_px2")
     base = ["frame", "particle", "t_s", "x_mm", "y_mm", "z_mm", "ray_miss_mm"]
     return base + [f"{c}_{p}" for c in cameras for p in pixels]
@@ -644,9 +696,11 @@ def pair_columns(cameras: Sequence[str]) -> list[str]:
 def rig_change(
     tracks: pd.DataFrame, calibration: Calibration, prior: DriftPrior | None = None
 ) -> tuple[RigChange, Noise] | None:
-    """Return the movement estimated from a table of tracks, and the noise model of its ray misses.
+    """Estimate how the second camera has moved since the calibration, from the tracks of a run.
 
-    Returns None for fewer than `LEAST_PAIRS` reliable pairs, or not exactly two cameras.
+    tracks : table with the columns `pair_columns`. prior : of the movement; None for `DriftPrior`.
+    Returns the movement and the noise model of the ray misses; None if there are fewer than
+    `LEAST_PAIRS` reliable pairs, or not exactly two cameras.
     """
     if len(calibration.cameras) != 2 or len(tracks) < LEAST_PAIRS:
         return None
@@ -729,16 +783,20 @@ def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
 def with_change(
     model: PairModel, change: RigChange | None, calibration: Calibration
 ) -> dict[str, Any]:
-    """Return the part ``pairs`` of tracking.json; a movement replaces an offset's sentence."""
+    """Return the part ``pairs`` of tracking.json.
+
+    model : the statistics of the run's pairs. change : the estimated movement, or None. If the
+    camera has moved, the sentence on this replaces the one on an offset of the calibration.
+    """
     words, moved = model.sentences(), change is not None and change.moved
     if change is not None and moved:
         words = model.sentences(without=[Finding.CALIBRATION_OFFSET])
         first = calibration.cameras[0].name
         unsure = "" if np.any(calibration.covariance) else " (or the calibration was never right)"
         words.append(
-            f"Camera {change.camera!r} has moved against {first!r} since the calibration{unsure}, "
-            f"{change.size_words()}. All positions are off by this movement. Calibrate again, or "
-            "smooth the run with --refine-rig."
+            f"Camera {change.camera!r} has moved against {first!r} since the "
+            f"calibration{unsure}, {change.size_words()}. All positions are wrong because of this "
+            "movement. Calibrate again, or smooth the run with --refine-rig."
         )
     return {
         "bias_px": model.bias_px,
@@ -751,9 +809,9 @@ def with_change(
 
 
 def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return stretches of a run with at most about 520 pairs each, spread evenly over the run.
+    """Return parts of a table of tracks, with at most about 520 pairs each, spread over the run.
 
-    Where many bubbles are seen they use only every second, third, ... frame.
+    If many bubbles are seen, the parts use only every second, third, ... frame.
     """
     frames, counts = np.unique(table["frame"].to_numpy(np.int64), return_counts=True)
     most = max(4, int(_MOST_ROWS / float(counts.mean())))

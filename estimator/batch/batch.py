@@ -49,7 +49,11 @@ _stopped = threading.Event()
 
 
 def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
-    """Do a job in this process; return status, words and figures. ``stage`` gets the progress."""
+    """Do a job in this process.
+
+    stage : is called with the progress; None for nobody.
+    Returns a mapping with "status", "words" (the reason of a failure) and "figures".
+    """
     if job.only_report:
         return _draw(job)
     return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
@@ -106,7 +110,9 @@ def _outcome(job: Job) -> dict[str, Any]:
     """Run a job in a new process and return its result, or a failure if the process dies."""
     if not Path(job.dataset).is_dir():
         return failure(
-            FAILED, f"{job.dataset}: this machine has no such folder; share it with this machine"
+            FAILED,
+            f"{job.dataset}: the computer that does this job has no such folder; make the folder "
+            "available there under the same path",
         )
     environment = {**dict.fromkeys(_ONE_THREAD, "1"), **os.environ}
     child = subprocess.Popen(
@@ -127,7 +133,9 @@ def _outcome(job: Job) -> dict[str, Any]:
     tail = messages.strip()[-_KEPT_OUTPUT:]
     return failure(
         CRASHED,
-        f"{how}: {tail}" if tail else f"{how} without a message; was there too little memory?",
+        f"{how}: {tail}"
+        if tail
+        else f"{how} without a message. A frequent cause is too little memory: try fewer --workers",
     )
 
 
@@ -155,7 +163,7 @@ def _answer(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
 
 
 def failure(status: str, words: str) -> dict[str, Any]:
-    """Return the result of a job that failed."""
+    """Return the result of a job that failed: its status, the reason, and no figures."""
     return {"status": status, "words": words, "figures": {}}
 
 
@@ -244,9 +252,11 @@ def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 
 def summary_line(job: Job, result: Mapping[str, Any], *, whole_path: bool = False) -> str:
-    """Return the result of a job in one line.
+    """Return the result of a job in one line for the user.
 
-    whole_path : whether the full path of the dataset is given, for datasets with equal names.
+    result : what `perform` returned, or a record of the journal.
+    whole_path : whether the line names the dataset by its full path, as it must if two datasets
+    have the same name.
     """
     place = job.dataset if whole_path else Path(job.dataset).name
     what = f"{job.kind} {place}" + (f" {job.run}" if job.run else "")
@@ -287,8 +297,8 @@ class Journal:
     def write(self, job: Job, result: Mapping[str, Any], inputs: str) -> dict[str, Any]:
         """Write the result of a job to the journal and return the record.
 
-        inputs : `fingerprint` of the job before it began: if one changes meanwhile, the job is done
-        again.
+        inputs : `fingerprint` of the job before it began. If an input has changed while the job was
+        running, the job is therefore done again next time.
         """
         record = {
             "kind": job.kind, "dataset": job.dataset, "run": job.run, **result,
@@ -300,7 +310,7 @@ class Journal:
 
 
 def table_of(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return the records as a table with one row per job, in their order.
+    """Return the journal's records of the jobs as a table, one row per job in the given order.
 
     The columns are `COLUMNS`, `FIGURES` and words, which gives the reason of a failure.
     """
@@ -323,9 +333,10 @@ def _first_line(words: object) -> str:
 def write_batch(
     records: Sequence[Mapping[str, Any]], folder: Path, *, report: bool = True, again: str = ""
 ) -> pd.DataFrame:
-    """Write batch.csv, batch.json and report.html to ``folder`` and return the table of `table_of`.
+    """Write batch.csv, batch.json and report.html to ``folder``, and return the table in batch.csv.
 
-    again : the command line that makes them again; "" for `telerig batch`.
+    records : the journal's record of each job. report : whether report.html is written.
+    again : the command line that makes the files again; "" for `telerig batch`.
     """
     table = table_of(records)
     name = Path(folder).resolve().name
@@ -341,7 +352,10 @@ def write_batch(
 
 
 def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the summary: the number of jobs of each kind and status, and every failure."""
+    """Return a summary in words: the number of jobs of each kind and status, and every failure.
+
+    records : the journal's record of each job.
+    """
     lines = []
     for kind in ("calibrate", "track", "smooth"):
         of_kind = [r for r in records if r["kind"] == kind]
@@ -363,7 +377,8 @@ def _listed(counts: Mapping[str, int]) -> str:
 
 
 Tell = Callable[[Job, dict[str, Any], int, int], None]
-"""Function that is told the progress: (job, its record, number of jobs done, number of jobs)."""
+"""Function that is called after each job with (job, its record, number of jobs done, number of
+jobs)."""
 
 _CONNECT_S = 20
 
@@ -371,11 +386,13 @@ _CONNECT_S = 20
 def run_batch(
     jobs: Sequence[Job], executor: Executor, journal: Journal, *, tell: Tell | None = None
 ) -> list[dict[str, Any]]:
-    """Do all jobs, each after those that it needs, and return their records in the same order.
+    """Do all jobs, each after the jobs that it needs, and return their records in the given order.
 
-    A job that ``journal`` records as done with the same inputs is not done again; a report that is
-    missing and wanted is drawn. If a job fails, only the jobs that need it are left out, and their
-    records name it. executor : runs `perform`. tell : is called after each job.
+    A job that ``journal`` records as done with the same inputs is not done again; only a report
+    that is wanted but missing is then drawn. If a job fails, the jobs that need its result are left
+    out, and their records name the failed job; all others are done.
+
+    executor : runs `perform` of each job. tell : is called after each job.
     """
     by_name = {job.name: job for job in jobs}
     records: dict[str, dict[str, Any]] = {}
@@ -458,10 +475,13 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 def dask_executor(address: str, option: str = "--scheduler") -> Iterator[Executor]:
     """Give an executor that uses the workers of a running Dask cluster.
 
-    The datasets must be at the same paths on every worker. If a worker dies, its job is done again
-    by another one, as often as the cluster's setting allowed-failures permits. address :
-    tcp://host:port of the scheduler; option : the one that named it, for messages. Raises
-    InputError if Dask is not installed, if no scheduler answers, or if it has no workers.
+    The datasets must be at the same paths on every worker. If a worker dies, another one does its
+    job again, as often as the cluster's setting allowed-failures permits.
+
+    address : tcp://host:port of the scheduler. option : name of the command-line option with which
+    the user gave the address, for messages.
+    Raises InputError if Dask is not installed, if no scheduler answers, or if the scheduler has no
+    workers.
     """
     try:
         from distributed import Client

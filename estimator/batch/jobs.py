@@ -30,11 +30,14 @@ _INPUTS = {"calibrate": ("calibration", "stage_axis")}
 class Job:
     """The calibration of one dataset, or the tracking or smoothing of one run; paths are text.
 
-    run : "" for a calibration. calibration : file for all runs; "" for the dataset's own. model,
-    medium : of a calibration. shake, refine_rig, accept : of a smoothing, see `telerig.smooth`.
+    run : name of the run; "" for a calibration.
+    calibration : calibration.json to use; "" for that of the dataset.
+    model, medium : options of a calibration, see `telerig.calibrate`.
+    shake, refine_rig, accept : options of a smoothing, see `telerig.smooth`.
     cluster : address of the Dask scheduler whose workers detect bubbles; "" for this computer.
-    tracks : tracks.csv or its folder; "" for the results folder. report : write report.html.
-    only_report : do nothing else. needs : names of jobs to be done before.
+    tracks : tracks.csv or its folder; "" for the run's results folder.
+    report : whether to write report.html. only_report : whether to write nothing else.
+    needs : names of the jobs that have to be done before.
     """
 
     kind: Kind
@@ -125,18 +128,27 @@ def jobs_of(
     only: Sequence[str] = (),
     strict: bool = False,
 ) -> list[Job]:
-    """Return calibration, tracking and smoothing of every dataset, each after what it needs.
+    """Return the jobs of a batch: calibration, tracking and smoothing of every dataset.
 
-    calibration : for all datasets; then none is calibrated. tracks : a folder with tracks in a
-    folder for each run, or None; only where nothing is tracked. only : kinds of jobs (`KINDS`) and
-    names of runs to be done. strict : a dataset that cannot be used raises InputError; otherwise it
-    becomes a calibration job that fails.
-    A dataset without views must have been calibrated before. Raises InputError for folders that do
-    not exist or are named twice, for unknown runs, and for options of jobs that are not done.
+    A job stands after the jobs that it needs. A dataset without views of the target must have been
+    calibrated before.
+
+    calibration : a calibration.json to use for all datasets, none of which is then calibrated.
+    model, medium, shake, refine_rig, accept, cluster, report : see `Job`.
+    tracks : folder with a folder of tracks for each run, if nothing is tracked; None for the
+    results folders.
+    only : kinds of jobs (`KINDS`) and names of runs to do; all if empty.
+    strict : whether a dataset that cannot be used raises InputError; otherwise it becomes a
+    calibration job that fails.
+    Raises InputError for folders that do not exist or are named twice, for unknown runs, and for
+    options of jobs that are not done.
     """
     kinds, only = kinds_and_runs(only)
     if tracks is not None and "track" in kinds:
-        raise InputError("--tracks is given, and runs are tracked", todo="add --only smooth")
+        raise InputError(
+            "--tracks is given, but this command would track the runs anew",
+            todo="add --only smooth, or leave --tracks out",
+        )
     places = _checked(datasets)
     shared: dict[str, Any] = {
         "calibration": "" if calibration is None else str(Path(calibration).resolve()),
@@ -163,7 +175,7 @@ def jobs_of(
 def kinds_and_runs(only: Iterable[str]) -> tuple[tuple[Kind, ...], list[str]]:
     """Return the kinds of jobs and the names of runs among the words of `--only`.
 
-    All kinds are returned where none is named.
+    If no kind is named, all kinds are returned.
     """
     words = list(only)
     kinds = tuple(kind for kind in KINDS if kind in words)
@@ -180,7 +192,7 @@ def shake_model(model: str, shake: str | None, only: Iterable[str]) -> tuple[str
     if smooths_only and shake is None:
         model, shake = "auto", model
     elif model == "default":
-        todo = "say --shake default; --model names a lens model unless --only smooth is given"
+        todo = "give --shake default for the shake's priors; --model names a lens model here"
         raise InputError("--model default is no lens model", todo=todo)
     if (shake or "auto") not in SHAKE_MODELS:
         option = "--model" if smooths_only else "--shake"
@@ -200,12 +212,16 @@ def _with_tracks(jobs: Sequence[Job], tracks: Path) -> list[Job]:
 
 
 def check_distinct(folders: Sequence[str], option: str) -> None:
-    """Raise InputError where two runs would have the same folder in that of an option."""
+    """Raise InputError if two runs would use the same folder.
+
+    folders : folder of each run. option : command-line option that named their common parent.
+    """
     twice = next((folder for folder in folders if folders.count(folder) > 1), None)
     if twice is not None:
         raise InputError(
-            f"several runs are named {Path(twice).name!r}, and {option} has one folder for them",
-            todo="give them in commands of their own, each with its own folder",
+            f"several runs are named {Path(twice).name!r}, so they would share one folder in that "
+            f"of {option}",
+            todo=f"use a command for each of these runs, each with another {option}",
         )
 
 
@@ -248,8 +264,8 @@ def _check_only(jobs: Sequence[Job], only: Sequence[str]) -> None:
         if run not in known:
             raise InputError(
                 f"no dataset has a run {run!r}", where="--only",
-                todo="leave --only out, name runs as their folders in runs/ are named, or kinds of "
-            f"jobs: {', '.join(KINDS)}",
+                todo="give --only the name of a folder in runs/ or a kind of job "
+            f"({', '.join(KINDS)}), or leave it out",
             )  # fmt: skip
 
 
@@ -292,10 +308,10 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
 
 
 def fingerprint(job: Job) -> str:
-    """Return a hash of what the result of a job depends on, not its report: version, options,
-    inputs.
+    """Return a hash of all that the result of a job depends on: version, options and input files.
 
-    Recorded files enter by size and time of change, calibrations and tracks by their content.
+    Recorded files enter by size and time of change, calibrations and tracks by their content. The
+    report does not change the hash.
     """
     stated = replace(job, report=True, only_report=False, cluster="")
     hashed = hashlib.sha256(f"{VERSION} {stated.as_json()}".encode())

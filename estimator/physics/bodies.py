@@ -23,11 +23,14 @@ _KEYS = ["frame", "particle"]
 def bodies_table(
     tracks: Any, cameras: tuple[Camera, ...], up: Array
 ) -> tuple[pd.DataFrame, Deviations]:
-    """Return the bodies of a run with the columns `BODY_COLUMNS`, and what the run told of them.
+    """Return size and shape of each bubble in each frame of a run.
 
-    tracks : `Tracks`, or a table with the columns of tracks.csv, whose diameters are then all that
-        is known. up : (3,) unit vector against gravity in the rig frame.
-    A frame in which an outline is missing, cut or covered has no row.
+    tracks : `Tracks`; or a table with the columns of tracks.csv, for which only the diameters are
+        known.
+    up : (3,) unit vector against gravity in the rig frame.
+
+    Returns a table with the columns `BODY_COLUMNS`, without rows for frames in which an outline is
+    missing, cut or covered; and how the outlines of this run deviate from those of spheroids.
     """
     table = getattr(tracks, "table", tracks)
     detections = getattr(tracks, "detections", None)

@@ -30,8 +30,9 @@ def frames_table(
 ) -> pd.DataFrame:
     """Return the content of bubbles.csv: one row for each row of trajectories.csv.
 
-    bodies : what `bodies_table` returns; None if no size is known. up : (3,) unit vector against
-    gravity. fluid : as for `liquid_of`; without one the dimensionless numbers are NaN.
+    bodies : the table that `bodies_table` returns; None if no size is known.
+    up : (3,) unit vector against gravity in the rig frame. gravity_m_s2 : its magnitude.
+    fluid : as for `liquid_of`; if it is None, the dimensionless numbers are NaN.
     """
     liquid = liquid_of(fluid, gravity_m_s2)
     size = BODY_COLUMNS[2:]

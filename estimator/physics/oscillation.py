@@ -18,11 +18,12 @@ _NEAR_PERIODS, _OWN_PERIODS = 5.0, 1.5
 
 @dataclass(frozen=True)
 class Oscillation:
-    """c cos 2 pi f t + s sin 2 pi f t of K components.
+    """An oscillation c cos(2 pi f t) + s sin(2 pi f t) of K components, K = 1 or 2.
 
     frequency_hz, s_frequency_hz : f and its standard deviation.
-    major, minor : semi-axes of the ellipse that two components describe; minor is 0 for one.
-    s_major, s_minor : their standard deviations. cosine, sine : (K,) c and s.
+    major, minor : semi-axes of the ellipse that two components describe, in their unit. For one
+    component, major is the amplitude and minor is 0.
+    s_major, s_minor : standard deviations of the semi-axes. cosine, sine : (K,) c and s.
     """
 
     frequency_hz: float
@@ -35,7 +36,7 @@ class Oscillation:
     sine: Array
 
     def at(self, t_s: Array) -> Array:
-        """(N, K) values at times (N,)."""
+        """Return the values (N, K) at times t_s (N,)."""
         phase = 2 * np.pi * self.frequency_hz * np.asarray(t_s)[:, None]
         return np.asarray(np.cos(phase) * self.cosine + np.sin(phase) * self.sine)
 
@@ -43,14 +44,17 @@ class Oscillation:
 def dominant_oscillation(
     t_s: Array, values: Array, low_hz: float = 0.0, high_hz: float = np.inf
 ) -> Oscillation | None:
-    """Return the strongest sinusoid of a series (N, K) between two frequencies.
+    """Return the strongest sinusoid of a series between two frequencies.
 
-    The series is a straight line, the sinusoid and a coloured noise of the one-sided density S at
-    f, which what the sinusoid leaves near f shows. A sinusoid of T seconds and amplitude A then has
-    the variances S / T of A and 3 S / (pi^2 A^2 T^3) of f, the Cramer-Rao bound for white noise of
-    that density.
-    None where the record is shorter than 1.5 periods or 16 samples, or where the amplitude is below
-    6 of its standard deviations.
+    t_s : (N,). values : (N, K), K = 1 or 2.
+
+    The series is modelled as a straight line, a sinusoid of frequency f, and coloured noise. The
+    one-sided density S of the noise near f is taken from the residuals. A sinusoid of T seconds and
+    amplitude A then has the variances S / T of A and 3 S / (pi^2 A^2 T^3) of f, which are the
+    Cramer-Rao bounds for white noise of this density.
+
+    Returns None if the record is shorter than 1.5 periods or 16 samples, or if the amplitude is
+    smaller than 6 of its standard deviations.
     """
     good = np.isfinite(values).all(-1)
     t, y = np.asarray(t_s, float)[good], np.asarray(values, float)[good]

@@ -19,10 +19,10 @@ follows the bubble's speed."""
 
 
 def summary_table(frames: pd.DataFrame, up: Array, liquid: Liquid | None = None) -> pd.DataFrame:
-    """Return the content of bubble_summary.csv.
+    """Return the content of bubble_summary.csv, one row per bubble.
 
-    frames : what `telerig.bubble_table` returns. up : (3,) unit vector against gravity.
-    liquid : the liquid of the dimensionless numbers, NaN without one.
+    frames : what `telerig.bubble_table` returns. up : (3,) unit vector against gravity in the rig
+    frame. liquid : properties of the liquid; if it is None, the dimensionless numbers are NaN.
     """
     groups = frames.groupby("particle", sort=True)
     rows = [_row(mine, up, liquid) for _, mine in groups]
@@ -56,11 +56,12 @@ def _row(mine: pd.DataFrame, up: Array, liquid: Liquid | None) -> dict[str, Any]
 
 
 def mean_of_body(values: Array, sd: Array) -> tuple[float, float]:
-    """Mean over a bubble's frames of a property of its body, with a standard deviation.
+    """Return the mean over a bubble's frames of a property of its body, and its standard deviation.
 
-    The stated errors do not average out, because frames share how the body and its outline differ
-    from a spheroid and an ellipse. Scatter beyond them is the body's own motion, and averages out
-    over its correlation time.
+    values, sd : (N,) value and stated standard deviation in each frame.
+    The stated errors do not average out, because the body differs from a spheroid in the same way
+    in all frames. Scatter beyond the stated errors is the body's own motion. It averages out over
+    its correlation time.
     """
     good = np.isfinite(values) & np.isfinite(sd)
     if not good.any():

@@ -160,7 +160,7 @@ def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path):
 def test_a_folder_that_this_machine_does_not_see_is_named(tmp_path):
     result = perform(Job("calibrate", str(tmp_path / "elsewhere")))
     assert result["status"] == "failed"
-    assert "elsewhere" in result["words"] and "share" in result["words"]
+    assert "elsewhere" in result["words"] and "available there" in result["words"]
 
 
 @pytest.mark.parametrize(

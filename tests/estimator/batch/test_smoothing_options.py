@@ -124,7 +124,7 @@ def test_model_means_the_shake_where_only_smoothing_is_done() -> None:
     assert shake_model("auto", None, ["smooth", "rise"]) == ("auto", "auto")
     assert shake_model("radial", "default", []) == ("radial", "default")
     for model, shake, only, words in (
-        ("default", None, [], "say --shake default"),
+        ("default", None, [], "give --shake default"),
         ("radial", None, ["smooth"], "--model radial: there is no such choice"),
         ("auto", "rough", [], "--shake rough: there is no such choice"),
     ):

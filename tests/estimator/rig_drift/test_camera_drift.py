@@ -304,7 +304,7 @@ def test_words_say_it_once() -> None:
     assert said["calibration_problem"]
     assert said["words"][:-1] == model.sentences(without=findings[:1]) and len(said["words"]) == 3
     assert "'right' has moved against 'left'" in said["words"][-1]
-    assert "--refine-rig" in said["words"][-1] and "positions are off" in said["words"][-1]
+    assert "--refine-rig" in said["words"][-1] and "positions are wrong" in said["words"][-1]
     assert with_change(model, still.found(), known)["words"] == model.sentences()
     assert PairCollector(known).found() is None
 
@@ -361,7 +361,7 @@ def test_smoothing_refuses_the_calibration_of_fewer_cameras() -> None:
 
 
 def test_refused() -> None:
-    with pytest.raises(InputError, match="drift prior"):
+    with pytest.raises(InputError, match="prior standard deviations of a movement"):
         DriftPrior(rotation_rad=0.0)
     first, _ = rig()
     with pytest.raises(CalibrationError, match="one line"):

@@ -30,7 +30,10 @@ MEDIA = ("air", "water")
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """A calibration and the dots detected in images, None if they were read from `dots.csv`."""
+    """A calibration, and the dots that were detected for it.
+
+    detected : None if the dots were read from `dots.csv`.
+    """
 
     calibration: Calibration
     detected: DatasetDots | None
@@ -70,7 +73,10 @@ def check_options(
 
 
 def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
-    """Return the cameras with the intrinsics of `rig.toml`, all with the pose of the rig frame."""
+    """Return the cameras with the intrinsics of `rig.toml`.
+
+    The poses are not known yet: all cameras have that of the first one, the identity.
+    """
     return tuple(
         Camera.create(
             c.name, c.image_size_px, c.scale_px_per_mm,
@@ -177,9 +183,13 @@ def solve_dots(
     stage: Progress | None = None,
     notes: Sequence[str] = (),
 ) -> Calibration:
-    """Calibrate the rig from a table of dots, without the stage's axis and the runs' windows.
+    """Calibrate the rig from a table of dots, without measuring the stage's axis.
 
-    The refractive windows are part of the model only if ``medium`` is "water".
+    table : the measured dots, with the columns of dots.csv. model, solver, medium, dots_free,
+    outlier_sd, stage : as for `run_calibration`. notes : further sentences for the user.
+
+    The refractive windows of rig.toml are part of the model only if ``medium`` is "water". If it is
+    "air", the caller adds them for the runs in water.
     """
     from telerig.estimator.calibration.self_calibration import self_calibrate
 
@@ -204,7 +214,11 @@ def solve_dots(
 def detect(
     dataset: Dataset, *, stage: Progress | None = None, pictures: bool = False
 ) -> DatasetDots | None:
-    """Detect the dots in all images of a dataset; None if it holds a table of dots instead."""
+    """Detect the dots in all images of a dataset.
+
+    stage : as for `run_calibration`. pictures : whether to draw the detections over each image.
+    Returns None if the dataset holds a table of dots instead of images.
+    """
     if dataset.source != "images":
         return None
     from telerig.estimator.dots.dataset_dots import detect_dataset

@@ -24,9 +24,10 @@ from telerig.factors.calibration import Observations, State, pixels, whitened_re
 from telerig.rig.triangulation import aligned_shift, working_volume
 
 ENOUGH_SHARE = 0.05
-"""A view that lowers the standard deviation by less is not worth taking."""
+"""A view is worth taking if it lowers the standard deviation by at least this share."""
 ALIKE_SHARE = 0.9
-"""Of the best gain: among such candidates the one that fills most of the empty image is taken."""
+"""Among candidates with at least this share of the best gain, the one that fills most of the empty
+parts of the images is taken."""
 _NOTABLE_SHARE = 0.5
 _SHOWN = 3
 _WHOLE_UM = 100.0
@@ -35,7 +36,12 @@ _MANY_DOTS = 150
 
 @dataclass(frozen=True)
 class HeldPose:
-    """One way to hold the target: after_um is the 3-D sd that the calibration would then have."""
+    """One way to hold the target.
+
+    rig_from_target : (4, 4) pose. after_um : standard deviation per axis of points in space, due to
+    the calibration, if a view in this pose were added. words : how to hold the target. reasons :
+    what this view adds.
+    """
 
     rig_from_target: Array
     after_um: float
@@ -45,12 +51,15 @@ class HeldPose:
 
 @dataclass(frozen=True)
 class NextView:
-    """Advice after ``views`` views.
+    """Advice on the next view of the target.
 
-    before_um : standard deviation per axis of points over the working volume, the calibration's
-    share, less their common rigid motion. poses : best first; none when no pose of the table is
-    seen by two cameras. size_um : what the uncertainty of the target's known distance and print
-    leaves.
+    views : number of views so far.
+    before_um : standard deviation per axis of points over the working volume, due to the
+    calibration and without a rigid motion that is common to all points.
+    poses : ways to hold the target, the best first; none if two cameras see none of the candidates.
+    size_um : the part of before_um that no view can lower, because the size of the target is not
+    known better.
+    marks : ids of the target's marks.
     """
 
     views: int
@@ -69,15 +78,18 @@ class NextView:
         return 1 - self.after_um / self.before_um
 
     def enough(self) -> bool:
-        """Whether there are views enough and another one would bring little."""
+        """Return whether there are enough views and one more would lower the errors only little."""
         many = self.views >= RECOMMENDED_VIEWS
         return many and bool(self.poses) and self.gain < ENOUGH_SHARE
 
     def verdict(self) -> str:
-        """Return words on what another view would bring."""
+        """Return a sentence on how much one more view would reduce the errors."""
         if not self.poses:
             good = rounded_um(self.before_um)
-            return f"{self.views} views; points are good to {good} µm, and no pose was found to add"
+            return (
+                f"{self.views} views; the calibration's share of the errors of points is {good} "
+                "µm; no further pose was found in which two cameras see the target"
+            )
         worth = ": these views are enough" if self.enough() else ""
         return (
             f"{self.views} views; one more would reduce the calibration's share of the errors of "
@@ -88,10 +100,13 @@ class NextView:
     def _floor(self) -> str:
         if self.size_um < _NOTABLE_SHARE * self.before_um:
             return ""
-        return f" ({rounded_um(self.size_um)} µm remain: the target's size is known no better)"
+        return (
+            f" ({rounded_um(self.size_um)} µm remain with any number of views, because the "
+            "target's size is not known better)"
+        )
 
     def words(self) -> str:
-        """Return the verdict, and how to hold the target."""
+        """Return the verdict and, if one more view is worthwhile, how to hold the target."""
         if not self.poses or self.enough():
             return self.verdict()
         best = self.poses[0]
@@ -115,10 +130,12 @@ class NextView:
 
 
 def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextView | None:
-    """Return the best ways to hold the target next; None for a single camera, or no covariance.
+    """Return the best ways to hold the target next.
 
-    The candidates' noise is the median of the dots so far. Of many dots some stand for all, which
-    promises slightly too little.
+    joint : covariance of the calibration with the views so far. The noise of a new view is taken as
+    the median of the dots so far. If the target has many dots, some of them represent all, so that
+    the predicted gain is slightly too small.
+    Returns None for a single camera, or if the covariance is not finite.
     """
     if len(problem.cameras) < 2 or not np.isfinite(joint.rig_block()[1]).all():
         return None
@@ -163,7 +180,7 @@ def _preferred(
 
 
 def rounded_um(value: float, other: float = np.nan) -> str:
-    """Return the numbers as text, with enough digits to tell them apart."""
+    """Return ``value`` as text, with so many digits that it differs from ``other`` as text."""
     if value >= _WHOLE_UM:
         return f"{value:.0f}"
     digits = 2
@@ -173,31 +190,34 @@ def rounded_um(value: float, other: float = np.nan) -> str:
 
 
 TILT_LIMIT_DEG = 62.0
-"""To either camera: beyond, a dot is too flat an ellipse to be found safely."""
+"""Largest angle between the plate's normal and a camera's axis: with more, a dot is too flat an
+ellipse to be found safely."""
 TURNS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
-"""Of the plate's normal from where it faces the cameras alike."""
+"""Angles by which candidates turn the plate's normal away from the middle between two cameras."""
 DIRECTIONS = 8
 ROLLS_DEG = (0.0, 45.0, 90.0, 135.0)
 PLACES = np.array([(0.0, 0.0, 0.0), *product((-1.0, 1.0), repeat=3)])
-"""Of the target's middle: in the middle of the volume, or at the corners of a cube round it."""
+"""Places of the target's middle: the middle of the volume and the corners of a cube round it."""
 PLACE_SHARE = 0.2
-"""Of the smaller field: half the side of that cube."""
+"""Half the side of this cube, as a share of the smallest field of view."""
 BORDER_SHARE = 0.03
 SEEN_SHARE = 0.9
-"""Of the dots that an image shows so far (median): a candidate shows as many in two cameras."""
+"""A candidate must show at least this share of the dots that an image shows so far (median), in two
+cameras."""
 CELLS = 6
-"""Parts of an image, each way, of which it is asked whether a dot has been there."""
+"""An image is divided into this many parts along u and along v, to see where no dot has been."""
 FEW_DOTS = 25
 _EDGE_ON = 0.1
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """K poses that two cameras or more of C see.
+    """K poses of the target, each of which at least two of the C cameras see.
 
-    rig_from_target : (K, 4, 4). tilt : (K,) number of the plate's normal in the table. facing : (K,
-    C) +1 where a camera sees the side of negative z, else -1. sees : (K, C) whether side and tilt
-    let a camera see it. pair : (K, 2) the cameras between which the plate is held.
+    rig_from_target : (K, 4, 4). tilt : (K,) index of the direction of the plate's normal.
+    facing : (K, C) +1 if the side of negative z faces the camera, else -1.
+    sees : (K, C) whether side and tilt let the camera see the target.
+    pair : (K, 2) indices of the two cameras between which the plate is held.
     """
 
     rig_from_target: Array
@@ -210,7 +230,7 @@ class Candidates:
         return len(self.tilt)
 
     def some(self, index: Ints | Bools | slice) -> Candidates:
-        """Return a choice of the candidates."""
+        """Return the candidates with these indices."""
         return Candidates(
             self.rig_from_target[index], self.facing[index], self.tilt[index], self.sees[index],
             self.pair[index],
@@ -236,12 +256,16 @@ def middle_mm(state: State) -> Array:
 
 
 def field_mm(problem: Problem) -> float:
-    """Return the smaller side of the smaller image, in object space."""
+    """Return the smallest side of all cameras' fields of view, in mm in object space."""
     return float(min(min(c.image_size_px) / c["scale_px_per_mm"] for c in problem.cameras))
 
 
 def volume_centre_mm(problem: Problem, state: State) -> Array:
-    """Return the rig's origin (3,), or where the target was if that is far from it."""
+    """Return the middle (3,) of the volume in which the target is held, in the rig frame.
+
+    It is the origin of the rig frame, or the mean position of the target so far if this is far from
+    the origin.
+    """
     seen = np.unique(problem.view[problem.kept])
     poses = state.rig_from_target[seen]
     mean = np.mean(poses[:, :3, :3] @ middle_mm(state) + poses[:, :3, 3], 0)
@@ -254,7 +278,12 @@ def optical_axes(state: State) -> Array:
 
 
 def bases(axes: Array, facing: Array) -> tuple[Array, Array, Array]:
-    """Return three unit vectors for two cameras: the plate's z facing both alike, along, across."""
+    """Return three orthonormal vectors (3,) for two cameras.
+
+    axes : (2, 3) optical axes. facing : (2,) as in `Candidates`.
+    The first vector is the z axis of a plate at the same angle to both cameras, the second lies in
+    the plane of both optical axes, and the third is perpendicular to this plane.
+    """
     a, b = facing[:, None] * axes
     alike = (a + b) / np.linalg.norm(a + b)
     across = np.cross(a, b)
@@ -326,7 +355,11 @@ def _rotations(normal: Array, roll_rad: Array) -> Array:
 def predicted(
     problem: Problem, state: State, poses: Candidates, dots: Ints, whitener: Array
 ) -> tuple[State, Observations]:
-    """Return K views of ``dots`` in all images, without measured pixels; whitener (C,) in 1/px."""
+    """Return the state and the observations of K new views, without measured pixels.
+
+    poses : of the target in the new views. dots : (n,) indices of the dots, which all C cameras
+    observe. whitener : (C,) reciprocal of the standard deviation of a pixel, in 1/px.
+    """
     cameras = np.arange(len(problem.cameras))
     view, camera, dot = (
         a.ravel() for a in np.meshgrid(np.arange(len(poses)), cameras, dots, indexing="ij")
@@ -349,7 +382,10 @@ def _plate_shift(problem: Problem, facing: Array) -> Array:
 
 
 def dots_seen(problem: Problem, state: State, poses: Candidates, dots: Ints) -> tuple[Bools, Array]:
-    """Return (K, C, n) which of ``dots`` are in the images, and their pixels (K, C, n, 2)."""
+    """Return which of n dots each of C cameras would see in K poses of the target.
+
+    dots : (n,) indices. Returns booleans (K, C, n) and the dots' pixels (K, C, n, 2).
+    """
     count = len(problem.cameras)
     views, obs = predicted(problem, state, poses, dots, np.ones(count))
     uv = pixels(views, obs, problem.rho_mm).reshape(len(poses), count, len(dots), 2)
@@ -363,7 +399,7 @@ def dots_seen(problem: Problem, state: State, poses: Candidates, dots: Ints) -> 
 
 
 def spread_dots(problem: Problem, count: int = FEW_DOTS) -> Ints:
-    """Return up to ``count`` dots, spread over the list of all."""
+    """Return the indices of up to ``count`` dots, evenly spread over the list of all dots."""
     whole = len(problem.dot_ids)
     return np.unique(np.linspace(0, whole - 1, min(count, whole)).round().astype(np.int64))
 
@@ -382,7 +418,11 @@ def _enough_seen(problem: Problem, state: State, poses: Candidates) -> Bools:
 
 
 def new_cells(problem: Problem, visible: Bools, uv_px: Array) -> Bools:
-    """Return parts (C, CELLS, CELLS) of the images, (columns, rows), that a view reaches first."""
+    """Return which parts of the images a new view would be the first to fill.
+
+    visible : (C, n) which of n dots each camera sees. uv_px : (C, n, 2) their pixels.
+    Returns booleans (C, CELLS, CELLS), by column and row of the parts.
+    """
     out = []
     for c, camera in enumerate(problem.cameras):
         edges = [np.linspace(-0.5, size - 0.5, CELLS + 1) for size in camera.image_size_px]
@@ -397,10 +437,14 @@ def new_cells(problem: Problem, visible: Bools, uv_px: Array) -> Bools:
 
 @dataclass(frozen=True)
 class ViewGain:
-    """What views do to the covariance of cameras and dots.
+    """Computes by how much further views would lower the uncertainty of points in space.
 
-    covariance : (P + 3 n, P + 3 n) of the rig block and of ``dots``, (n,) sorted. root : (P, R),
-    root root^T weighs the rig block by the variance of points in space. whitener : (C,) 1/px.
+    covariance : (P + 3 n, P + 3 n) of the P parameters of the cameras and of n dots.
+    dots : (n,) sorted indices of these dots.
+    root : (P, R); the trace of root^T C root is the summed variance of points in space if the
+    cameras' parameters have the covariance C.
+    whitener : (C,) for each camera the reciprocal of the standard deviation of a pixel, in 1/px.
+    points_mm : the points over the working volume, (N, 3).
     """
 
     problem: Problem
@@ -427,7 +471,9 @@ class ViewGain:
 
     @property
     def size_um(self) -> float:
-        """Of points that are all wrong by the factor that target and distance leave open."""
+        """Standard deviation per axis of points, in um, that the uncertainty of the target's size
+        alone causes. It scales all points by a common factor.
+        """
         problem = self.problem
         plane = (problem.nominal_mm - problem.nominal_mm.mean(0))[:, :2]
         known = float(np.sum((plane / problem.dot_sigma_mm[:, :2]) ** 2))
@@ -442,10 +488,11 @@ class ViewGain:
         return np.asarray(1e3 * np.sqrt(np.maximum(whole - less, 0) / self.points_mm.size))
 
     def after_um(self, poses: Candidates, dots: Ints) -> Array:
-        """Return the standard deviation (K,) per axis with each view added, seen at ``dots``.
+        """Return the standard deviation (K,) per axis, in um, of points after each of K views.
 
-        With A the view's rows, its pose projected out, and C the covariance, the summed variance of
-        points falls by the trace of root^T C A^T (1 + A C A^T)^-1 A C root.
+        Each view is added alone. dots : indices of the dots that it shows.
+        With A the whitened derivatives of the view, its pose projected out, and C the covariance,
+        the summed variance of points falls by the trace of root^T C A^T (1 + A C A^T)^-1 A C root.
         """
         rows, by_pose = self._rows(poses, dots)
         rig = len(self.root)
@@ -501,7 +548,10 @@ _CORNER_CELLS = 2
 
 
 def hold_words(problem: Problem, state: State, one: Candidates) -> str:
-    """Return words on turn, lean, roll and place of a pose, as its pair of cameras sees it."""
+    """Return in words how to hold the target in a pose: turn, lean, roll and place.
+
+    They are relative to the pair of cameras between which the target is held.
+    """
     pair, rig_from_target = one.pair[0], one.rig_from_target[0]
     axes, facing = optical_axes(state)[pair], one.facing[0][pair]
     alike, along, across = bases(axes, facing)
@@ -573,7 +623,7 @@ def _place_words(problem: Problem, state: State, rig_from_target: Array) -> str:
 
 
 def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, ...]:
-    """Return words on what a pose has that the views so far have not."""
+    """Return phrases on what a pose adds to the views so far: a tilt, filled parts of an image."""
     out = []
     seen = np.unique(problem.view[problem.kept])
     cosine = np.abs(optical_axes(state) @ state.rig_from_target[seen, :3, 2].T)
@@ -609,7 +659,11 @@ def _where(cells: Array) -> str:
 def first_views(
     first: str, second: str, angle_deg: float, *, alone: bool = True
 ) -> tuple[str, ...]:
-    """Return words for the first views, before any calibration can say more."""
+    """Return instructions for the first views, which are needed before any calibration.
+
+    first, second : names of two cameras. angle_deg : angle between their axes. alone : whether the
+    rig has no further cameras.
+    """
     between = "the cameras" if alone else f"cameras {first} and {second}"
     turn = max(0, min(20, int(TILT_LIMIT_DEG - angle_deg / 2 - 5) // 5 * 5))
     aside = {

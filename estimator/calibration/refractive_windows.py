@@ -29,14 +29,19 @@ _LEANING_DEG = 30.0
 
 
 def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
-    """Return the cameras, each behind its window if it has one."""
+    """Return the cameras, each with its refractive window if ``walls`` has one for it.
+
+    walls : windows by the camera's name.
+    """
     return tuple(replace(c, wall=walls.get(c.name, c.wall)) for c in cameras)
 
 
 def behind_windows(calibration: Calibration, walls: Mapping[str, Wall]) -> Calibration:
-    """Return a calibration that was made in air, for use in the water behind windows.
+    """Return a calibration that was made in air as one for points in the water behind windows.
 
-    The prior covariance of each window's orientation joins the covariance.
+    The prior covariance of each window's orientation becomes part of the covariance.
+
+    walls : windows by the camera's name.
     """
     cameras = with_windows(calibration.cameras, walls)
     names, covariance = _with_priors(
@@ -94,9 +99,11 @@ def _with_priors(
 
 
 def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
-    """Return the largest error (µm) of points if ``used`` replaces the ``true`` cameras.
+    """Return the largest error (µm) of points that are triangulated with the cameras ``used``
+    instead of the ``true`` ones.
 
-    A common shift of all points is set aside. With one camera, it is the error across its own axis.
+    A shift that is common to all points does not count. With one camera, the result is the error
+    across its optical axis.
     """
     points = working_volume(tuple(used))
     pixels = [camera.project(points) for camera in true]
@@ -109,7 +116,7 @@ def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
 
 
 def window_notes(calibration: Calibration, rig: RigDescription) -> list[str]:
-    """Return notes for the user on the windows' effect and on what is not known of them."""
+    """Return notes for the user on the effect of the refractive windows and their uncertainty."""
     cameras = [c for c in calibration.cameras if c.wall is not None]
     if not cameras:
         return _without_windows(calibration)
@@ -127,11 +134,12 @@ def _in_words(calibration: Calibration, names: Sequence[str]) -> str:
     error = _um(model_error_um(calibration.in_air().cameras, calibration.cameras))
     if calibration.medium == "air":
         return (
-            f"calibrated in air; points of runs lie in the water {where}. A model without the "
-            f"windows would be wrong by {error} over the working volume"
+            f"calibrated in air; points of runs lie in the water {where}. Without the windows in "
+            f"the model, points would be wrong by {error} over the working volume"
         )
     return (
-        f"calibrated in the water {where}; used in air without them, it would be wrong by {error}"
+        f"calibrated in the water {where}. If this calibration is used for points in air, without "
+        f"windows, they are wrong by {error}"
     )
 
 
@@ -147,7 +155,10 @@ def _without_windows(calibration: Calibration) -> list[str]:
     """Return the note on a target in the water if `rig.toml` states no windows."""
     if calibration.medium == "air":
         return []
-    words = "calibrated in the water without [walls]: scales and axes hold in the water only"
+    words = (
+        "calibrated in the water, and rig.toml states no windows ([walls]): scales and axes hold "
+        "for points in the water only"
+    )
     if any(abs(c["kappa_per_mm"]) * c.rho_mm >= ENTOCENTRIC for c in calibration.cameras):
         words += "; with a perspective lens, state its window in [walls.<camera>] of rig.toml"
     return [words]
@@ -161,13 +172,14 @@ def _implausible(camera: Camera) -> list[str]:
     if wall.indices[0] > wall.indices[-1]:
         words.append(
             f"[walls.{camera.name}] indices {list(wall.indices)} put this camera into the denser "
-            "medium: the camera's side comes first, as in [1.0, 1.52, 1.333]"
+            "medium; give the camera's side first, as in [1.0, 1.52, 1.333] for air, glass, water"
         )
     leaning = np.degrees(np.arccos(min(1.0, abs(wall.normal[2]))))
     if leaning > _LEANING_DEG:
         words.append(
-            f"the window of {camera.name} leans {leaning:.0f} degrees to its line of sight: its "
-            "normal is in the camera's frame, where that of a window facing the camera is [0, 0, 1]"
+            f"the normal of the window of {camera.name} is {leaning:.0f} degrees off the camera's "
+            f"axis. Check normal in [walls.{camera.name}]: it is in the camera's frame, in which a "
+            "window that faces the camera has [0, 0, 1]"
         )
     return words
 
@@ -182,12 +194,18 @@ def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
     moved = (turned.project(points) - camera.project(points)) / camera["scale_px_per_mm"]
     moved = moved - moved.mean(0)
     most = 1e3 * float(np.abs(moved).max())
-    words = f"the normal of the window of {camera.name} is known to {np.degrees(sd):.2g} deg"
+    words = (
+        f"the normal of the window of {camera.name} has a standard deviation of "
+        f"{np.degrees(sd):.2g} deg"
+    )
     if calibration.medium == "water":
-        return [f"{words}, counted in the covariances"]
-    words += f": {_rounded(most)} µm over the working volume, counted in the covariances"
+        return [f"{words}, which the covariances contain"]
+    words += (
+        f", which shifts points by up to {_rounded(most)} µm over the working volume; the "
+        "covariances contain this"
+    )
     if most > calibration.statistics.get("space_sd_um", np.inf) / 2:
-        words += "; measure it better, or calibrate with the target in the water"
+        words += ". Measure the normal better, or calibrate with the target in the water"
     return [words]
 
 
@@ -204,9 +222,10 @@ def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[str]:
     if apart < 3 * sd or from_stated > 3 * wall.normal_sigma_rad:
         return []
     return [
-        f"the window of {camera.name} may as well lean {np.degrees(apart / 2):.2g} deg to the "
-        "other side: a telecentric lens with the target in the water does not show the sign of "
-        "the tilt. Points are not affected; if the normal matters, state it better in rig.toml"
+        f"the window of {camera.name} may just as well be tilted by {np.degrees(apart / 2):.2g} "
+        "deg to the other side: with a telecentric lens and the target in the water, images do "
+        "not show the sign of the tilt. Points are not affected. If you need the normal itself, "
+        "state it more precisely in rig.toml"
     ]
 
 
@@ -227,17 +246,18 @@ def _without_distance(camera: Camera) -> list[str]:
     if max(shift, rest) < _NOTABLE_UM:
         return []
     return [
-        f"[walls.{camera.name}] has no distance_mm, so the window is taken at the camera's origin: "
-        f"every {_STEP_MM:.0f} mm that it stands elsewhere shift all of this camera's points by "
-        f"{_rounded(shift)} µm, and each of them by {_um(rest)} more"
+        f"[walls.{camera.name}] has no distance_mm, so the window is taken to be at the camera's "
+        f"origin. If it is {_STEP_MM:.0f} mm away from there, all points of this camera are "
+        f"shifted by {_rounded(shift)} µm, and single points by {_um(rest)} more. Add distance_mm "
+        "if this matters"
     ]
 
 
 def window_warnings(rig: RigDescription | None, calibration: Calibration) -> list[str]:
     """Return warnings if the windows of rig.toml and of the calibration differ.
 
-    A calibration in water without windows has their effect in its scales and axes, but not in
-    perspective.
+    There is no warning about missing windows in a calibration in water: its scales and axes contain
+    the effect of the windows, except for perspective lenses.
     """
     if rig is None:
         return []
@@ -248,8 +268,9 @@ def window_warnings(rig: RigDescription | None, calibration: Calibration) -> lis
         bare = [replace(c, wall=None) if c.name in gone else c for c in calibration.cameras]
         much = _um(model_error_um(calibration.cameras, bare))
         return [
-            f"the calibration has windows for {', '.join(gone)} that rig.toml does not state: if "
-            f"they are gone, points are wrong by {much} over the working volume; calibrate again"
+            f"the calibration has windows for {', '.join(gone)} that rig.toml does not state. If "
+            f"the windows have been removed, points are wrong by {much} over the working volume: "
+            "calibrate again. Otherwise state them in [walls]"
         ]
     missing = [n for n, wall in stated.items() if n in have and not _same(have[n], wall)]
     if not missing or calibration.medium == "water":

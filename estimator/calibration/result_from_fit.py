@@ -46,21 +46,24 @@ GAUGE_OF_SCALES = (
 BAD_SCATTER_PX = 0.5
 BAD_KEPT = 0.9
 UNEXPLAINED = 0.3
-"""Noise floor over image noise beyond which errors of the lens model can move the angle between
-axes as far as the image centres do."""
+"""If the ratio of noise floor to image noise exceeds this, errors of the lens model can change the
+angle between the axes as much as uncertain image centres do."""
 BAD_FLOOR = 5.0
-"""Noise floor over image noise beyond which a warning says that the model is incomplete."""
+"""If the ratio of noise floor to image noise exceeds this, a warning says that the lens model is
+incomplete."""
 
 
 @dataclass(frozen=True)
 class Fit:
     """A finished self-calibration of C cameras.
 
-    models : name of each camera's lens model. model_words : a phrase about them. choice : None if
-    the user gave them. centre_held : (C, 4, 4) poses of the cameras from a fit with held image
-    centres; None if they are held in this fit, too.
-    mirror, mirrored_cost : the kept solution of the mirror ambiguity, and the other's cost.
-    tilts_deg : of the target by (view, camera).
+    models : name of each camera's lens model. model_words : a phrase on how they were chosen.
+    choice : the choice of the models; None if the user gave them.
+    centre_held : (C, 4, 4) poses of the cameras from a second fit in which the image centres are
+    held in the middle of the images; None if they are held in this fit.
+    mirror : the solution of the mirror ambiguity that was kept. mirrored_cost : cost of the other.
+    tilts_deg : by (view, camera) the angle between the target's normal and the optical axis.
+    notes : sentences for the user.
     """
 
     robust: RobustFit
@@ -88,11 +91,11 @@ def calibration_from_fit(
     nominal_rotvec_deg: Nominal,
     name: str,
 ) -> Calibration:
-    """Make the public `Calibration` from a finished fit, whose ``mirror`` is decided.
+    """Make the public `Calibration` from a finished fit, in which the mirror ambiguity is resolved.
 
-    joint : covariance of all parameters. free : for each camera, the intrinsics that it contains.
-    weak : sentences of `checks.weak_parameters`. nominal_rotvec_deg : by index of a camera, as
-    `rig.toml` states it.
+    joint : covariance of all parameters. free : for each camera the names of the intrinsics that
+    the covariance contains. weak : the sentences of `checks.weak_parameters`. nominal_rotvec_deg :
+    nominal rotation vectors by the camera's index. name : name of the rig.
     """
     problem, state = fit.robust.problem, fit.robust.solution.state
     cameras = cameras_from_state(problem, state)
@@ -166,9 +169,9 @@ def dot_table(problem: Problem) -> pd.DataFrame:
 
 
 def residual_table(problem: Problem, state: State) -> pd.DataFrame:
-    """Return the rows of `residuals.csv`: `dot_table`, residual (measured minus predicted), weight.
+    """Return the content of `residuals.csv`: `dot_table` with residuals, weights and reasons.
 
-    A weight less than 1 has a reason.
+    Residuals are measured minus predicted pixels. The reason says why a weight is less than 1.
     """
     residual = -pixel_residuals(problem, state)
     distance = np.sqrt(squared_distance(residual, problem.covariance_px2))
@@ -194,8 +197,8 @@ def odd_views(problem: Problem) -> list[str]:
     measured = np.bincount(problem.view, minlength=len(problem.views))
     kept = np.bincount(problem.view[problem.kept], minlength=len(problem.views))
     return [
-        f"view {name!r}: only {k} of {n} dots agree with the others; is it numbered wrongly, or "
-        "did the target move between the cameras' images?"
+        f"view {name!r}: only {k} of its {n} dots agree with the other views. Check whether its "
+        "dots are numbered wrongly, or whether the target moved between the cameras' images"
         for name, k, n in zip(problem.views, kept, measured)
         if k < 0.5 * n
     ]
@@ -361,7 +364,10 @@ def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
     chi2 = statistics["chi2_dof"]
     spread = 5 * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
     if abs(chi2 - 1) > max(0.15, spread):
-        reasons.append(f"chi-square per degree of freedom is {chi2:.2f}, not 1")
+        reasons.append(
+            f"chi-square per degree of freedom is {chi2:.2f} instead of 1, so the stated noise of "
+            "the dots is wrong or the model is incomplete; look for a pattern in residuals.csv"
+        )
     if statistics["noise_floor_px"] > BAD_FLOOR * statistics["image_noise_px"]:
         reasons.append(
             f"the dots deviate from the model {fit.model!r} by {statistics['scatter_px']:.2g} px "

@@ -40,7 +40,7 @@ _RIG_TABLES = ("cameras", "stereo", "target", "stage", "walls")
 
 
 def sources(dataset: Dataset) -> list[Path | Source]:
-    """Return the inputs whose change makes the calibration of a dataset stale."""
+    """Return the inputs whose change makes the calibration of a dataset out of date."""
     views, stops = dataset.path / "calibration", dataset.path / "stage_axis"
     cameras = tuple(dataset.rig.cameras)
     from_table = dataset.source == "dots"
@@ -54,7 +54,9 @@ def sources(dataset: Dataset) -> list[Path | Source]:
 
 
 def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
-    """Write the HTML report of a results folder; ``dot`` : its pictures, if drawn already."""
+    """Write the HTML report of a results folder, and return its path.
+
+    dot : pictures of the example dot if they are drawn already; None draws them."""
     from telerig.io.report.calibration.report import write_calibration_report
 
     return write_calibration_report(folder, dot=dot)
@@ -116,13 +118,16 @@ def write_results(
     used: Mapping[str, Input] | None = None,
     again: str = "",
 ) -> Path:
-    """Write the results folder of a calibration; return the path of the report, if there is one.
+    """Write the results folder of a calibration, and return the path of its report, if any.
 
     All files (`docs/files.md`) appear together at the end, so that an interrupted command leaves
-    the old ones. command, options, seconds : for `run.json`. change : for `comparison.json`; None
-    writes none. report : function that writes the report of a folder, or None. used : the
-    fingerprints of `sources` from before the dataset was read. again : the command line that makes
-    the folder again; "" for `telerig calibrate` of the dataset.
+    the old files unchanged.
+
+    command, options, seconds : content of `run.json`.
+    change : content of `comparison.json`; None writes no such file.
+    report : function that writes the report of a folder; None for no report.
+    used : fingerprints of `sources` from before the dataset was read.
+    again : the command line that makes the folder again; "" for `telerig calibrate` of the dataset.
     """
     record = run_record(command, dataset.path, input_files(dataset), options, seconds)
     again = again or f"telerig calibrate {shlex.quote(str(dataset.path))}"

@@ -90,21 +90,25 @@ def self_calibrate(
 ) -> Calibration:
     """Calibrate one to four cameras from measured dots.
 
-    Not every camera has to see every view: shared views must connect all cameras.
+    Not every camera has to see every view, but shared views must connect all cameras.
 
-    dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
-    cameras : nominal, the first defines the rig frame.
-    nominal_rotvec_deg : nominal <camera>_from_<first> rotation vectors by camera, or the second
-        camera's alone; they resolve the mirror ambiguity.
-    model : a name of `telerig.rig.lens_parameters`, or "auto"; for all cameras, or by camera.
-    dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
-    solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
-    outlier_sd : standard deviations from the model beyond which a dot is left out.
+    dots : table with the columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
+    cameras : nominal cameras; the first one defines the rig frame.
+    target : the nominal target.
+    nominal_rotvec_deg : nominal rotation vectors <camera>_from_<first> in degrees by the camera's
+        name, or that of the second camera alone; they resolve the mirror ambiguity.
+    model : a name of `telerig.rig.lens_parameters`, or "auto"; one for all cameras, or by camera.
+    dots_free : how the dots may differ from their nominal positions: "3d" (in all directions, as
+        far as the target's stated standard deviations allow), "plane" (only within the plane of
+        the target) or "nominal" (not at all).
+    solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
+    outlier_sd : number of standard deviations from the model beyond which a dot is left out.
+    notes : sentences for the user that are added to the result. name : name of the rig.
 
-    Raises CalibrationError when the views cannot determine a calibration, with the remedy.
+    Raises CalibrationError if the views cannot determine a calibration; the error says what to do.
     """
     if not 1 <= len(cameras) <= MOST_CAMERAS:
-        todo = f"a rig has one to {MOST_CAMERAS} cameras"
+        todo = f"give one to {MOST_CAMERAS} cameras"
         raise InputError(f"{len(cameras)} cameras", todo=todo)
     models = models_by_camera(model, [c.name for c in cameras])
     if solver not in SOLVERS:
@@ -231,8 +235,9 @@ def _nominal(
     unknown = sorted(set(given) - set(names[1:]))
     if unknown:
         raise InputError(
-            f"nominal rotations of {', '.join(unknown)}",
-            todo=f"the cameras beside the first are {', '.join(names[1:]) or 'none'}",
+            f"nominal rotations are given for {', '.join(unknown)}, which the rig does not have or "
+            "which is its first camera",
+            todo=f"give them for: {', '.join(names[1:]) or 'no camera, because there is only one'}",
         )
     return {names.index(n): np.asarray(r, float) for n, r in given.items()}
 
@@ -256,8 +261,8 @@ def _trust(
 def dots_unknown(problem: Problem) -> bool:
     """Return whether the dots' nominal positions are too inexact to start the calibration from.
 
-    They are if their stated standard deviation, ``print_sigma_mm`` of the target, is more than a
-    tenth of the dots' mean spacing. The positions are then estimated from the views.
+    This is so if ``print_sigma_mm`` of the target, the standard deviation of the positions, is more
+    than a tenth of the dots' mean spacing. The positions are then estimated from the views.
     """
     spread = np.ptp(problem.nominal_mm[:, :2], axis=0).max()
     spacing = spread / max(1.0, np.sqrt(len(problem.dot_ids)))
@@ -265,11 +270,16 @@ def dots_unknown(problem: Problem) -> bool:
 
 
 def hold_dots(problem: Problem, dots_free: str) -> Problem:
-    """Return the problem with its dots free in 3-D, in the plane, or not at all."""
+    """Return the problem with priors on the dots' positions according to ``dots_free``.
+
+    dots_free : as for `self_calibrate`. Raises CalibrationError for another value.
+    """
     held = 1e-6
     sigma = problem.dot_sigma_mm.copy()
     if dots_free not in ("3d", "plane", "nominal"):
-        raise CalibrationError(f"unknown choice {dots_free!r}", todo="3d, plane or nominal")
+        raise CalibrationError(
+            f"dots_free is {dots_free!r}", todo="give one of: 3d, plane or nominal"
+        )
     if dots_free in ("plane", "nominal"):
         sigma[:, 2] = held
     if dots_free == "nominal":
@@ -278,7 +288,13 @@ def hold_dots(problem: Problem, dots_free: str) -> Problem:
 
 
 def with_plate(problem: Problem, nominal: mirror_ambiguity.Nominal | None = None) -> Problem:
-    """Return the problem with the views of a two-sided plate from behind, as fits better."""
+    """Return the problem in which the views through a two-sided plate are marked as such.
+
+    Which of its two sides carries the dots is not known, so both are tried; the better fit is kept.
+    The problem stays as it is for other targets, and for a single camera.
+
+    nominal : nominal rotation vectors in degrees by the camera's index.
+    """
     target = problem.target
     if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
         return problem
@@ -296,9 +312,13 @@ def with_plate(problem: Problem, nominal: mirror_ambiguity.Nominal | None = None
 def best_start(
     problem: Problem, dots_mm: Array, nominal: mirror_ambiguity.Nominal | None = None
 ) -> State:
-    """Return the closed-form start of least cost after a short solve.
+    """Return a start for the calibration: of several closed-form states the one that fits best.
 
-    nominal : decides between starts that fit alike (`mirror_ambiguity.consistent_start`).
+    Each is improved by a few iterations before the costs are compared.
+
+    dots_mm : (N, 3) positions of the target's dots. nominal : nominal rotation vectors in degrees
+    by the camera's index; they decide between states that fit equally well (see
+    `mirror_ambiguity.consistent_start`).
     """
     if len(problem.cameras) == 1:
         return known_target.mono_state(problem, dots_mm)
@@ -323,15 +343,16 @@ def _fit(
     """Fit a rich model robustly, choose the lens model, and fit that to convergence."""
     choice, held = None, None
     weighed = problem
-    words = f"{joint_name(models, [c.name for c in problem.cameras])}: as asked"
+    words = f"{joint_name(models, [c.name for c in problem.cameras])}: as given"
     if AUTO in models:
         first, choice = choose_model(problem, start, models, progress)
         weighed = first.problem
         models, start, words = choice.chosen.names, choice.chosen.state, choice.words
         if any("centre" in name for name in models):
             words += (
-                "; the perspective is strong, so the image centre (where the axis meets the "
-                "image) is free too, and the inter-camera angle is as uncertain as it makes it"
+                "; because the perspective is strong, the image centre (where the optical axis "
+                "meets the image) is free, too, which makes the angle between the cameras less "
+                "certain"
             )
             held = _centre_held(first.problem, start, models)
     final = problem.with_model(models)
@@ -353,9 +374,10 @@ def choose_model(
     models: tuple[str, ...],
     progress: Progress | None = None,
 ) -> tuple[RobustFit, Choice]:
-    """Return the robust fit of the richest model, and the choice of what each camera needs.
+    """Fit the richest lens model, and choose the lens model that each camera needs.
 
-    models : per camera, "auto" or a model that stays.
+    models : for each camera "auto", or the name of the lens model that the user gave.
+    Returns the robust fit of the richest model, and the choice.
     """
     first = _rich(problem, start, models, progress)
     return first, choose(first.problem, first.solution, models)

@@ -47,13 +47,15 @@ class StageAxis:
     """The calibrated stage.
 
     axis_rig : (3,) unit vector of travel in rig axes, in the direction of increasing readings.
-    basis : (3, 2) two orthonormal vectors perpendicular to it; covariance : (2, 2) rad^2 of the
-    axis in them.
-    scale, scale_sd : scale error of the encoder; reading = (1 + scale) travel. joint_covariance :
-    (3, 3) of the two components of the axis and the scale. rig_from_target : pose at reading 0.
-    chi2_dof : of the dots; 1 is expected.
+    basis : (3, 2) two orthonormal vectors perpendicular to the axis. covariance : (2, 2) of the
+    axis's direction along these vectors, in rad^2.
+    scale, scale_sd : scale error of the encoder (reading = (1 + scale) travel), and its standard
+    deviation. joint_covariance : (3, 3) of the two components of the direction and the scale.
+    rig_from_target : pose of the target at reading 0.
+    chi2_dof : chi-square per degree of freedom of the dots; 1 is expected.
     position_sigma_mm, wander_sigma_mm : standard deviations of the carriage's position along and
-    across the axis, as given or as observed if that is significantly larger. words : for the user.
+    across the axis: the given ones, or the observed ones if these are significantly larger.
+    words : sentences for the user.
     """
 
     axis_rig: Array
@@ -89,11 +91,11 @@ class StageAxis:
 
 
 def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | None:
-    """Return the stage that the folder `stage_axis/` gives, None without it.
+    """Measure the stage's axis from the folder `stage_axis/` of a dataset; None if there is none.
 
-    ``words`` say so if rig.toml states another direction. Raises InputError for a folder without
-    positions.csv, or with both or neither of images and dots.csv, and the errors of
-    `stage_axis_of`.
+    If rig.toml states another direction of travel, ``words`` of the result say so. Raises
+    InputError if the folder has no positions.csv, or both or neither of images and dots.csv, and
+    the errors of `stage_axis_of`.
     """
     folder = dataset.path / FOLDER
     if not folder.is_dir():
@@ -153,8 +155,8 @@ def _contradiction(axis: Array, stated: tuple[float, float, float]) -> list[str]
         return []
     direction = ", ".join(f"{v:.3f}" for v in axis)
     return [
-        f"rig.toml states a travel direction {angle:.0f} deg away from the measured one: "
-        + ("reverse its sign" if angle > 180 - _CONTRADICTION_DEG else f"write ({direction})")
+        f"[stage] axis in rig.toml is {angle:.0f} deg away from the measured direction of travel: "
+        + ("reverse its sign" if angle > 180 - _CONTRADICTION_DEG else f"write [{direction}]")
     ]
 
 
@@ -166,11 +168,14 @@ def stage_axis_of(
     position_sigma_mm: float = 0.001,
     wander_sigma_mm: float = 0.0,
 ) -> StageAxis:
-    """Return travel axis and encoder scale; their covariance includes the cameras' calibration.
+    """Measure the axis of travel and the encoder's scale from views at several stage positions.
 
-    table : columns as in dots.csv: view, camera, dot, u_px, v_px and either suu_px2, suv_px2,
-    svv_px2 or sigma_px. positions_mm : the encoder reading of each view, a mapping or a table with
-    the columns view and position_mm.
+    The covariance of the result includes the errors of the cameras' calibration.
+
+    table : measured dots of a target at rest, with the columns of dots.csv: view, camera, dot,
+    u_px, v_px and either suu_px2, suv_px2, svv_px2 or sigma_px.
+    positions_mm : the encoder reading of each view, a mapping or a table with the columns view and
+    position_mm.
     position_sigma_mm, wander_sigma_mm : as in `StageAxis`.
     Raises InputError for views without a position and for unknown cameras, and CalibrationError for
     fewer than two positions, less than 1 mm between them, or a single camera.
@@ -200,11 +205,17 @@ def _dots(
     index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
     known = table["dot"].isin(index).to_numpy()
     unknown = int((~known).sum())
-    words = [f"{unknown} dots are not in the calibration and are not used"] if unknown else []
+    words = (
+        [f"{unknown} dots have numbers that are not in the calibration, and are not used"]
+        if unknown else []
+    )  # fmt: skip
     rows = table[known]
     views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
     unseen = [v for v in readings if v not in views]
-    words += [f"positions.csv lists view {', '.join(unseen)}, which has no dots"] if unseen else []
+    words += (
+        [f"positions.csv lists view {', '.join(unseen)}, which has no dots and is not used"]
+        if unseen else []
+    )  # fmt: skip
     reading = np.array([readings[v] for v in views])
     _check_enough(reading, set(rows["camera"]))
     number = {v: i for i, v in enumerate(views)}
@@ -262,7 +273,8 @@ def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
     span = float(np.ptp(reading_mm))
     if span < LEAST_TRAVEL_MM:
         raise CalibrationError(
-            f"{len(reading_mm)} view(s) over {span:.3g} mm of readings show no travel",
+            f"{len(reading_mm)} view(s) whose readings span {span:.3g} mm are not enough to "
+            "measure the travel",
             where=FOLDER,
             todo="take views at three or more positions, as far apart as the image allows",
         )
@@ -307,7 +319,7 @@ def _observed_sigma(
 
 
 def _scatter_words(given: tuple[float, float], observed: tuple[float, float]) -> list[str]:
-    names = ("the encoder readings scatter", "the carriage moves across its axis")
+    names = ("the encoder readings scatter", "the carriage deviates from a straight line")
     return [
         f"{name} by {1000 * new:.2g} µm, more than the {1000 * old:.2g} µm that were stated; the "
         "larger value is used"
@@ -321,15 +333,15 @@ def _suspect_notes(dots: Dots, weights: Weights, system: StageEquations) -> list
     words = []
     for v in np.flatnonzero(weights.views < _LEAST_WEIGHT):
         words.append(
-            f"the reading {dots.reading_mm[v]:.6g} mm of view {dots.views[v]} is off by "
-            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm and gets almost no "
-            "weight; check positions.csv"
+            f"the encoder reading {dots.reading_mm[v]:.6g} mm of view {dots.views[v]} is wrong by "
+            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm and has almost no "
+            "influence; check positions.csv"
         )
     odd = int((weights.dots < _LEAST_WEIGHT).sum())
     if odd:
         words.append(
-            f"{odd} of {len(weights.dots)} dots lie far from their predicted pixels and get almost "
-            "no weight"
+            f"{odd} of {len(weights.dots)} dots lie far from their predicted pixels and have "
+            "almost no influence; check the images of stage_axis/ if there are many"
         )
     if len(dots.views) == 2:
         words.append("two positions cannot reveal a wrong encoder reading; take three or more")
@@ -394,8 +406,9 @@ _STATE, _RIG, _FIRST_ERROR = 0, 1, 2
 class Dots:
     """M measured dots of one target in V views.
 
-    reading_mm : (V,). view, camera : (M,) indices. place_mm : (M, 3) in the target frame. uv_px :
-    (M, 2). information : (M, 2, 2) inverse covariances of the pixels (1/px^2).
+    reading_mm : (V,) encoder reading of each view. view, camera : (M,) indices. place_mm : (M, 3)
+    position of each dot in the target frame. uv_px : (M, 2) measured pixels. information :
+    (M, 2, 2) inverse covariances of the pixels (1/px^2).
     """
 
     views: tuple[str, ...]
@@ -409,7 +422,11 @@ class Dots:
 
 @dataclass(frozen=True)
 class State:
-    """The target's pose in the rig at reading 0, and the travel (3,) per unit of reading."""
+    """The unknowns of the fit.
+
+    rig_from_target : pose of the target at reading 0. slope : (3,) travel in rig axes per mm of the
+    encoder's reading.
+    """
 
     rig_from_target: Pose
     slope: Array
@@ -425,11 +442,14 @@ class Weights:
 
 @dataclass(frozen=True)
 class StageEquations:
-    """The normal equations of the 9 unknowns (pose 6, slope 3), the carriage's errors eliminated.
+    """The normal equations of the 9 unknowns (pose 6, slope 3).
 
-    normal, right : (9, 9), (9,). by_rig : (9, P) coupling with the cameras' parameters. shift_mm,
-    shift_covariance : (V, 3), (V, 3, 3) of each view from the straight line. dot_score : (M,)
-    squared residuals in standard deviations, if each view is shifted freely.
+    The errors of the carriage's position in each view have been eliminated.
+
+    normal, right : (9, 9), (9,) matrix and right-hand side. by_rig : (9, P) coupling with the
+    cameras' P parameters. shift_mm, shift_covariance : (V, 3), (V, 3, 3) deviation of each view
+    from the straight line in mm, and its covariance.
+    dot_score : (M,) squared residuals of the dots in variances, if each view may deviate freely.
     """
 
     normal: Array
@@ -449,9 +469,11 @@ def fit(
 ) -> tuple[State, Weights, StageEquations]:
     """Fit the state to the dots by robust Gauss-Newton steps from a start.
 
-    free : for each camera the names of its free intrinsics. sigma_mm : standard deviations along
-    and across the axis. A dot or a reading beyond 3.5 standard deviations loses its weight by
-    `travel_weights`. Raises CalibrationError if the fit does not converge.
+    free : for each camera the names of its free intrinsics. sigma_mm : standard deviations of the
+    carriage's position along and across the axis. A dot or an encoder reading that is farther than
+    3.5 standard deviations from the fit loses weight (`travel_weights`).
+    Returns the fitted state, the weights and the equations at this state. Raises CalibrationError
+    if the fit does not converge.
     """
     weights = Weights(np.ones(len(dots.view)), np.ones(len(dots.views)))
     system = linearised(cameras, free, dots, state, sigma_mm, weights)
@@ -502,7 +524,10 @@ def linearised(
     sigma_mm: tuple[float, float],
     weights: Weights,
 ) -> StageEquations:
-    """Return the normal equations; GTSAM eliminates the carriage's error of each view."""
+    """Return the normal equations at a state; GTSAM eliminates the carriage's error of each view.
+
+    free, sigma_mm : as for `fit`.
+    """
     import gtsam
 
     residual, by_point, by_state, by_rig = derivatives(cameras, free, dots, state)
@@ -548,10 +573,11 @@ def _across(slope: Array) -> Array:
 def derivatives(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], dots: Dots, state: State
 ) -> tuple[Array, Array, Array, Array]:
-    """Return residuals (M, 2), measured minus predicted, and derivatives of the prediction.
+    """Return the residuals of M dots, and the derivatives of the predicted pixels.
 
-    These are (M, 2, 3) by the rig point, (M, 2, 9) by the state, and (M, 2, P) by the cameras'
-    parameters.
+    Returns the residuals (M, 2) in px, measured minus predicted, and the derivatives (M, 2, 3) with
+    respect to the dot's position in the rig frame, (M, 2, 9) with respect to the state, and
+    (M, 2, P) with respect to the cameras' P parameters.
     """
     pose = state.rig_from_target
     points = pose.apply(dots.place_mm) - dots.reading_mm[dots.view, None] * state.slope
@@ -574,9 +600,9 @@ def derivatives(
 def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
     """Return a state in closed form from which `fit` can start.
 
-    Dots are triangulated, the slope is a median over pairs of views, and the target is fitted to
-    the median position of each dot. Raises CalibrationError if no dot is seen by two cameras at two
-    positions.
+    The dots are triangulated. The slope is a median over pairs of views, and the target is fitted
+    to the median position of each dot. Raises CalibrationError if no dot is seen by two cameras at
+    two positions.
     """
     ids = np.unique(dots.place_mm, axis=0, return_inverse=True)[1].reshape(-1)
     keys = dots.view * (ids.max() + 1) + ids

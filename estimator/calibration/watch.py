@@ -42,7 +42,7 @@ _NAMED = 5
 
 
 class Stop(Protocol):
-    """What `threading.Event` has."""
+    """A flag that says when to stop, such as a `threading.Event`."""
 
     def wait(self, timeout: float) -> bool: ...
     def is_set(self) -> bool: ...
@@ -50,11 +50,13 @@ class Stop(Protocol):
 
 @dataclass
 class WatchedFolder:
-    """The images of a dataset as they arrive; each is detected once.
+    """The images of a dataset as they arrive in its folder; dots are detected in each image once.
 
-    An image counts as written when its size and time were the same at two polls. One that changes
-    later is detected again. A view that lacks an image for longer than ``patience_s`` is named
-    once.
+    An image counts as completely written when its size and its time of change are the same at two
+    polls. If it changes later, its dots are detected again.
+
+    path : folder of the dataset. tell : function that gets messages for the user.
+    patience_s : if an image of a view is missing for longer than this, one message says so.
     """
 
     path: Path
@@ -68,7 +70,7 @@ class WatchedFolder:
     _waiting_s: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def poll(self, stop: Stop | None = None) -> None:
-        """List the folder and detect what is new, until ``stop`` is set."""
+        """Look into the folder once and detect the dots in new images; end early at ``stop``."""
         dataset = self._listed()
         if dataset is None:
             return
@@ -146,7 +148,10 @@ class WatchedFolder:
         return [self._found[p][1] for v in self.dataset.views for p in v.image_paths.values()]
 
     def complete(self) -> list[str]:
-        """Return names of the views in which two cameras found the target, or the only one did."""
+        """Return the names of the views in which enough cameras see the target.
+
+        These are two cameras, or the only camera of the rig.
+        """
         if self.dataset is None:
             return []
         good: dict[str, int] = {}
@@ -155,7 +160,10 @@ class WatchedFolder:
         return [name for name, count in good.items() if count >= _needed(self.dataset)]
 
     def version(self) -> frozenset[tuple[Path, Stamp]]:
-        """Return the images of complete views, as they are now."""
+        """Return the files of the complete views with their size and time of change.
+
+        The result changes whenever another calibration is possible.
+        """
         complete = set(self.complete())
         return frozenset((p, s) for p, (s, i) in self._found.items() if i.view in complete)
 
@@ -205,11 +213,16 @@ def watch(
     until_um: float | None = None,
     **options: Any,
 ) -> tuple[Dataset, CalibrationRun]:
-    """Solve whenever a view is complete, until one more would gain little or ``stop`` is set.
+    """Calibrate whenever a new view of the target is complete, and say how to take the next one.
 
-    options : as for `run_calibration`. Returns the dataset of the images that were used and its
-    calibration, walls and stage included. Raises CalibrationError or DetectionError when stopped
-    with too little to calibrate.
+    This ends when one more view would gain little, when points in space are good enough, or when
+    ``stop`` is set.
+
+    tell : function that gets messages for the user. interval_s : time between two looks into the
+    folder. until_um : standard deviation of points in space that is good enough; None for none.
+    options : as for `run_calibration`.
+    Returns the dataset of the images that were used, and its calibration with windows and stage.
+    Raises CalibrationError or DetectionError if it is stopped before there are enough views.
     """
     check_options(**options, cameras=list(dataset.rig.cameras))
     folder = WatchedFolder(dataset.path, tell)
@@ -224,7 +237,7 @@ def watch(
             if _solved(folder, dataset, tell, until_um, solve):
                 break
     if stop.is_set():
-        tell("stopped; calibrating with what has arrived")
+        tell("stopped; calibrating with the images that have arrived")
     detected = folder.detected()
     assert folder.dataset is not None
     detected = with_example(folder.dataset, detected)
@@ -256,7 +269,7 @@ def _solved(
 
 def _too_few(dataset: Dataset, count: int) -> str:
     missing = RECOMMENDED_VIEWS - count
-    return f"{_views(count)}, {missing} more to begin with. Next: {_generic(dataset, count)}"
+    return f"{_views(count)}; {missing} more needed. Next: {_generic(dataset, count)}"
 
 
 def _views(count: int) -> str:
@@ -283,7 +296,10 @@ def _generic(dataset: Dataset, count: int) -> str:
 def standing(
     calibration: Calibration, dataset: Dataset, count: int, until_um: float | None
 ) -> tuple[str, bool]:
-    """Return one line on a calibration in the making, and whether it is enough."""
+    """Return one line on a calibration from the views so far, and whether the views are enough.
+
+    count : number of complete views. until_um : as for `watch`.
+    """
     advice = calibration.diagnostics.get("next_view") or {}
     status = str(calibration.verdict["status"])
     words = _views(count) + (f", {status}" if status != "GOOD" else "")
@@ -291,19 +307,19 @@ def standing(
         residual = calibration.statistics["rms_px"]
         return f"{words}: residual {residual:.3g} px. Next: {_generic(dataset, count)}", False
     sd = advice["before_um"]
-    words += f": points are good to {rounded_um(sd)} µm"
+    words += f": standard deviation of points in space {rounded_um(sd)} µm"
     if count < RECOMMENDED_VIEWS:
         missing = RECOMMENDED_VIEWS - count
-        return f"{words}, {missing} more to begin with. Next: {_generic(dataset, count)}", False
+        return f"{words}; {missing} more views needed. Next: {_generic(dataset, count)}", False
     if status == "REJECTED":
         return f"{words}: {calibration.verdict['reasons'][0]}", False
     if until_um is not None and sd <= until_um:
-        return f"{words}: enough, {until_um:g} µm were asked for", True
+        return f"{words}. This is enough: {until_um:g} µm were asked for", True
     if advice["enough"]:
         unmet = "" if until_um is None else f", though {until_um:g} µm were asked for"
-        gain = f"one more view would lower this by less than {ENOUGH_SHARE:.0%}"
-        return f"{words}: enough, {gain}{unmet}", True
+        gain = f"one more view would lower it by less than {ENOUGH_SHARE:.0%}"
+        return f"{words}. These views are enough: {gain}{unmet}", True
     if not advice["poses"]:
         return f"{words}. {advice['verdict']}", False
     after = rounded_um(advice["after_um"])
-    return f"{words}, {after} µm with one more view: {advice['poses'][0]['words']}", False
+    return f"{words}; {after} µm with one more view. Next: {advice['poses'][0]['words']}", False

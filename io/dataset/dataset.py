@@ -33,9 +33,11 @@ _LAYOUT = "put images at calibration/<camera>/<view>.tif, or dots in calibration
 
 @dataclass(frozen=True)
 class View:
-    """One position of the calibration target; its name is that of its images or in the table.
+    """One position of the calibration target, of which each camera takes an image.
 
-    image_paths : the image file by camera name; empty when the dots are read from dots.csv.
+    name : name of its image files without their extension, or the text in column view of dots.csv.
+    image_paths : the image file of each camera, by the camera's name; empty if the dots are read
+    from dots.csv.
     """
 
     name: str
@@ -60,9 +62,13 @@ class Run:
 class Dataset(ShortText):
     """Hold what `load_dataset` found in a dataset folder.
 
+    path : the folder. rig : the content of rig.toml.
     views : the calibration views in natural order of their names (2 before 10).
-    source : "images" or "dots"; None when no views were required and the folder has none or both.
-    notes : sentences that a user should read. table : the dots as `read_dots_csv` returns them.
+    runs : the runs by name.
+    source : "images" or "dots", from which the views are read; None if views were not required and
+    the folder has none, or both images and dots.
+    notes : sentences that a user should read.
+    table : the dots as `read_dots_csv` returns them; None for images.
     """
 
     path: Path
@@ -138,7 +144,7 @@ class Dataset(ShortText):
     def truth(self) -> dict[str, Any] | None:
         """The content of the simulator's `truth/truth.json`; None in a real dataset.
 
-        It serves for comparison only; no estimator may use it.
+        The truth is for comparison with results only; no estimator may use it.
         """
         file = self.path / "truth" / "truth.json"
         if not file.is_file():
@@ -152,12 +158,16 @@ def load_dataset(
     *,
     need_views: bool = True,
 ) -> Dataset:
-    """Read a dataset's rig.toml and dots.csv, and list its views and runs; no image is decoded.
+    """Open a dataset: read its rig.toml and dots.csv, and list its views and runs.
 
-    source : "images" or "dots"; needed when `calibration/` holds both. None takes the only one.
-    need_views : False for work on runs with a calibration from elsewhere.
-    Raises InputError when the folder is not a dataset, and when two views have equal names, and
-    NoViewsError when views are needed and there are none.
+    No image is decoded.
+
+    source : "images" or "dots", from which the views are read; None takes the only one that there
+    is. It has to be given if `calibration/` holds both.
+    need_views : whether the dataset must have views of the target. False is for runs that are
+    evaluated with a calibration from elsewhere.
+    Returns a `Dataset`. Raises InputError if the folder is not a dataset or if two views have equal
+    names, and NoViewsError if views are needed and there are none.
     """
     folder = _dataset_folder(Path(path))
     rig = read_rig_toml(folder / "rig.toml")
@@ -254,7 +264,10 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
     for entry in _entries(calibration):
         if not entry.is_dir():
             if entry.name != "dots.csv":
-                notes.append(f"calibration/{entry.name} is in no camera's folder: not used")
+                notes.append(
+                    f"calibration/{entry.name} is not used, because it is in no camera's folder "
+                    "calibration/<camera>/"
+                )
         elif entry.name not in rig.cameras:
             raise InputError(
                 f"there is no camera {entry.name!r} in rig.toml",
@@ -315,4 +328,7 @@ def _note_single(cameras_of: Mapping[Any, set[str]], rig: RigDescription, notes:
         alone = sorted((str(v) for v, seen in cameras_of.items() if seen == {camera}), key=natural)
         if alone:
             count = f"{len(alone)} view{'s' if len(alone) > 1 else ''}"
-            notes.append(f"{count} of camera {camera} alone: {', '.join(alone)}")
+            notes.append(
+                f"{count} with an image of camera {camera} only, so without use for the angle "
+                f"between cameras: {', '.join(alone)}"
+            )

@@ -39,18 +39,19 @@ RunSource = Literal["images", "detections"]
 
 @dataclass(frozen=True)
 class RunData:
-    """Hold what `load_run` found in a run's folder; it has F frames.
+    """Hold what `load_run` found in the folder of a run with F frames.
 
     t_s : (F,) the middle of each frame's exposure in s. position_mm : (F,) the stage's position at
     t_s, NaN outside the encoder's record; None without stage.csv.
     image_sizes_px : (width, height) by camera. source : "images" or "detections".
-    rig, stage, accelerometers, references, detections : None where there is no such file. Large
-    detections are a `FrameTable`, which stays on disk.
+    rig : the content of rig.toml. stage, accelerometers, references, detections : the tables of
+    stage.csv, accelerometer.csv, references.csv and detections.csv. Each is None if there is no
+    such file. A large detections.csv is a `FrameTable`, which stays on disk.
     notes : sentences that a user should read. `image` adds one for each frame that it cannot read.
-    skip_unreadable : True if `image` returns None for every frame that cannot be read, False if for
-    none; None means that only the last frame of a recording may be unreadable.
-    sources : the opened frames by camera; positions : (F,) where in it each frame lies, -1 for
-    none.
+    skip_unreadable : whether `image` returns None for a frame that cannot be read. True: for every
+    frame; False: for none; None: only for the last frame of a recording.
+    sources : the opened frames by camera. positions : (F,) by camera, the position of each frame
+    among the camera's opened frames, -1 for a missing frame.
     """
 
     name: str
@@ -72,11 +73,13 @@ class RunData:
     positions: Mapping[str, Ints] = field(default_factory=dict, repr=False, compare=False)
 
     def image(self, camera: str | int, frame: int) -> Image | None:
-        """Read one frame of one camera, given by name or index: pixels (height, width) as stored.
+        """Read one frame of one camera.
 
-        Returns None when that camera misses the frame, or when it cannot be read and may be left
-        out. Raises InputError for other unreadable frames, an image of another size, and a run of
-        detections.
+        camera : name or index. frame : from 0.
+        Returns the pixels (height, width) as stored; None if the camera misses the frame, or if the
+        frame cannot be read and `skip_unreadable` permits this. Raises InputError for any other
+        frame that cannot be read, for an image of another size, and for a run that was loaded from
+        detections.csv.
         """
         name = self.camera_name(camera)
         if name not in self.sources:
@@ -108,10 +111,10 @@ class RunData:
         return image
 
     def first(self, frames: int) -> RunData:
-        """Return the run with its first frames only; the sensors' records stay whole."""
+        """Return the run with its first ``frames`` frames only; the sensors' records stay whole."""
         if frames < 1:
             raise InputError(
-                f"the first {frames} frames are none", where=str(self.path), todo="give 1 or more"
+                f"the number of frames is {frames}", where=str(self.path), todo="give 1 or more"
             )
         if frames >= self.frame_count:
             return self
@@ -154,17 +157,21 @@ def load_run(
     pair_by: Pairing = "auto",
     skip_unreadable: bool | None = None,
 ) -> RunData:
-    """Read a run's tables and open its frames; only the first and the last images are decoded.
+    """Open a run: read its tables and open its frames. Only the first and last image are decoded.
 
     path : `DATASET/runs/NAME`, or any folder that holds the same files.
     rig : the content of rig.toml; None looks for a `rig.toml` two folders above the run.
-    source : "images" or "detections"; needed where the folder has both. None takes the only one.
+    source : "images" or "detections", from which bubbles are taken; None takes the only one that
+    there is. It has to be given if the folder has both.
     cameras : names of the cameras; None takes the two that `[tracking]` in rig.toml names, or the
-    first two. image_sizes_px : (width, height) by camera; they replace those of rig.toml.
-    pair_by : how the images of several cameras are paired, see `pair_frames`.
-    skip_unreadable : True leaves out every frame that cannot be read, False none. None leaves out
-    only the last one of a recording, which is cut short when the disk is full or the power fails.
-    Raises InputError, with the file, the row or frame, and what to do.
+    first two.
+    image_sizes_px : (width, height) by camera; they replace those of rig.toml.
+    pair_by : how the images of several cameras are paired: "numbers", "order" or "auto", see
+    `telerig.io.dataset.run.pair_frames`.
+    skip_unreadable : True leaves out every frame that cannot be read, False leaves out none and
+    raises an error. None leaves out only the last frame of a recording, which may be cut short
+    because the disk was full or the power failed.
+    Returns a `RunData`. Raises InputError, which names the file, the row or frame, and what to do.
     """
     folder = _run_folder(Path(path))
     check_name(folder.resolve().name, str(folder), "run")
@@ -285,7 +292,7 @@ def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str,
         raise InputError(
             f"there is no camera {name!r} in the rig",
             where=str(entry),
-            todo=suggestion(name, every) + " Else move it out of the run's folder.",
+            todo=suggestion(name, every) + " If it is no camera, move it out of the run's folder.",
         )
     sources = {name: open_frames(folder, name) for name in names}
     for name, source in sources.items():
@@ -422,7 +429,7 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
         notes.append(
             f"stage.csv has no reading for {step[hit[0]]:.3g} s from {t[hit[0]]:.6g} s on"
             + (f", and {len(hit) - 1} further gaps" if len(hit) > 1 else "")
-            + ": positions there are interpolated"
+            + "; the stage's positions in between are interpolated"
         )
     return np.asarray(at, float)
 
@@ -452,8 +459,9 @@ def _with_ends_checked(run: RunData) -> RunData:
 Pairing = Literal["auto", "numbers", "order"]
 
 _TODO = (
-    "complete the images; number their names alike; name what is missing in the column "
-    "`missing` of frames.csv; or pair them in order (--pair-by order)"
+    "do one of these: add the missing images; give images of the same frame the same number in "
+    "their names; name the missing frames in the column `missing` of frames.csv; or pair the "
+    "images in order (--pair-by order)"
 )
 
 
@@ -467,9 +475,12 @@ def pair_frames(
 
     pair_by : "numbers" pairs by the numbers in the file names, "order" by the order of the images,
     and "auto" by the numbers if they are plausible, otherwise by the order.
+    sources : the opened frames by camera.
     missing : (F,) by camera, True for the frames that frames.csv reports as dropped; None for none.
-    Returns (F,) by camera, the position of each frame in that camera's source (-1: missing), and
-    sentences for the user. Raises InputError when the images cannot be paired safely.
+    where : the folder, for errors.
+    Returns for each camera the position (F,) of each frame among its opened frames, -1 for a
+    missing frame, and sentences for the user. Raises InputError if the images cannot be paired
+    safely.
     """
     if missing is not None:
         return _by_missing(sources, missing, where)
@@ -483,13 +494,14 @@ def pair_frames(
     if pair_by == "numbers":
         silent = ", ".join(name for name, n in numbers.items() if n is None)
         raise InputError(
-            f"the names of camera {silent} do not count the frames",
+            f"the names of the images of camera {silent} do not contain the number of the frame",
             where=where,
-            todo="name images like 000000.tif, 000001.tif, or pair them in order",
+            todo="name images like 000000.tif, 000001.tif, or pair them in order (--pair-by order)",
         )
     if len(set(counts.values())) > 1:
         counted = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"the cameras differ in their frames: {counted}", where=where, todo=_TODO)
+        what = f"the cameras have different numbers of frames: {counted}"
+        raise InputError(what, where=where, todo=_TODO)
     return _in_order(counts)
 
 
@@ -513,10 +525,11 @@ def _trustworthy(numbers: Mapping[str, Ints], where: str) -> bool:
             return False
         starts = " and ".join(f"{name} at {n[0]}" for name, n in numbers.items())
         raise InputError(
-            f"as many images in each camera, but their names start differently: {starts}",
+            "the cameras have equal numbers of images, but the numbers in the images' names start "
+            f"differently: {starts}",
             where=where,
-            todo="pair them by the numbers (--pair-by numbers) if frames are missing at the ends, "
-            "else in order (--pair-by order)",
+            todo="give --pair-by numbers if equal numbers mean the same frame (frames are then "
+            "missing at the ends), or --pair-by order if the first images belong together",
         )
     return 2 * len(shared) >= min(map(len, sets))
 
@@ -532,7 +545,7 @@ def _by_numbers(numbers: Mapping[str, Ints]) -> tuple[dict[str, Ints], list[str]
     """Pair frames by the numbers in their names; the returned values are those of `pair_frames`."""
     step, first = _step(numbers), min(int(n[0]) for n in numbers.values())
     count = max(int(n[-1] - first) // step + 1 for n in numbers.values())
-    notes = [f"the names of the images count in steps of {step}"] if step > 1 else []
+    notes = [f"the numbers in the images' names increase by {step}"] if step > 1 else []
     positions = {}
     for name, counted in numbers.items():
         place = np.full(count, -1, np.int64)
@@ -563,10 +576,10 @@ def _by_missing(
             place = np.where(gone, -1, np.cumsum(~gone) - 1)
         else:
             raise InputError(
-                f"camera {name} has {len(source)} images; frames.csv has {frames} rows, "
-                f"{frames - present} of them with its frame missing",
+                f"camera {name} has {len(source)} images, but frames.csv has {frames} rows and "
+                f"states that this camera misses {frames - present} of them",
                 where=where,
-                todo="correct the column `missing`, or complete the images",
+                todo="correct the column `missing`, or add the missing images",
             )
         positions[name] = place
         notes += _missing_note(name, place)

@@ -36,10 +36,11 @@ DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *COVAR
 def choose_source(
     has: Mapping[AnySource, bool], source: str | None, folder: Path
 ) -> AnySource | None:
-    """Return the form of the measurements that is used, "images" or that of a table, or None.
+    """Return whether images or a table of measurements are used; None if there is neither.
 
-    has : for each of the two forms, whether the folder has it. source : the one that the user asked
-    for; None takes the only one. Raises InputError for another word, and for both without a choice.
+    has : whether the folder has "images", and whether it has the table ("dots" or "detections").
+    source : the one that the user asked for; None takes the only one that there is.
+    Raises InputError for another word, and if there are both and the user chose none.
     """
     first, second = has
     if source is not None and source not in has:
@@ -177,11 +178,14 @@ def _check_repeats(table: pd.DataFrame, target: Target, file: Path) -> None:
 
 
 def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *, of: str) -> bool:
-    """Set the table's columns suu_px2, suv_px2, svv_px2 (px^2) in place, where the file lacks them.
+    """Add the columns suu_px2, suv_px2, svv_px2 (px^2) to a table in place, if it lacks them.
 
-    They are computed from the column sigma_px, or else from ``default_sigma_px``. of : the point
-    that they are of, for errors. Returns whether the file stated the noise. Raises InputError when
-    only some of the columns exist, and for values that are no covariance.
+    They are computed from the column sigma_px, or from ``default_sigma_px`` if there is no such
+    column.
+
+    of : what the points are, for errors, for example "a dot's centre".
+    Returns whether the file stated the noise. Raises InputError if only some of the columns exist,
+    and for values that are no covariance.
     """
     given = [name for name in COVARIANCE if name in table]
     if 0 < len(given) < 3:
@@ -271,8 +275,8 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
     rows.refuse(again, "frame", lambda i: f"{frame[i]} stands twice", "keep one of the rows")
     refuse(frame < 0, lambda i: ", before 0", "frames count from 0")
     if frame_count is not None:
-        end = f", but the images end with frame {frame_count - 1}"
-        refuse(frame >= frame_count, lambda i: end, "remove the row, or complete the images")
+        end = f", but the last frame with images is {frame_count - 1}"
+        refuse(frame >= frame_count, lambda i: end, "remove the row, or add the missing images")
     falls = np.diff(frame, prepend=frame[0]) < 0
     refuse(falls, lambda i: f" after {frame[i - 1]}", "sort the rows by frame")
     refuse(
@@ -290,9 +294,9 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
 
 
 def read_run_toml(path: Path) -> tuple[float, float]:
-    """Read frame rate (Hz) and time of frame 0 (s, by default 0) from `run.toml`.
+    """Read `run.toml`, and return the frame rate (Hz) and the time of frame 0 (s, by default 0).
 
-    Raises InputError when the file is no TOML, has an unknown key, or has no positive frame rate.
+    Raises InputError if the file is no TOML, has an unknown key, or has no positive frame rate.
     """
     raw = read_toml(path, "write frame_rate_hz = 500.0")
     for key in raw:
@@ -402,7 +406,8 @@ def read_detections_part(
 ) -> pd.DataFrame | None:  # fmt: skip
     """Read some rows of `detections.csv` as `read_detections_csv` reads all of them.
 
-    content, row : as for `read_part`, and so is the result for an unusual text.
+    content : the header and some rows as bytes. row : number of the first of these rows in the
+    file. Returns None for an unusual text, as `read_part` does.
     """
     table = read_part(path, content, row, _pixel_columns(_OF_BUBBLES))
     if table is None:
@@ -455,8 +460,9 @@ def _check_pixels(
     rows_of(table, path).refuse(
         (frame < 0) | (frame > last),
         "frame",
-        lambda i: f"is {frame[i]}, " + ("before 0" if frame[i] < 0 else f"the last is {last}"),
-        "frames count from 0; correct the cell, or complete the times of the frames",
+        lambda i: f"is {frame[i]}, "
+        + ("before 0" if frame[i] < 0 else f"but the last frame is {last}"),
+        "frames count from 0; correct the cell, or add the frame to frames.csv",
     )
 
 

@@ -23,11 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Format:
-    """Describe one format, whose module is imported at its first use.
+    """Describe one format of an import or export; its module is imported at the first use.
 
-    function : "module:name" below ``telerig.io.exchange``. description : for the help text. suffix
-    : of an exported file; "" for a folder. options : those of the command that the function takes.
-    extra : the optional dependency that it needs, as in ``pip install 'telerig[tdms]'``.
+    program : the program that uses the format.
+    function : "module:name" of the function that reads or writes it, below ``telerig.io.exchange``.
+    description : for the help text. suffix : ending of an exported file; "" for a folder.
+    options : the options of the command that the function takes.
+    extra : name of the optional dependency that it needs, as in ``pip install 'telerig[tdms]'``.
     """
 
     program: str
@@ -132,9 +134,11 @@ def export_results(
     """Write cameras or a run in the format ``to``, a name in `CAMERA_EXPORTS` or `RUN_EXPORTS`.
 
     source : a dataset, one of its results folders, or a calibration.json.
-    run : the run's name; None takes the only one with results. calibration : is used in place of
-    the dataset's own. out : the file or folder; None writes into the dataset's results/export.
-    accept : ("stale",) also exports results whose inputs have changed. options : of the format.
+    run : name of the run; None takes the only one with results.
+    calibration : calibration.json to use in place of that of the dataset.
+    out : file or folder to write; None writes into the folder results/export of the dataset.
+    accept : ("stale",) also exports results whose inputs have changed.
+    options : options of the format, see `Format.options`.
     Returns lines of text that say what was written and where. Raises InputError for an unknown
     format, and for results that are missing, stale or cannot be used.
     """
@@ -173,9 +177,11 @@ def export_cameras(
 ) -> list[str]:
     """Write the cameras in one of the formats `CAMERA_EXPORTS`.
 
-    volume : where errors are measured and polynomials fitted; None takes `working_volume`. remarks
-    : sentences that the file keeps as comments. options : those that the format takes.
-    Returns lines of text. Raises InputError for a volume that the cameras do not see.
+    volume : box in which errors are measured and polynomials are fitted; None takes
+    `working_volume`. remarks : sentences that are written into the file as comments.
+    options : options of the format, see `Format.options`.
+    Returns lines of text that say what was written. Raises InputError for a volume that the cameras
+    do not see.
     """
     from telerig.io.exchange.export.volume import working_volume
 
@@ -198,10 +204,11 @@ def export_cameras(
 def export_run(
     results: RunResults, to: str, out: Path, cameras: Sequence[Camera] = ()
 ) -> list[str]:
-    """Write a run in one of the formats `RUN_EXPORTS`; return lines of text on what was written.
+    """Write a run in one of the formats `RUN_EXPORTS`.
 
-    Cameras are written too, if the format can hold them. Raises InputError for data that it cannot
-    hold.
+    cameras : calibrated cameras, which are written too if the format can hold cameras.
+    Returns lines of text that say what was written. Raises InputError for data that the format
+    cannot hold.
     """
     RUN_EXPORTS[to](results, out, cameras=cameras)
     bubbles = counted(results.points["particle"].nunique(), "bubble")

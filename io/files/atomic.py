@@ -34,10 +34,10 @@ _OLD_S = 7 * 24 * 3600.0
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, with the same suffix, and rename it at the end.
+    """Yield a temporary path beside ``path``, and rename the file there to ``path`` at the end.
 
-    On an exception it is removed, and a file that was at ``path`` before stays. Raises InputError
-    when the place cannot be written, also when the disk is full or the folder disappears meanwhile.
+    If an exception occurs, the temporary file is removed, and an earlier file at ``path`` stays.
+    Raises InputError if the file cannot be written, for example because the disk is full.
     """
     final = Path(path)
     if final.is_dir():
@@ -109,16 +109,20 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
 
 
 def write_json_atomic(path: str | os.PathLike[str], content: Any) -> None:
-    """Write a strict JSON file, completely or not at all, with the types of `plain`.
+    """Write a strict JSON file, completely or not at all; ``content`` is converted by `plain`.
 
-    Raises TypeError for an object that JSON cannot represent, InputError when it cannot be written.
+    Raises TypeError for an object that JSON cannot represent, and InputError if the file cannot be
+    written.
     """
     text = json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False)
     write_text_atomic(path, text + "\n")
 
 
 def plain(content: Any) -> Any:
-    """Return ``content`` in the types of JSON; dataclasses become objects, NaN becomes null."""
+    """Return ``content`` with all values converted to the types of JSON.
+
+    Dataclasses become objects, NaN becomes null.
+    """
     if isinstance(content, dict):
         return {str(key): plain(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):
@@ -148,7 +152,10 @@ def _machine() -> str:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of killed commands; those of other computers after a week."""
+    """Remove temporary files that killed commands have left in a folder.
+
+    Files of commands on other computers are removed after a week.
+    """
     try:
         entries = [entry for entry in folder.iterdir() if entry.name.startswith(".")]
     except OSError:

@@ -126,18 +126,20 @@ def append_table(table: pd.DataFrame, path: Path) -> None:
 
 @dataclass(frozen=True)
 class Rows:
-    """Name rows of a file in errors.
+    """Names the rows of a table in errors, by their numbers in the file.
 
-    numbers : (rows,) each row's number in the file, where the header is row 1.
+    numbers : (rows,) number of each row in the file; the header is row 1.
     """
 
     file: Path
     numbers: Any
 
     def refuse(self, bad: Bools, column: str, what: str | Callable[[int], str], todo: str) -> None:
-        """Raise InputError for the first bad row, and list further ones; do nothing without one.
+        """Raise InputError if a row is bad; the message names the first one and lists others.
 
-        what : what is wrong, or a function that returns it for the position of a row in the table.
+        bad : (rows,) whether each row is bad. column : the column that the message names.
+        what : what is wrong, or a function that returns this for the index of a row in the table.
+        todo : what the user can do.
         """
         positions = np.flatnonzero(bad)
         if not positions.size:
@@ -159,10 +161,11 @@ def rows_of(table: pd.DataFrame, file: Path) -> Rows:
 def read_part(
     file: Path, content: bytes, row: int, columns: Sequence[Column]
 ) -> pd.DataFrame | None:
-    """Read a part of a CSV table as `read_table` reads all of it, further columns included.
+    """Read a part of a CSV table as `read_table` reads the whole table with ``extra``.
 
-    content : the header and some rows.  row : number of the first one in the file.
-    Returns None where the text is unusual; `read_table` of the file then finds out what it is.
+    content : the header and some rows. row : number of the first of these rows in the file.
+    Returns None if the text is unusual, so that the whole file has to be read with `read_table`,
+    which finds any fault.
     """
     return _sound_table(file, columns, "keep", content, row)
 

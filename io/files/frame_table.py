@@ -25,13 +25,13 @@ file that follows it; None where the text is unusual."""
 
 @dataclass(frozen=True)
 class FrameTable:
-    """Hold where in a file the rows of each frame are.
+    """A large CSV table, sorted by frame, which stays on disk and is read part by part.
 
-    read : returns the table of a part of the file.  header : first line.
-    offset : (B + 1,) bytes at which blocks of rows begin, and the last one ends.
+    read : function that returns the table of a part of the file. header : first line of the file.
+    offset : (B + 1,) bytes at which each of B blocks of rows begins, and the end of the last one.
     first, last, row : (B,) first and last frame of each block, and the number of its first row.
-    rows : number of rows.  particles : what the column ``particle`` holds, as text.
-    stop : only frames before this one are in the table; None for all.
+    rows : number of rows. particles : the different values in the column ``particle``, as text.
+    stop : only frames before this one belong to the table; None for all.
     """
 
     file: Path
@@ -113,7 +113,7 @@ class FrameTable:
         return pd.concat(parts) if len(parts) > 1 else parts[0]
 
     def parts(self, frames: int = 2000) -> Iterator[pd.DataFrame]:
-        """Yield the rows of some frames at a time, in their order."""
+        """Yield the table in parts of ``frames`` frames, in their order."""
         stop = int(self.last[-1]) + 1
         for first in range(0, stop if self.stop is None else min(stop, self.stop), frames):
             yield self.between(first, first + frames)

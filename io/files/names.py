@@ -38,10 +38,10 @@ def fault_of_name(name: str) -> str:
 
 
 def check_name(name: str, where: str, thing: str = "name") -> str:
-    """Return a name that follows the rule.
+    """Return a name unchanged if it can be part of file names.
 
     where : the place that the error names. thing : what has the name, for example "camera".
-    Raises InputError for any other name.
+    Raises InputError for a name that `fault_of_name` finds a fault in.
     """
     if fault := fault_of_name(name):
         raise InputError(f"the {thing} {name!r:.80} {fault}", where=where, todo=ADVICE)

@@ -18,7 +18,11 @@ LARGEST_NUMBER = 1e15
 
 
 def read_toml(file: Path, todo: str, missing: str = "check the path") -> dict[str, Any]:
-    """Read a TOML file; ``todo`` is the advice for a file that is no TOML, ``missing`` for none."""
+    """Read a TOML file and return its content.
+
+    todo : the advice in the error for a file that is no TOML. missing : the advice for a file that
+    does not exist. Raises InputError as `toml_content` and `read_text` do.
+    """
     return toml_content(read_text(file, missing=missing), str(file), todo)
 
 

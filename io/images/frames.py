@@ -46,20 +46,26 @@ class FrameSource(Protocol):
     def __len__(self) -> int: ...
 
     def read(self, position: int) -> Image:
-        """Read the frame at ``position`` (from 0); InputError names file and frame."""
+        """Read the frame at ``position`` (from 0); pixels (height, width).
+
+        Raises InputError, which names file and frame, if the frame cannot be read.
+        """
 
     def where(self, position: int) -> str:
-        """Return the names of file and frame, for errors."""
+        """Return the file and the frame at ``position`` in words, for errors."""
 
     def numbers(self) -> Ints | None:
-        """Return the increasing numbers (frames,) in the file names; None without such numbers."""
+        """Return the number (frames,) of each frame in its file name; None without such numbers.
+
+        The numbers increase.
+        """
 
 
 @dataclass(frozen=True)
 class ImageFiles:
     """Give access to a folder that holds one image file per frame, in natural order of the names.
 
-    Paths would need ten times the memory of names, and are sent to every process.
+    Names are kept instead of paths, because paths need ten times the memory, in every process.
     """
 
     path: Path
@@ -76,7 +82,7 @@ class ImageFiles:
         return str(self.path / self.names[position])
 
     def numbers(self) -> Ints | None:
-        """Return the last number in each name, (frames,); None if the rest of the names differs."""
+        """Return the last number (frames,) in each name; None if the rest of the names differs."""
         parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", Path(n).stem) for n in self.names]
         if not all(parts) or len({(m[1], m[3]) for m in parts if m}) != 1:
             return None
@@ -87,7 +93,7 @@ class ImageFiles:
 
 
 class PageFrames:
-    """Give access to the pages of a multi-page TIFF; InputError if no page is complete."""
+    """Give access to the pages of a multi-page TIFF. Raises InputError if no page is complete."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -214,11 +220,12 @@ def _found(offsets: list[int], path: Path) -> Ints:
 
 
 def open_frames(folder: Path, camera: str) -> FrameSource | None:
-    """Open the frames of one camera in a run's folder, None if it has none; no frame is decoded.
+    """Open the frames of one camera in a run's folder; no frame is decoded.
 
-    They are `<camera>/*.tif|png|bmp|jpg`, or `<camera>.tif` (multi-page), or a video
-    `<camera>.avi|mp4|mov|mkv`, or a high-speed camera's `<camera>.cine` or `<camera>.mraw`. Raises
-    InputError when there is more than one of these, or when a file cannot be opened.
+    The frames are the images `<camera>/*.tif|png|bmp|jpg`, or `<camera>.tif` (multi-page), or a
+    video `<camera>.avi|mp4|mov|mkv`, or a high-speed camera's file `<camera>.cine` or
+    `<camera>.mraw`. Returns None if the folder has none of these. Raises InputError if it has more
+    than one of them, or if a file cannot be opened.
     """
     found = camera_entries(folder, camera)
     if len(found) > 1:
@@ -285,9 +292,10 @@ _WIDE_GREY = {"gray9", "gray10", "gray12", "gray14", "gray16"}
 class VideoFrames:
     """Give access to the frames of a video by their position.
 
-    Successive frames are read at the decoder's speed; for others decoding starts at a key frame.
-    Grey formats are returned as stored (uint8, or uint16 for 9 to 16 bits), YUV formats as their
-    stored brightness; RGB frames must be grey. Raises InputError without PyAV and for other files.
+    Successive frames are read fast; for any other frame, decoding starts at the key frame before
+    it. Grey formats are returned as stored (uint8, or uint16 for 9 to 16 bits), YUV formats as
+    their stored brightness; frames of RGB formats must be grey. Raises InputError if PyAV is not
+    installed, or if the file is no video.
     """
 
     def __init__(self, path: Path) -> None:

@@ -11,10 +11,11 @@ Window = tuple[slice, slice]
 
 
 def cell_coverage(polygon: Array, size: tuple[int, int]) -> Array:
-    """Return the exact share (rows, columns) of each unit cell inside a closed polygon (points, 2).
+    """Return the exact share (rows, columns) of each cell of a grid that lies inside a polygon.
 
-    The polygon's x and y in cells must lie inside the grid. Each edge is cut at the cells' borders;
-    a piece adds its height to all cells to its right.
+    polygon : (points, 2) x and y of its corners in cells, inside the grid. size : (rows, columns)
+    of the grid. Each edge is cut at the cells' borders; a piece adds its height to all cells to its
+    right.
     """
     rows, columns = size
     start, end = _pieces(polygon)
@@ -70,10 +71,13 @@ def pixel_weights(
     shift_px: float = 0.0,
     kind: type[np.floating] = np.float64,
 ) -> Array:
-    """Return the weights (pixels + 2 pad, pixels * per_pixel) of a row's fine cells in pixels.
+    """Return the matrix that turns a row of fine cells into blurred pixels.
 
-    They blur and integrate. The row starts at the left edge of its first pixel and is displaced by
-    shift_px. Averaging inside a cell blurs by its width squared over 12, which is taken off.
+    Its size is (pixels + 2 pad, pixels * per_pixel): the pixels, with ``pad`` more on both sides,
+    from ``per_pixel`` cells per pixel. It blurs with the standard deviation sigma_px and integrates
+    over each pixel. The row of cells starts at the left edge of its first pixel and is displaced by
+    shift_px. The blur by the finite width of a cell, a variance of width^2 / 12, is subtracted from
+    sigma_px^2.
     """
     centre = (np.arange(pixels * per_pixel) + 0.5) / per_pixel + shift_px
     border = np.arange(-pad, pixels + pad + 1)[:, None]
@@ -85,9 +89,11 @@ def pixel_weights(
 def overlap(
     shape: tuple[int, ...], patch_shape: tuple[int, ...], row: int, column: int
 ) -> tuple[Window, Window]:
-    """Return the slices (rows, columns) of a patch in an image, and of that part in the patch.
+    """Return the part of an image that a patch covers.
 
-    row, column : the patch's first pixel in the image, which may be negative.
+    shape, patch_shape : of the image and of the patch. row, column : the patch's first pixel in the
+    image, which may be negative.
+    Returns the slices (rows, columns) of this part in the image, and its slices in the patch.
     """
     first = np.maximum([row, column], 0)
     end = np.maximum(np.minimum(np.add([row, column], patch_shape), shape), first)
@@ -97,7 +103,10 @@ def overlap(
 
 
 def refined(outline: Array, count: int) -> Array:
-    """Interpolate a smooth closed outline (points, 2) trigonometrically to (count, 2) points."""
+    """Return ``count`` points (count, 2) of a smooth closed outline that is given by fewer.
+
+    outline : (points, 2), evenly spaced in the parameter; the interpolation is trigonometric.
+    """
     n = len(outline)
     spectrum = np.fft.rfft(outline, axis=0)
     if n % 2 == 0:

@@ -58,7 +58,10 @@ def read_image(
 
 
 def image_from_pixels(pixels: NDArray[Any], file: Path) -> Image:
-    """Convert decoded pixels of a page or a video as `read_image` does, with the same checks."""
+    """Return decoded pixels of a page or a video as grey levels, with the checks of `read_image`.
+
+    file : for errors.
+    """
     return _native(_grey(pixels, file), file)
 
 
@@ -191,10 +194,11 @@ def tiff_reader() -> Any:
 
 
 def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
-    """Return the pixels of tifffile's ``page``, (height, width) or (height, width, channels).
+    """Return the pixels of a page of a TIFF, (height, width) or (height, width, channels).
 
-    Raises InputError when the file ends before the page does, or white is 0; and what tifffile
-    raises.
+    page : tifffile's page. file_size : size of the file in bytes.
+    Raises InputError if the file ends within the page or stores white as 0, and all errors that
+    tifffile raises.
     """
     bits = np.max(page.bitspersample)
     bytes_per_pixel = max(int(bits) // 8, 1) * page.samplesperpixel * page.imagedepth

@@ -23,7 +23,10 @@ Result = TypeVar("Result")
 
 
 def cores() -> int:
-    """Return how many cores this process may use: TELERIG_CORES, or all that the system allows."""
+    """Return how many cores this process may use.
+
+    It is the environment variable TELERIG_CORES, or the number that the system allows.
+    """
     asked = os.environ.get("TELERIG_CORES", "")
     if asked.isdecimal() and int(asked) > 0:
         return int(asked)
@@ -43,10 +46,10 @@ def ordered_map(
     workers: int,
     meanwhile: Callable[[], object] | None = None,
 ) -> Iterator[Result]:
-    """Yield ``function`` of each task, in the order of the tasks, by ``workers`` processes.
+    """Yield the result of ``function`` for each task, in the order of the tasks.
 
-    function : a module's function or a `functools.partial` of one. meanwhile : is called once in
-    this process while copies of it work.
+    function : a module's function or a `functools.partial` of one. workers : number of processes
+    that work at the same time. meanwhile : is called once in this process while the others work.
     """
     if workers <= 1:
         yield from map(function, tasks)
@@ -64,12 +67,18 @@ def ordered_map(
 
 
 def quick_workers(tasks: int) -> int:
-    """Return how many processes pay for short work: one per core where they start at once."""
+    """Return how many processes are worthwhile for ``tasks`` short tasks.
+
+    It is one per core if processes start at once (`can_fork`), otherwise one.
+    """
     return min(cores(), tasks) if can_fork() else 1
 
 
 class Assistant:
-    """Calls functions in another process, one after the other, or in this one without ``end``."""
+    """Calls functions in a second process, one after the other.
+
+    end : connection to this process; without it, functions are called in the present process.
+    """
 
     def __init__(self, end: Connection | None = None) -> None:
         self._end = end
@@ -80,9 +89,10 @@ class Assistant:
         return self.begin(function, *arguments)()
 
     def begin(self, function: Callable[..., Result], *arguments: Any) -> Callable[[], Result]:
-        """Ask for a call of a module's function; what is given back waits for its result.
+        """Begin a call of a module's function in the second process.
 
-        Without another process, or when it died, the function is called then, in this one.
+        Returns a function that waits for the result and returns it. If there is no second process,
+        or if it died, this function calls the given one in the present process.
         """
         if self._last is not None:
             self._last.fetch()  # an end that nobody reads would block the other one
@@ -91,7 +101,7 @@ class Assistant:
 
 
 class Answer:
-    """A call that was asked for."""
+    """A call that was begun in the second process."""
 
     def __init__(
         self, end: Connection | None, function: Callable[..., Any], arguments: tuple[Any, ...]
@@ -105,7 +115,7 @@ class Answer:
             self._end = None
 
     def fetch(self) -> None:
-        """Wait for it, where another process does it."""
+        """Wait for the result of the second process."""
         if self._end is None or self._found is not None:
             return
         try:
@@ -125,10 +135,10 @@ class Answer:
 
 @contextmanager
 def assistant(prepare: Callable[[], object]) -> Iterator[Assistant]:
-    """Yield a copy of this process that calls ``prepare`` at once, and functions when asked to.
+    """Yield an `Assistant`, a copy of this process that calls functions when asked to.
 
-    It loads libraries that only the end of a command needs. Where a copy does not pay, or it died,
-    functions are called in this process.
+    The copy calls ``prepare`` first, to load libraries that only the end of a command needs. If a
+    copy is not worthwhile, or if it died, functions are called in the present process.
     """
     if cores() < 2 or not can_fork():
         yield Assistant()
@@ -175,11 +185,12 @@ ISOLATED_S = 60.0
 
 
 def isolated(function: Callable[..., Result], *arguments: Any) -> Result:
-    """Call a module's function in a copy of this process, which a crash of a C library may end.
+    """Call a module's function in a copy of this process, so that a crash of a C library ends only
+    the copy, and return its result.
 
-    Where a copy would not be safe (`can_fork`), it is called in this process. Raises
-    ChildProcessError if the copy died or took longer than `ISOLATED_S`, and what the function
-    raises.
+    If a copy would not be safe (`can_fork`), the function is called in this process. Raises
+    ChildProcessError if the copy died or took longer than `ISOLATED_S`, and the errors of the
+    function.
     """
     if not can_fork():
         return function(*arguments)
@@ -244,19 +255,20 @@ FREED_BYTES = 16 << 20
 
 
 def keep_freed_memory() -> None:
-    """Let the C library keep what is freed, up to twice `FREED_BYTES`, for the next array.
+    """Let the C library keep freed memory, up to twice `FREED_BYTES`, for the next array.
 
-    glibc gives blocks beyond a limit back to the system, whose fresh pages cost 5 us each, twice
-    what is computed in them. A block that was freed raises the limit to its size (mallopt(3),
-    M_MMAP_THRESHOLD); nothing is written into it, so that it takes no memory.
+    glibc gives freed blocks beyond a limit back to the system. A fresh page of memory then costs 5
+    us, twice the time of the computation in it. Freeing a large block raises the limit to the size
+    of this block (mallopt(3), M_MMAP_THRESHOLD). Nothing is written into the block, so that it
+    needs no memory.
     """
     np.empty(FREED_BYTES, np.uint8)
 
 
 def give_back_freed_memory() -> None:
-    """Let the C library give what is freed back to the system, where it can (glibc's malloc_trim).
+    """Let the C library give freed memory back to the system, by malloc_trim of glibc.
 
-    GTSAM frees hundreds of MB in small pieces, which no large array can use.
+    GTSAM frees hundreds of MB in small pieces, which cannot be used for a large array.
     """
     import ctypes
 

@@ -71,10 +71,12 @@ _SCALE = INDEX["scale_px_per_mm"]
 class FittedModel:
     """A fitted lens model of all cameras.
 
-    lenses : parameter groups of each camera. parameters : number of free intrinsics. cost : half
-    the sum of squared whitened residuals and priors. rows : number of measured coordinates.
-    per_view : (V,) mean squared whitened residual of each view, predicted by a fit without it; NaN
-    if too few views would remain, infinite if the model was not cross-validated.
+    lenses : for each camera the groups of parameters that are free. parameters : number of free
+    intrinsics. cost : half the sum of squared whitened residuals, including those of the priors.
+    rows : number of measured coordinates. rms_px : RMS residual per coordinate.
+    per_view : (V,) for each of the V views the mean squared whitened residual when a fit without
+    this view predicts it; NaN if too few views would remain for the fit, infinite if the model was
+    not cross-validated.
     """
 
     lenses: Lenses
@@ -98,12 +100,15 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the model choice, which adds a group of parameters to one camera's model, or not.
+    """One step of the model choice: a group of parameters that was added to one camera's model, or
+    that was considered and not added.
 
-    camera, added : of the added parameters; -1 and () for the first step, the simplest model.
-    gain : decrease of chi-square, in units of the residuals' variance; bic_gain : minus the penalty
-    of the information criterion. fit : None if the gain was predicted without a fit. undetermined :
-    whether the views do not determine the added parameters.
+    camera, added : index of the camera and names of the added parameters; -1 and () for the first
+    step, the simplest model. lenses : the model of all cameras with these parameters.
+    gain : decrease of chi-square, in units of the residuals' variance. bic_gain : the same minus
+    the penalty of the information criterion. taken : whether the group was added. words : why not.
+    fit : None if the gain was predicted without a fit.
+    undetermined : whether the views do not determine the added parameters.
     """
 
     camera: int
@@ -118,13 +123,20 @@ class Step:
 
     @property
     def p_value(self) -> float:
-        """The probability of such a gain if the added parameters are zero; NaN without any."""
+        """The probability of so large a gain if the true values of the added parameters are zero.
+
+        It is NaN for the first step, which adds none.
+        """
         return float(chdtrc(len(self.added), self.gain)) if self.added else float("nan")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen lens model, the steps that led to it and those not taken, and their words."""
+    """The chosen lens model.
+
+    steps : those that led to the model, then those that were not taken. words : reasons of the
+    choice, for the user.
+    """
 
     steps: tuple[Step, ...]
     chosen: FittedModel
@@ -132,10 +144,10 @@ class Choice:
 
 
 def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
-    """Return the choice among the models that the problem's free parameters contain.
+    """Choose the lens model of each camera among all that the richest model contains.
 
-    problem, rich : the problem with the richest model, and its solution. models : for each camera
-    "auto", or the name of a model that is kept.
+    problem, rich : the problem with the richest model, and its solution.
+    models : for each camera "auto", or the name of the lens model that the user gave.
     """
     whole = tuple(_lens_of(free) for free in problem.free)
     allowed = [possible(lens) if m == AUTO else [lens] for lens, m in zip(whole, models)]
@@ -222,10 +234,11 @@ def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> FittedM
 
 
 def model_start(problem: Problem, state: State) -> State:
-    """Return a start for the problem's own model, from a state of another model.
+    """Return a start for the problem's own lens model, from the state that another model gave.
 
-    A tilt acts in second order, so a solver cannot leave zero. It starts at the tilt that stretches
-    the image in the same way as the best aspect ratio and skew.
+    A tilt of the sensor stretches the image in second order, so a solver cannot leave a tilt of
+    zero. The start is therefore the tilt that stretches the image in the same way as the best
+    aspect ratio and skew.
     """
     start = held_at_nominal(problem, state)
     if not any("tilt_x" in free for free in problem.free):
@@ -303,7 +316,8 @@ def _without_worse_predictions(steps: list[Step]) -> list[Step]:
         if not after.left_out > before.left_out:
             break
         words = (
-            f"left-out views are predicted {after.left_out / before.left_out - 1:.1%} worse with it"
+            "not added: with it, views that the fit leaves out are predicted "
+            f"{after.left_out / before.left_out - 1:.1%} worse"
         )
         steps[last] = replace(steps[last], taken=False, words=words)
         last -= 1
@@ -322,9 +336,15 @@ def _not_taken(
         gain = max(quadratic.rise(chosen) - quadratic.rise(lenses), 0.0)
         bic_gain = gain - quadratic.penalty_of(Lens({group}))
         share = quadratic.sd_over_prior(lenses, camera, group)
-        words = f"held: the gain in chi-square is below its penalty of {gain - bic_gain:.1f}"
+        words = (
+            "held at nominal: chi-square would fall by less than the penalty of "
+            f"{gain - bic_gain:.1f}"
+        )
         if share > UNDETERMINED:
-            words = f"held: not determined by these views (posterior sd {share:.0%} of the prior's)"
+            words = (
+                "held at nominal: these views do not determine it (posterior standard deviation "
+                f"{share:.0%} of the prior one)"
+            )
         out.append(
             Step(camera, GROUPS[group], lenses, gain, bic_gain, False, words, None,
                  share > UNDETERMINED)
@@ -354,8 +374,9 @@ def _words(
         for step in steps if step.undetermined
     ]  # fmt: skip
     return words + (
-        f"; these views do not determine {', '.join(undetermined)}: held" if undetermined else ""
-    )
+        f"; held at nominal because these views do not determine it: {', '.join(undetermined)}"
+        if undetermined else ""
+    )  # fmt: skip
 
 
 def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]) -> str:
@@ -364,18 +385,22 @@ def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]
     fits = [step.fit for step in taken if step.fit is not None]
     simpler = [fit for fit in fits[:-1] if np.isfinite(fit.left_out)]
     if not np.isfinite(chosen.left_out):
-        return "lowest information criterion; there are too few views to leave some out"
+        return (
+            "lowest information criterion; it was not cross-validated, because there are too few "
+            "views"
+        )
     if not simpler:
-        return "no richer model predicts left-out views better"
+        return "in cross-validation no richer model predicts left-out views better"
     words = (
-        f"left-out views are predicted {simpler[0].left_out / chosen.left_out:.3g} times better "
-        f"(mean square) than by {joint_name(simpler[0].names, cameras)}"
+        "in cross-validation the mean square error of left-out views is "
+        f"{simpler[0].left_out / chosen.left_out:.3g} times smaller than with the model "
+        f"{joint_name(simpler[0].names, cameras)}"
     )
     if len(simpler) > 1:
         last = ", ".join(taken[-1].added)
         words += (
-            f", {simpler[-1].left_out / chosen.left_out:.4g} times better than without the last "
-            f"step ({last} of camera {cameras[taken[-1].camera]!r})"
+            f", and {simpler[-1].left_out / chosen.left_out:.4g} times smaller than without the "
+            f"parameters that were added last ({last} of camera {cameras[taken[-1].camera]!r})"
         )
     return words
 
@@ -385,9 +410,9 @@ def _stretch_words(camera: str, intrinsics: Array) -> str:
     aspect, skew = intrinsics[[INDEX["aspect"], INDEX["skew"]]]
     axes = np.linalg.svd(np.array([[1.0, skew], [0.0, aspect]]), compute_uv=False)
     return (
-        f"the image of camera {camera!r} is stretched by {100 * (axes[0] / axes[1] - 1):.2g} %: by "
-        "pixels that are not square, or by a tilted sensor behind a lens that is telecentric on "
-        "both sides; no image can tell which"
+        f"the image of camera {camera!r} is stretched by {100 * (axes[0] / axes[1] - 1):.2g} %: "
+        "either its pixels are not square, or its sensor is tilted behind a lens that is "
+        "telecentric on both sides; images cannot distinguish the two"
     )
 
 
@@ -398,7 +423,10 @@ POSE_STEPS = 3
 
 
 def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
-    """Return the state after Gauss-Newton steps of every view's pose alone."""
+    """Return the state in which the pose of the target in every view fits best.
+
+    All other parameters stay as they are. steps : largest number of Gauss-Newton steps.
+    """
     system = System(problem)
     for _ in range(steps):
         normal = np.zeros((len(problem.views), 6, 6))
@@ -419,10 +447,14 @@ def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
 
 
 def cross_validation_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
-    """Return each view's mean squared whitened residual (V,), predicted by a fit without it.
+    """Cross-validate a lens model: predict each of the V views by a fit that leaves it out.
 
-    A fit without some views is one Gauss-Newton step from ``state``, the minimum with all views.
-    The pose of a left-out view is then fitted to it. Views whose fold cannot be left out get NaN.
+    The views are left out in ``folds`` parts, one after the other. A fit without one part is one
+    Gauss-Newton step from ``state``, the minimum with all views. Only the pose of the target is
+    then fitted to each left-out view.
+
+    Returns the mean squared whitened residual (V,) of each view; NaN if too few views would remain
+    without its part.
     """
     views = np.arange(len(problem.views))
     out = np.full(len(views), np.nan)
@@ -445,18 +477,21 @@ def cross_validation_chi2(problem: Problem, state: State, folds: int = FOLDS) ->
 
 
 CONSIDERED_P_VALUE = 0.01
-"""A group is considered if the improvement of the fit when it is freed has a p-value below this,
-even if the improvement is too small to free the group in the model."""
+"""The uncertainty of a group of parameters that are held is considered in the covariance if freeing
+the group improves the fit with a p-value below this."""
 UNDAMPED = 1e-12
 
 
 def considered_groups(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:
-    """Return for each camera the considered groups of lens parameters (names as in `GROUPS`).
+    """Return for each camera the groups of lens parameters (names as in `GROUPS`) that are
+    considered: they are held at nominal, but the covariance includes their uncertainty.
 
-    They are held at nominal, but the covariance includes their uncertainty: groups that another
-    camera's model frees (the lenses are of the same kind), and those whose freeing improves the fit
-    by more than chance (`CONSIDERED_P_VALUE`). Groups that the views do not determine are not
-    considered, because their weak priors would dominate the covariance.
+    A group is considered if the model of another camera frees it (the lenses are of the same kind),
+    or if freeing it would improve the fit by more than chance (`CONSIDERED_P_VALUE`). Groups that
+    the views do not determine are not considered, because their weak priors would dominate the
+    covariance.
+
+    cameras : number of cameras.
     """
     out: list[set[str]] = [set() for _ in range(cameras)]
     steps = choice.steps if choice is not None else ()
@@ -488,9 +523,10 @@ def considered_covariance(
     models: Sequence[str],
     groups: Sequence[Lens],
 ) -> tuple[tuple[tuple[str, ...], ...], JointCovariance]:
-    """Return for each camera the free and the considered parameters, and their covariance.
+    """Return the covariance of the free and the considered parameters, and their names by camera.
 
-    joint : covariance of the solution. groups : for each camera the considered groups.
+    joint : covariance of the solution, without considered parameters. models : for each camera the
+    name of its lens model. groups : for each camera the considered groups.
     """
     if not any(groups):
         return problem.free, joint
@@ -505,7 +541,10 @@ def considered_covariance(
 
 
 def considered_words(groups: Sequence[Lens], cameras: Sequence[str]) -> str:
-    """Return a clause on the considered parameters, for the end of the choice's words, or ""."""
+    """Return a clause on the considered parameters, for the end of `Choice.words`; "" for none.
+
+    groups : for each camera the considered groups. cameras : their names.
+    """
     parts = [
         f"{', '.join(p for g in ordered(more) for p in GROUPS[g])} of camera {camera!r}"
         for camera, more in zip(cameras, groups) if more
@@ -513,6 +552,7 @@ def considered_words(groups: Sequence[Lens], cameras: Sequence[str]) -> str:
     if not parts:
         return ""
     return (
-        f"; {' and '.join(parts)}: held at nominal because freeing it is not worth its "
-        "penalty, but the data do not exclude it, so every stated uncertainty contains its effect"
+        f"; held at nominal, because the fit improves by less than the penalty: "
+        f"{' and '.join(parts)}. The data do not exclude other values, so every stated "
+        "uncertainty contains their effect"
     )

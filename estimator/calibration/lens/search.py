@@ -51,14 +51,17 @@ estimated."""
 
 @dataclass(frozen=True)
 class QuadraticCost:
-    """The cost as a quadratic form in K coordinates, at the minimum of a rich model.
+    """The chi-square of all lens models, approximated by a quadratic form about the minimum of the
+    richest one.
 
-    names : (camera, parameter) of each coordinate; the two sums of each camera that describe a
-    homography come last. offset : (K,) at the minimum, relative to nominal. covariance : (K, K).
-    prior : (K,) standard deviations.
-    least : chi-square at the minimum. variance : of the residuals, relative to the stated noise, by
-    which chi-square is divided. penalty : of one free parameter; group_penalty : of a group
-    besides.
+    Its K coordinates are the free intrinsics of all cameras, in units of `parameter_unit`, and two
+    sums of intrinsics for each camera, which describe the homography of a tilted sensor.
+
+    names : (camera, parameter) of each coordinate. offset : (K,) coordinates of the minimum,
+    relative to nominal. covariance : (K, K). prior : (K,) standard deviations of the priors.
+    least : chi-square at the minimum. variance : variance of the residuals relative to the stated
+    noise, by which every chi-square here is divided.
+    penalty : penalty of each free parameter. group_penalty : further penalty of each group.
     """
 
     names: tuple[tuple[int, str], ...]
@@ -108,7 +111,7 @@ class QuadraticCost:
         )  # fmt: skip
 
     def rise(self, lenses: Lenses) -> float:
-        """Return by how much chi-square of a model exceeds that of the rich model."""
+        """Return by how much chi-square of a model exceeds that of the richest one."""
         held = self._held(lenses)
         if len(held) == 0:
             return 0.0
@@ -116,22 +119,34 @@ class QuadraticCost:
         return float(d @ np.linalg.solve(inside, d)) / self.variance
 
     def cost(self, lenses: Lenses) -> float:
-        """Return the criterion, up to a constant: the rise of chi-square plus the penalties."""
+        """Return the information criterion of a model, up to a constant.
+
+        It is the rise of chi-square plus the penalties.
+        """
         return self.rise(lenses) + sum(self.penalty_of(lens) for lens in lenses)
 
     def cost_of_fit(self, lenses: Lenses, fitted_cost: float) -> float:
-        """Return the criterion of a fitted model; fitted_cost is half its chi-square."""
+        """Return the information criterion of a model that was fitted, comparable with `cost`.
+
+        fitted_cost : half the sum of squared whitened residuals.
+        """
         penalties = sum(self.penalty_of(lens) for lens in lenses)
         return 2 * fitted_cost / self.variance - self.least + penalties
 
     def penalty_of(self, lens: Lens) -> float:
-        """Return the penalty of a model; a tilt counts as two groups, stretch and homography."""
+        """Return the penalty of one camera's model.
+
+        A tilt counts as two groups, because it stretches the image and acts as a homography.
+        """
         own = lens - {"centre"}
         groups = own | {"affine"} if "tilt" in own else own
         return self.penalty * sum(len(GROUPS[g]) for g in own) + self.group_penalty * len(groups)
 
     def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
-        """Return the largest ratio of posterior to prior sd among the parameters of a group."""
+        """Return how well the views determine a group of parameters of one camera.
+
+        It is the largest ratio of posterior to prior standard deviation among the parameters.
+        """
         held = self._held(lenses)
         mine = [i for i, n in enumerate(self.names) if n[0] == camera and n[1] in GROUPS[group]]
         cross = self.covariance[np.ix_(mine, held)]
@@ -180,10 +195,11 @@ def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) 
 
 
 def possible(rich: Lens) -> list[Lens]:
-    """Return every lens model that a rich one contains.
+    """Return every lens model whose groups the richest model contains.
 
-    k2 is free only with k1, a tilt replaces aspect and skew, and excludes s, because both could
-    describe the same homography. If the centre is free, the centre and kappa always are.
+    k2 is free only together with k1. A tilt replaces aspect and skew, and excludes s, because both
+    could describe the same homography. If the richest model frees the image centre, all models free
+    the centre and kappa.
     """
     always = rich & {"centre", "kappa"} if "centre" in rich else Lens()
     richest = rich | {"tilt"} if {"affine", "p", "s"} <= rich else rich
@@ -191,10 +207,11 @@ def possible(rich: Lens) -> list[Lens]:
 
 
 def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lenses:
-    """Return the model with the lowest cost, among lens models ``allowed`` for each camera.
+    """Return the lens models of all cameras with the lowest `QuadraticCost.cost`.
 
-    One camera after the other is optimised until none changes, from the richest and from the
-    simplest model; the better result is returned.
+    allowed : for each camera the lens models to choose from. The model of one camera after the
+    other is optimised until none changes, once from the richest and once from the simplest models;
+    the better result is returned.
     """
     ends = []
     for start in (max, min):
@@ -223,7 +240,10 @@ def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Add
 
 
 def steps_to(quadratic: QuadraticCost, chosen: Lenses, least: Lenses) -> list[Addition]:
-    """Return the steps from the simplest model ``least`` to ``chosen``, the most useful first."""
+    """Return the additions that lead from the simplest model ``least`` to ``chosen``.
+
+    Each adds the group that lowers the cost most.
+    """
     within = [list(_between(low, high)) for low, high in zip(least, chosen)]
     now = least
     out: list[Addition] = []

@@ -44,14 +44,20 @@ LOOSE = 0.03
 """An offset is undetermined if the views determine it less well than the best one by this factor
 or more."""
 OTHER_SCALE = 0.05
-"""Cameras whose nominal scales differ by less than this share cannot be told apart by them."""
+"""If the nominal scales of two cameras differ by less than this share, the scales do not show
+whether the cameras were exchanged."""
 CLEAR_MISFIT = 0.1
-"""Largest misfit of an image's map that is accepted, as a share of the spread of its dots."""
+"""Largest accepted distance of an image's dots from the map of the target's plane, as a share of
+the dots' spread."""
 
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence for the user with a short name, and whether the verdict then is no longer GOOD."""
+    """A sentence for the user.
+
+    code : short name of its subject. affects_verdict : whether the verdict is not GOOD because of
+    it.
+    """
 
     code: str
     words: str
@@ -60,7 +66,11 @@ class Note:
 
 @dataclass(frozen=True)
 class PreCheck:
-    """Notes before a calibration, and by (view, camera) the target's tilt to the optical axis."""
+    """The result of the checks before a calibration.
+
+    tilts_deg : by (index of the view, index of the camera) the angle between the target's normal
+    and the optical axis. notes : sentences for the user.
+    """
 
     tilts_deg: dict[tuple[int, int], float]
     notes: tuple[Note, ...]
@@ -91,8 +101,8 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
         words = (
             f"only {len(usable)} views can be used in "
             f"{_those(problem)}: {RECOMMENDED_VIEWS} or more are "
-            "recommended. With fewer, lens distortion and the dots' own positions become "
-            "uncertain first (see their standard deviations)"
+            "recommended. With fewer, above all the lens distortion and the dots' positions on "
+            "the target become uncertain (see their standard deviations). Add views"
         )
         notes.append(Note("few views", words, affects_verdict=True))
     for c, camera in enumerate(problem.cameras):
@@ -109,7 +119,10 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
         seen = [c for c in range(len(problem.cameras)) if (v, c) in maps]
         if stereo and len(seen) == 1:
             camera_name = problem.cameras[seen[0]].name
-            words = f"view {name!r} is usable in camera {camera_name!r} only, so it gives no stereo"
+            words = (
+                f"view {name!r} can be used in camera {camera_name!r} only, so it does not "
+                "connect the cameras"
+            )
             notes.append(Note("one camera", words, affects_verdict=True))
         if not seen:
             words = f"view {name!r} has fewer than {MINIMUM_DOTS} dots in every camera"
@@ -123,7 +136,7 @@ def _refuse_too_few(
     if unknown_dots:
         needed, undetermined = 4, "the shape of the target (3 affine numbers) and with it the scale"
     elif stereo:
-        needed, undetermined = 2, "the sign of the tilts: two inter-camera rotations fit alike"
+        needed, undetermined = 2, "the rotation between the cameras: two different ones fit alike"
     else:
         needed, undetermined = 1, "everything"
     if len(usable) >= needed:
@@ -159,8 +172,8 @@ def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
         if count < 2:
             names = [problem.cameras[c].name for c in (a, b)]
             raise CalibrationError(
-                f"cameras {names[0]!r} and {names[1]!r} have {count} view in common, which leaves "
-                "the sign of the tilts open: two inter-camera rotations fit alike",
+                f"cameras {names[0]!r} and {names[1]!r} have {count} view in common, which does "
+                "not determine the rotation between them: two different ones fit alike",
                 todo="add views at other tilts that both of them see",
             )
 
@@ -168,10 +181,11 @@ def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
 def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
     """Return a note for each camera whose offset relative to the others no view determines.
 
-    A view that two telecentric cameras see determines their offset only along the common
-    perpendicular of their axes; a view that three see determines the rest. The views' positions are
-    eliminated from the linear equations of all offsets; see docs/theory.md. With fewer than three
-    cameras, or with clear perspective in all lenses, there is no note.
+    A view that two telecentric cameras see determines the offset of the two cameras only along the
+    common perpendicular of their axes; a view that three cameras see determines the rest. To find
+    the offsets that are not determined, the positions of the target are eliminated from the linear
+    equations of all offsets; see docs/theory.md. With fewer than three cameras, or with clear
+    perspective in all lenses, there is no note.
     """
     count = len(problem.cameras)
     kappa_rho = state.intrinsics[:, INDEX["kappa_per_mm"]] * np.array(problem.rho_mm)
@@ -197,10 +211,10 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
     return tuple(
         Note(
             "offset",
-            f"camera {problem.cameras[c].name!r}: no view is seen by it and two other cameras at "
-            "once, so its offset across the common perpendiculars of the optical axes is not "
-            "determined, and points that it sees together with two others are wrong by it. Add a "
-            "view that three cameras see at once",
+            f"camera {problem.cameras[c].name!r}: no view is seen by this and two other cameras "
+            "at once, so its offset across the common perpendiculars of the optical axes is not "
+            "determined. Points that it sees together with two others are wrong by this offset. "
+            "Add a view that three cameras see at once",
             affects_verdict=True,
         )
         for c in cameras
@@ -208,10 +222,10 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
 
 
 def exchanged_notes(problem: Problem, state: State) -> tuple[Note, ...]:
-    """Return a note for two cameras whose scales fit each other's nominal scale better.
+    """Return a note for each two cameras whose folders of images were probably exchanged.
 
-    Their folders were probably exchanged. Nominal scales that differ by less than `OTHER_SCALE`
-    tell nothing.
+    The estimated scale of each is near the nominal scale of the other. If the nominal scales differ
+    by less than `OTHER_SCALE`, nothing can be concluded, and there is no note.
     """
     estimated = np.log(state.intrinsics[:, INDEX["scale_px_per_mm"]])
     nominal = np.log([camera["scale_px_per_mm"] for camera in problem.cameras])
@@ -277,8 +291,9 @@ def _refuse_parallel(
             spread = max(spread, float(np.degrees(np.ptp(vectors, 0).max())))
     if len(usable) > 1 and spread < PARALLEL_DEG:
         raise CalibrationError(
-            f"all views are parallel: the target's tilt differs by {spread:.1f} degrees at most, "
-            "so depth can be stretched against the tilt (a bas-relief) and hardly a pixel moves",
+            f"all views are parallel: the target's tilt differs by {spread:.1f} degrees at most. "
+            "Then a larger depth with a smaller tilt gives nearly the same images (bas-relief "
+            "ambiguity), so the scale along the depth is not determined",
             todo="tilt the target differently in every view, by 20-40 degrees about several axes",
         )
 
@@ -287,7 +302,8 @@ def _coverage_note(problem: Problem, c: int) -> list[Note]:
     camera = problem.cameras[c]
     mine = problem.camera == c
     if not np.any(mine):
-        return [Note("no dots", f"camera {camera.name!r} has no dots at all")]
+        words = f"camera {camera.name!r} has no dots at all; check its images and [target]"
+        return [Note("no dots", words)]
     cells = np.floor(problem.uv_px[mine] / np.array(camera.image_size_px) * 4).astype(int)
     filled = len({tuple(x) for x in np.clip(cells, 0, 3)})
     if filled >= 8:

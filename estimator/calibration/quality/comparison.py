@@ -24,10 +24,11 @@ from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_shift, triangulate_any, working_volume
 
 UNLIKELY = 1e-3
-"""A difference with a smaller probability under chance alone is called a movement."""
+"""A difference counts as real if chance alone causes one as large with less than this
+probability."""
 _RANK = 1e-3
-"""Directions with a smaller share of the largest standard deviation are left out: there, the
-second order of the others is larger than the prediction."""
+"""Directions whose standard deviation is smaller than this share of the largest one are left out,
+because second-order effects of the others are larger there."""
 _ROUNDING = 1e-6
 _FAR = 5.0
 _LEAST_CHANCE = 1e-12
@@ -35,7 +36,11 @@ _LEAST_CHANCE = 1e-12
 
 @dataclass(frozen=True)
 class Rig:
-    """What is compared of one calibration: cameras and the covariance (P, P) of the rig block."""
+    """The part of a calibration that is compared.
+
+    free : for each camera the names of its free intrinsics. covariance : (P, P) of the free
+    intrinsics and then of the poses of all cameras but the first.
+    """
 
     cameras: tuple[Camera, ...]
     free: tuple[tuple[str, ...], ...]
@@ -44,7 +49,10 @@ class Rig:
 
 @dataclass(frozen=True)
 class Change:
-    """The change of one quantity in "urad", "um" or "ppm", second calibration minus first."""
+    """The change of one quantity from the first calibration to the second.
+
+    unit : "urad", "um" or "ppm". sd : standard deviation of the change that both covariances give.
+    """
 
     quantity: str
     unit: str
@@ -59,9 +67,12 @@ class Change:
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """How far two rigs place the same pixels apart in space, after the best rigid motion.
+    """How far the points that two calibrations triangulate from the same pixels lie apart.
 
-    points_mm, shift_mm, sd_mm : (N, 3) in the rig frame; sd_mm is what both covariances predict.
+    A rigid motion that is common to all points has been removed.
+
+    points_mm, shift_mm : (N, 3) points, and their shift from the first calibration to the second.
+    sd_mm : (N, 3) standard deviation of the shift that both covariances predict.
     p_value : of a chi-square test that the predicted errors alone cause the shift.
     """
 
@@ -77,7 +88,7 @@ class FieldDifference:
 
     @property
     def predicted_um(self) -> float:
-        """Return the value of `rms_um` (µm) that is expected if the rig did not change."""
+        """Return the value of `rms_um` that both covariances predict for a rig without change."""
         return float(1e3 * np.sqrt(np.mean(self.sd_mm**2)))
 
 
@@ -85,10 +96,13 @@ class FieldDifference:
 class RigComparison:
     """The comparison of two calibrations of one rig with C cameras.
 
-    changes : for each camera but the first, its rotation about x, y and z and its offset along the
-    common perpendicular, relative to the first; then the C changes of the scales.
-    p_moved : probability that errors alone cause changes of the poses as large as these. exchanged
-    : whether two cameras have exchanged their scales. media : "air" or "water" of each calibration.
+    cameras : their names.
+    changes : for each camera but the first, the changes of its rotation about x, y and z and of its
+    offset along the common perpendicular, relative to the first; then the C changes of the scales.
+    field : the differences of points in space.
+    p_moved : probability that errors alone cause changes of the poses as large as these.
+    exchanged : whether two cameras have exchanged their scales.
+    media : "air" or "water", for each of the two calibrations.
     """
 
     cameras: tuple[str, ...]
@@ -100,7 +114,7 @@ class RigComparison:
 
     @property
     def identical(self) -> bool:
-        """Whether both calibrations are equal to rounding: then they come from the same views."""
+        """Whether both calibrations agree to rounding, so that they come from the same views."""
         return self.field.rms_um < _ROUNDING * self.field.predicted_um
 
     @property
@@ -117,8 +131,8 @@ class RigComparison:
         """Return the result as one sentence for the user."""
         if self.identical:
             return (
-                "both calibrations are the same to rounding, so they come from the same views. To "
-                "learn whether the rig moved, compare with a calibration from other views"
+                "both calibrations are equal except for rounding, so they come from the same "
+                "views. To learn whether the rig moved, compare with a calibration from other views"
             )
         size = "; ".join(self._size(c) for c in range(1, len(self.cameras)))
         first = (
@@ -129,12 +143,15 @@ class RigComparison:
         field = self.field
         apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
         second = (
-            f"the same pixels lie {apart} µm RMS per axis apart in space, where the two "
-            f"calibrations' uncertainty explains {expected} µm"
+            f"points triangulated from the same pixels differ by {apart} µm RMS per axis; the "
+            f"uncertainty of the two calibrations explains {expected} µm"
         )
         if self.differs:
             chance = chance_words(field.p_value)
-            second += f", which is more than chance explains ({chance}); do not mix their runs"
+            second += (
+                f", so the rig has changed ({chance}); use each calibration only for the runs of "
+                "its own time"
+            )
         return "; ".join([first, *self._scale_words(), second, *self._medium_words()])
 
     def _size(self, camera: int) -> str:
@@ -168,7 +185,7 @@ class RigComparison:
             return []
         return [
             f"the earlier one was made in {_of(self.media[0])}, this one in {_of(self.media[1])}: "
-            "windows that [walls] does not state count as changes"
+            "windows that [walls] of rig.toml does not state count as changes"
         ]
 
     def as_dict(self) -> dict[str, Any]:
@@ -187,11 +204,14 @@ class RigComparison:
 
 
 def compare_calibrations(first: Calibration, second: Calibration) -> RigComparison:
-    """Compare two calibrations of one rig: how did it change from ``first`` to ``second``?
+    """Compare two calibrations of one rig: how did the rig change from ``first`` to ``second``?
 
-    Their errors are taken as independent. Errors that they share, for example of the target's
-    stated distance, make the standard deviations too large, never too small. Windows are left out.
-    Raises InputError if the two have different cameras or image sizes, or only one camera.
+    The errors of both calibrations are taken as independent. If they share errors, for example of
+    the target's stated distance, the standard deviations of the changes are too large, never too
+    small. Refractive windows are left out, so points are compared in air.
+
+    Returns a `RigComparison`; its ``words()`` are a sentence for the user. Raises InputError if the
+    two calibrations have different cameras or image sizes, or only one camera.
     """
     check_same_rig(first.cameras, second.cameras)
     found = compare_rigs(_rig(first), _rig(second))
@@ -199,7 +219,7 @@ def compare_calibrations(first: Calibration, second: Calibration) -> RigComparis
 
 
 class Named(Protocol):
-    """Describe what `check_same_rig` needs of a camera, calibrated or of `rig.toml`."""
+    """A camera with a name and an image size, whether calibrated or only described in rig.toml."""
 
     @property
     def name(self) -> str: ...
@@ -208,11 +228,16 @@ class Named(Protocol):
 
 
 def check_same_rig(first: Sequence[Named], second: Sequence[Named]) -> None:
-    """Raise InputError if names, order or image sizes differ, or for a single camera."""
+    """Raise InputError if the cameras of two rigs differ in name, order or image size.
+
+    It is raised for rigs of a single camera, too, because nothing can be compared then.
+    """
     mine, theirs = ([(c.name, tuple(c.image_size_px)) for c in k] for k in (first, second))
     if len(mine) < 2 and len(theirs) < 2:
         raise InputError(
-            "one camera has no pose to another", todo="compare calibrations of two cameras"
+            "both calibrations have one camera only, and the comparison is about the poses of "
+            "cameras relative to each other",
+            todo="compare calibrations of two cameras or more",
         )
     if mine == theirs:
         return
@@ -234,7 +259,10 @@ def _named(cameras: list[tuple[str, tuple[int, ...]]]) -> str:
 
 
 def compare_rigs(first: Rig, second: Rig) -> RigComparison:
-    """Return the changes between two rigs, second minus first; the covariances add up."""
+    """Return the changes between two rigs, second minus first.
+
+    The covariance of a change is the sum of both covariances.
+    """
     cameras = tuple(camera.name for camera in first.cameras)
     pose, covariance = _pose_change(first, second)
     sd = np.sqrt(np.diag(covariance))
@@ -312,13 +340,21 @@ def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
 
 
 def after_rigid_motion(found_mm: Array, points_mm: Array) -> Array:
-    """Return ``found_mm`` (N, 3), moved rigidly to fit best, minus ``points_mm`` (N, 3)."""
+    """Return the differences (N, 3) of two sets of N points after their best rigid alignment.
+
+    They are found_mm, moved rigidly such that it fits points_mm best, minus points_mm; both are
+    (N, 3).
+    """
     a, b = found_mm - found_mm.mean(0), points_mm - points_mm.mean(0)
     return np.asarray(a @ nearest_rotation(b.T @ a).T - b)
 
 
 def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference:
-    """Return how far the second rig triangulates the pixels of the first's grid of points apart."""
+    """Return how far points differ that two rigs triangulate from the same pixels.
+
+    The pixels are those at which the first rig sees a cubic grid of points over its working volume.
+    steps : number of points along each edge of the grid.
+    """
     points = working_volume(first.cameras, steps)
     pixels = [camera.project(points) for camera in first.cameras]
     found = triangulate_any(second.cameras, pixels, 1.0).points_mm

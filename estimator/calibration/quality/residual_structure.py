@@ -27,8 +27,12 @@ _LEAST_DOTS = 3
 class ResidualTest:
     """The result of one test of a camera's residuals.
 
-    size : of the effect; for "region" in standard deviations of a residual, for "view" a ratio to
-    the other views, else relative. p_value : that chance alone gives an effect as large as this.
+    name : "region", "direction", "neighbours" or "view".
+    size : size of the effect: for "region" the RMS of the mean residuals in parts of the image, in
+    standard deviations of a residual; for "direction" the relative difference of the variances; for
+    "neighbours" a correlation; for "view" the ratio to the other views.
+    p_value : probability that chance alone gives an effect at least as large.
+    words : the finding and its possible causes, for the user.
     """
 
     name: str
@@ -71,8 +75,7 @@ def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[s
     widest = float(np.sqrt(max(widening)))
     if widest > 1:
         words.append(
-            f"for this pattern in the images every standard deviation is {widest:.2g} times what "
-            "independent errors of the dots would give"
+            f"because of this pattern every standard deviation has been multiplied by {widest:.2g}"
         )
     return {
         "sound": not found,
@@ -83,9 +86,12 @@ def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[s
 
 
 def standardised_residuals(whitened: Array, leverage: Array) -> Array:
-    """Return whitened residuals (M, 2) times (identity - leverage)^(-1/2), of unit variance.
+    """Return residuals (M, 2) of unit variance.
 
-    Components of which the fit absorbs more than 98 % are set to 0.
+    They are the whitened residuals multiplied by (identity - leverage)^(-1/2). A component of which
+    the fit absorbs more than 98 % is set to 0.
+
+    whitened, leverage : as for `residual_tests`.
     """
     left = np.eye(2) - leverage
     values, vectors = np.linalg.eigh(0.5 * (left + np.swapaxes(left, -1, -2)))

@@ -36,12 +36,13 @@ _SCALE = 1e-7
 def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
     """Calibrate from each half of the views and compare the two rigs.
 
+    state : the solution with all views.
     Returns the content of `Calibration.diagnostics`, entry "halves": "words" and, if the check was
-    possible, the views of each half, the RMS difference and its prediction (µm per axis), the
-    p-value, "agree", and the differences at a grid of points.
-    Both halves use the same size of the target, which tells nothing about repeatability: the known
-    distance of two dots, or else the estimated one of two dots far apart, is taken as exact in
-    both.
+    possible, the number of views of each half, the RMS difference of points and its prediction (µm
+    per axis), the p-value, "agree", and the differences at a grid of points.
+    Both halves use the same size of the target, so the check says nothing about this size: the
+    known distance of two dots, or else the estimated distance of two dots far apart, is taken as
+    exact in both.
     """
     if len(problem.cameras) < 2:
         return {"words": "one camera: the split-half check compares points in space and needs two"}
@@ -56,7 +57,10 @@ def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
     try:
         first, second = (_rig(problem, state, views) for views in parts)
     except CalibrationError as error:
-        return {"words": f"one half of the views does not determine the rig: {error.what}"}
+        return {
+            "words": "the split-half check was not possible, because one half of the views does "
+            f"not determine the rig: {error.what}"
+        }
     field = field_difference(first, second)
     return {
         "views": [len(p) for p in parts],
@@ -130,13 +134,15 @@ def _words(field: FieldDifference, views: list[int]) -> str:
     ratio = field.rms_um / max(field.predicted_um, 1e-12)
     apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
     words = (
-        f"calibrated from {views[0]} and from the other {views[1]} views, the same pixels lie "
-        f"{apart} µm RMS per axis apart in space; the two covariances predict {expected} µm"
+        f"of two calibrations, one from {views[0]} and one from the other {views[1]} views, points "
+        f"triangulated from the same pixels differ by {apart} µm RMS per axis; their covariances "
+        f"predict {expected} µm"
     )
     if field.p_value >= UNLIKELY:
         return words + f" (ratio {ratio:.2f}), so the stated covariance can be believed"
     return (
         words + f" (ratio {ratio:.2f}; {chance_words(field.p_value)}): the two halves "
         "disagree, so an effect that the model does not contain acts on the images; every stated "
-        "standard deviation is too small by about this ratio"
+        "standard deviation is too small by about this ratio. Look for a pattern in residuals.csv, "
+        "and try --model auto"
     )

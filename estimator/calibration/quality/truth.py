@@ -24,8 +24,9 @@ MANY_SD = 4.0
 
 @dataclass(frozen=True)
 class SpaceError:
-    """Errors of N triangulated points after the best rigid motion: RMS and predicted, µm per axis.
+    """Errors of N triangulated points, after the rigid motion that fits them best to the truth.
 
+    rms_um, predicted_um : RMS error per axis, and its prediction by the calibration's covariance.
     errors_mm : (N, 3) estimated minus true. covariance_mm2 : (3N, 3N) predicted covariance.
     """
 
@@ -37,7 +38,11 @@ class SpaceError:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A text table, one line per quantity, and a verdict that begins with PASSED or FAILED."""
+    """A calibration compared with the truth of the simulator.
+
+    table : text with one line per quantity. verdict : a sentence that begins with PASSED or FAILED.
+    space : errors of points in space.
+    """
 
     table: str
     verdict: str
@@ -63,7 +68,10 @@ def true_cameras(truth: Mapping[str, Any]) -> tuple[Camera, ...]:
 def space_error(
     calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array
 ) -> SpaceError:
-    """Triangulate the true pixels of true points (N, 3) with the rig, and return the errors."""
+    """Triangulate points from their true pixels with a calibration, and return the errors.
+
+    truth : the true cameras. points_mm : (N, 3) true points in the rig frame.
+    """
     calibration = calibration.in_air()
     pixels = [camera.project(points_mm) for camera in truth]
     found = triangulate_any(calibration.cameras, pixels, 1.0).points_mm
@@ -78,7 +86,10 @@ def space_error(
 
 
 def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Comparison:
-    """Return a table of estimated and true values (`truth/truth.json`), and a verdict."""
+    """Compare a calibration with the truth of the simulator.
+
+    truth : content of `truth/truth.json` of the simulated dataset.
+    """
     cameras = true_cameras(truth)
     space = space_error(calibration, cameras, working_volume(cameras))
     rows = _parameters(calibration, cameras)

@@ -14,10 +14,12 @@ STEPS = 7
 
 @dataclass(frozen=True)
 class UncertaintyMap:
-    """Covariances (N, 3, 3) of triangulated points on a grid (N, 3), split by their cause.
+    """Covariances of triangulated points on a grid over the working volume, split by their cause.
 
-    Errors of the calibration are common to all points of a run; the noise of pixels with the
-    standard deviation sigma_px is independent for each point.
+    points_mm : (N, 3) in the rig frame.
+    calibration_mm2 : (N, 3, 3) due to errors of the calibration, which are common to all points of
+    a run. measurement_mm2 : (N, 3, 3) due to noise of the pixels with the standard deviation
+    sigma_px, which is independent for each point.
     """
 
     points_mm: Array

@@ -264,11 +264,12 @@ class Calibration(ShortText):
     def common_covariance(
         self, points_mm: ArrayLike, information_px: ArrayLike | None = None
     ) -> Array:
-        """Return the calibration's share of the covariance of triangulated points, in mm^2.
+        """Return the part of the covariance of triangulated points that the calibration causes.
 
         points_mm : (..., 3) in the rig frame. information_px : (..., 2C, 2C) inverse covariance of
-        their pixels in the C cameras, 0 in those that do not see a point; None for equal noise.
-        Returns (..., 3, 3). The error that it describes is common to all points of a run.
+        the points' pixels in the C cameras, 0 in cameras that do not see a point; None for equal
+        noise of all pixels.
+        Returns (..., 3, 3) in mm^2. The errors that it describes are common to all points of a run.
         """
         points = np.asarray(points_mm, float)
         size = 2 * len(self.cameras)
@@ -284,10 +285,11 @@ class Calibration(ShortText):
         return out.reshape(*points.shape, 3)
 
     def share_columns(self, points_mm: ArrayLike) -> dict[str, NDArray[Any]]:
-        """Return the columns of a table of points (N, 3) that state the calibration's share.
+        """Return columns of tracks.csv that state the calibration's part of the points' errors.
 
-        They are `CALIBRATION_SHARE` in mm, if there is a covariance, and `EXTRAPOLATED`, if the
-        dots are known (`telerig.io.results.tracking`).
+        points_mm : (N, 3) in the rig frame. The columns are `CALIBRATION_SHARE` in mm, if the
+        calibration has a covariance, and `EXTRAPOLATED`, if its dots are known (see
+        `telerig.io.results.tracking`).
         """
         from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED
 
@@ -539,8 +541,8 @@ def load_calibration(path: str | Path) -> Calibration:
 def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
     """Return the calibration of the two cameras that recorded a run, by their names.
 
-    It is returned unchanged if it has fewer than three cameras, or if ``names`` are not two of
-    them; `check_calibration` then reports the error.
+    The calibration is returned unchanged if it has fewer than three cameras, or if ``names`` are
+    not two of its cameras; `check_calibration` then reports the error.
     """
     known = [camera.name for camera in calibration.cameras]
     if len(known) < 3 or len(names) != 2 or not set(names) <= set(known):
@@ -550,11 +552,12 @@ def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
 
 
 def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:
-    """Read the calibration for a run: of its dataset, or from ``files``.
+    """Read the calibration for a run, either that of its dataset or the one in ``files``.
 
-    files : one calibration.json or its folder, or the two camera files of OpenLPT (.txt). Returns
-    it with the files that were read. Raises InputError when there is none, or when files do not
-    belong together.
+    files : one calibration.json or its folder, or the two camera files of OpenLPT (.txt); None or
+    empty for that of the dataset.
+    Returns the calibration and the files that were read. Raises InputError if there is no
+    calibration, or if the files do not belong together.
     """
     if not files:
         default = run.resolve().parent.parent / "results" / "calibration" / "calibration.json"
@@ -579,8 +582,8 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
 
 
 NO_COVARIANCE = (
-    "imported: the calibration's own uncertainty is unknown and counted as none, so covariances "
-    "of points hold the measurement's share only"
+    "imported: the calibration's own uncertainty is unknown and taken as zero, so covariances of "
+    "points contain the noise of the pixels only"
 )
 
 
@@ -593,9 +596,9 @@ def calibration_from_cameras(
 ) -> Calibration:
     """Make a `Calibration` from cameras that are taken as exactly known.
 
-    The frame of the first has to be the rig frame. sigma_px : standard deviation of the pixels that
-    `Calibration.triangulate` assumes. notes : further sentences, for example the names of its
-    files.
+    cameras : the frame of the first one has to be the rig frame.
+    sigma_px : standard deviation of pixels that `Calibration.triangulate` assumes.
+    notes : further sentences for the user, for example the names of the cameras' files.
     The result has no free intrinsics, and the covariance of its poses is zero; its first note says
     that the uncertainty is unknown. Raises CalibrationError if there is no camera, if two have the
     same name, if the first frame is not the rig frame, or if sigma_px is not positive.

@@ -29,13 +29,15 @@ class JointCovariance:
 
     The first K parameters are those of cameras and views. Poses are in GTSAM's tangent space
     (rotation, translation) at ``rig_from_...``, with right perturbation.
-    names : of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
-    matrix : (D, D); of cameras and views only (D = K) if there are more than
-    `FULL_COVARIANCE_UP_TO` parameters. dots : (N, 3, 3). cross : (K, N, 3). rig : P, the size of
-    the rig block.
-    leverage : (M, 2, 2) J C J^T of each used measurement: the share of its noise that the fit
-    absorbs.
-    units : physical units per unit of the solver, for all K + 3 N parameters.
+    names : names of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
+    matrix : (D, D) covariance; if there are more than `FULL_COVARIANCE_UP_TO` parameters, only of
+    cameras and views (D = K).
+    dots : (N, 3, 3) covariance of each dot. cross : (K, N, 3) covariances of cameras and views with
+    each dot.
+    rig : number P of the cameras' parameters, which come first.
+    leverage : (M, 2, 2) J C J^T of each used measurement, with J its derivatives and C the
+    covariance of all parameters: the share of its noise that the fit absorbs.
+    units : (K + 3 N,) size of each parameter's unit in the solver, in physical units.
     """
 
     names: tuple[str, ...]
@@ -47,10 +49,11 @@ class JointCovariance:
     units: Array
 
     def of_rig_and(self, dots: Ints) -> Array:
-        """Return the covariance (P + 3 n, P + 3 n) of the rig block and n dots.
+        """Return the covariance (P + 3 n, P + 3 n) of the cameras' P parameters and n dots.
 
-        Without the full matrix, dots count as independent given cameras and views, which neglects a
-        known distance of two dots.
+        dots : (n,) indices of the dots. If the full matrix was not computed, dots are taken as
+        independent of each other for given cameras and views; this neglects a known distance of two
+        dots.
         """
         common = len(self.cross)
         if len(self.names) > common:
@@ -74,7 +77,10 @@ class JointCovariance:
         return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
     def widened(self, offset: Array) -> JointCovariance:
-        """Return the covariance plus offset offset^T, an error (K + 3 N,) in the solver's units."""
+        """Return the covariance with a further error added, which moves all parameters together.
+
+        offset : (K + 3 N,) size of the error in the solver's units; offset offset^T is added.
+        """
         shift = offset * self.units
         whole = shift[: len(self.matrix)]
         common, of_dots = shift[: len(self.cross)], shift[len(self.cross) :].reshape(-1, 3)
@@ -86,17 +92,19 @@ class JointCovariance:
         )
 
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
-        """Return the names and the covariance (P, P) of the rig block."""
+        """Return the names and the covariance (P, P) of the cameras' parameters."""
         return self.names[: self.rig], self.matrix[: self.rig, : self.rig]
 
 
 def joint_covariance(
     problem: Problem, solution: Solution, *, leverage: Array | None = None
 ) -> JointCovariance:
-    """Return the inverse of the information matrix at the solution, as the solver factorised it.
+    """Return the covariance of all parameters: the inverse of the information matrix.
 
-    A parameter that no measurement determines (the pose of a view that was left out) gets an
+    A parameter on which no measurement depends (the pose of a view that was left out) gets an
     infinite variance. Raises CalibrationError if the information matrix is singular.
+
+    leverage : (M, 2, 2) of each used measurement if it is known; None computes it.
     """
     size = slots(problem)["dots"][0].stop
     posterior = solution.equations.posterior(whole=size <= FULL_COVARIANCE_UP_TO)
@@ -133,7 +141,11 @@ def _names(problem: Problem) -> tuple[str, ...]:
 
 
 def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior) -> Array:
-    """Return J C J^T (M, 2, 2) of each used measurement: the noise share that the fit absorbs."""
+    """Return the leverage (M, 2, 2) of each used measurement.
+
+    It is J C J^T, with J the derivatives of the measurement and C the covariance ``posterior``: the
+    share of the measurement's noise that the fit absorbs.
+    """
     system, out = System(problem), np.empty((int(np.sum(problem.kept)), 2, 2))
     for c, obs in enumerate(system.images):
         columns = system.columns(solution.state, c)[:-1].transpose(2, 1, 0)

@@ -23,9 +23,10 @@ from telerig.factors.calibration import State
 from telerig.factors.linear_factors import add_linear_factors
 
 DOTS_OF_GROUP = 10
-"""Number of dots, about, that are one variable of the graph; see docs/decisions/020."""
+"""Approximate number of dots that form one variable of the graph; see docs/decisions/020."""
 LEAST_PIVOT = 1e-10
-"""Smallest pivot, for columns of unit length, with which the problem still counts as determined."""
+"""Smallest pivot with which the problem still counts as determined, if all columns have the length
+1."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,13 @@ class _Images:
 class GraphLayout:
     """Orders the variables of a problem's graph: cameras, then views, then groups of dots.
 
-    The last group is filled up with variables that no measurement touches. size : W, the number of
-    scalars. places : for each variable the indices of its scalars. families : keys (M,) of the
-    variables of one size, and their scalars (M, size). order : of elimination.
+    All groups have the same size, so the last one may contain dots that do not exist and on which
+    no measurement depends.
+
+    size : number W of all scalar parameters. places : for each variable the indices of its scalars.
+    families : for each set of variables of equal size, their keys (M,) and the indices (M, size) of
+    their scalars.
+    order : keys of the variables in the order of elimination.
     """
 
     def __init__(self, system: System) -> None:
@@ -70,7 +75,7 @@ class GraphLayout:
 
     @cached_property
     def every_place(self) -> Ints:
-        """Return the places of all variables, one after the other in the order of their keys."""
+        """The indices of the scalars of all variables, one variable after the other."""
         return np.concatenate(self.places)
 
     def _images(self, view: Ints, dot: Ints) -> _Images:
@@ -80,7 +85,7 @@ class GraphLayout:
 
     @cached_property
     def gtsam_order(self) -> Any:
-        """Return the order of elimination as a `gtsam.Ordering`."""
+        """The order of elimination as a `gtsam.Ordering`."""
         import gtsam
 
         order = gtsam.Ordering()
@@ -92,8 +97,9 @@ class GraphLayout:
 class GraphEquations:
     """The Gaussian factor graph of a problem, linearised at one state.
 
-    square, right : (W,) the diagonal of J^T J, and -J^T r. untouched : (W,) whether no measurement
-    and no prior depends on the scalar.
+    J are the derivatives of the whitened residuals r with respect to the W scalar parameters.
+    square, right : (W,) diagonal of J^T J, and -J^T r. untouched : (W,) whether no measurement and
+    no prior depends on the parameter. cost : half the sum of squared residuals.
     """
 
     def __init__(self, layout: GraphLayout, state: State) -> None:
@@ -239,9 +245,10 @@ class GraphEquations:
             raise undetermined() from error
 
     def step(self, damping: float) -> tuple[Array, float]:
-        """Return the step (D,) with Marquardt's damping, and the gain by the linear model.
+        """Return a Levenberg-Marquardt step (D,) of the D parameters, and the predicted gain.
 
-        Raises CalibrationError when GTSAM can eliminate the graph neither by Cholesky nor by QR.
+        The gain is the decrease of the cost that the linear model predicts. Raises CalibrationError
+        if GTSAM can eliminate the graph neither by Cholesky nor by QR.
         """
         step = np.empty(self.layout.size)
         step[self.layout.every_place] = self._net(damping).optimize().vector()
@@ -249,7 +256,10 @@ class GraphEquations:
         return step[: self.layout.system.size], float(0.5 * step @ self.right)
 
     def posterior(self, whole: bool) -> Posterior:
-        """Return the inverse of J^T J, always in full; CalibrationError if it is singular."""
+        """Return the inverse of J^T J, in full for any ``whole``.
+
+        Raises CalibrationError if J^T J is singular.
+        """
         del whole
         root, place = self._square_root()
         inverse, failed = dpotri(root, lower=0, overwrite_c=1)
@@ -262,7 +272,7 @@ class GraphEquations:
         return Posterior.of(matrix[:size, :size], self.layout.system.dots_at, self.untouched[:size])
 
     def information(self) -> Array:
-        """Return J^T J as a dense matrix (D, D)."""
+        """Return J^T J of the D parameters as a dense matrix (D, D)."""
         root, place = self._square_root()
         scaled = root / self.scale[place]
         out = np.empty_like(root)

@@ -26,7 +26,11 @@ from telerig.factors.custom_factors import (
 
 
 def keys_of(problem: Problem) -> Keys:
-    """Return GTSAM's keys: k0, ... intrinsics, c1, ... cameras, v0, ... views, d0, ... dots."""
+    """Return GTSAM's keys of a problem's variables.
+
+    They are k0, ... for intrinsics, c1, ... for poses of cameras, v0, ... for views and d0, ... for
+    dots.
+    """
     import gtsam
 
     cameras = range(len(problem.cameras))
@@ -42,7 +46,7 @@ def keys_of(problem: Problem) -> Keys:
 
 
 def nonlinear_graph(problem: Problem, start: State) -> tuple[Any, Any, Keys]:
-    """Return gtsam.NonlinearFactorGraph, gtsam.Values from ``start``, and keys of the problem."""
+    """Return a problem as gtsam.NonlinearFactorGraph, the start as gtsam.Values, and their keys."""
     import gtsam
 
     keys, system = keys_of(problem), System(problem)

@@ -56,7 +56,10 @@ DOTS_FREE = ("3d", "plane", "nominal")
 
 
 def checked_outlier_sd(outlier_sd: float) -> float:
-    """Return ``outlier_sd``; InputError if it is not finite or would leave out correct dots."""
+    """Return ``outlier_sd`` unchanged.
+
+    Raises InputError if it is not finite, or so small that many correct dots would be left out.
+    """
     if not LEAST_OUTLIER_SD <= outlier_sd < np.inf:
         raise InputError(
             f"dots beyond {outlier_sd:g} standard deviations cannot be distinguished from "
@@ -71,16 +74,18 @@ class Problem:
     """The measurements, priors and free parameters of one self-calibration.
 
     There are C cameras, V views, N dots and M measured dots. The first camera is the rig frame.
-    nominal_mm, dot_sigma_mm : (N, 3) nominal position of each dot, and standard deviations from it.
-    view, camera, dot : (M,) indices of each measurement. uv_px : (M, 2). covariance_px2 : (M, 2,
-    2), without weights. weight : (M,) from 0 to 1.
+    nominal_mm, dot_sigma_mm : (N, 3) nominal position of each dot in the target's frame, and the
+    prior standard deviations of the true one.
+    view, camera, dot : (M,) indices of each measurement. uv_px : (M, 2) measured pixels.
+    covariance_px2 : (M, 2, 2), without weights. weight : (M,) from 0 to 1.
     free : for each camera the names of its free intrinsics.
     scale : ((dot index, dot index), distance_mm, sigma_mm) of two dots whose distance is known;
     None if the nominal positions set the scale.
     plate_shift : (V, C) as in `Observations`. solver : "gtsam", "schur" or "auto". outlier_sd :
     number of standard deviations beyond which a dot is left out.
-    hold_scales : where all lenses have perspective, hold their scales at the nominal ones. The
-    depth of each camera's origin is then where its scale is that, not where the axes meet.
+    hold_scales : if all lenses have perspective, whether their scales are held at nominal. Each
+    camera's origin is then at the depth at which its scale is the nominal one, and not where the
+    optical axes come closest.
     """
 
     cameras: tuple[Camera, ...]
@@ -104,7 +109,10 @@ class Problem:
 
     @property
     def scales_held(self) -> bool:
-        """Whether the scales, and not the optical axes, fix the depths of the cameras' origins."""
+        """Whether the nominal scales fix the depths of the cameras' origins.
+
+        Otherwise the point at which the optical axes come closest does.
+        """
         return self.hold_scales and all("kappa_per_mm" in names for names in self.free)
 
     @property
@@ -126,18 +134,21 @@ class Problem:
 
     @property
     def kept(self) -> Bools:
-        """(M,) which measurements are used: those of positive weight."""
+        """Whether each measurement is used (M,), because its weight is positive."""
         return self.weight > 0
 
     def observations(self) -> Observations:
-        """Return measurements of positive weight, whitened with the square root of their weight."""
+        """Return the measurements with a weight above 0.
+
+        Their whitening matrices are multiplied by the square root of the weight.
+        """
         keep = self.kept
         whitener = whitening(self.covariance_px2[keep])
         whitener = whitener * np.sqrt(self.weight[keep])[:, None, None]
         return self._rows(keep, whitener)
 
     def unweighted(self) -> Observations:
-        """Return all measurements, whitened by their covariance alone."""
+        """Return all measurements; their whitening matrices do not contain the weights."""
         whitener = whitening(self.covariance_px2)
         return self._rows(np.ones(len(self.view), bool), whitener)
 
@@ -149,7 +160,10 @@ class Problem:
         )  # fmt: skip
 
     def with_model(self, model: str | Sequence[str]) -> Problem:
-        """Return the problem with the free intrinsics of a model, for all cameras or for each."""
+        """Return the problem with the free intrinsics of a lens model.
+
+        model : its name for all cameras, or one name for each camera.
+        """
         names = [model] * len(self.cameras) if isinstance(model, str) else list(model)
         free = (
             ("scale_px_per_mm", *parameters_of(n), *wall_freedom(c))
@@ -171,7 +185,10 @@ class Problem:
 
 
 def whitening(covariance: Array) -> Array:
-    """Return the inverses of the lower Cholesky factors of covariances, both (M, 2, 2)."""
+    """Return whitening matrices W (M, 2, 2) with W^T W = inverse of the covariance (M, 2, 2).
+
+    W is the inverse of the lower Cholesky factor.
+    """
     first, second, mixed = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 1, 0]
     rest = second * first - mixed * mixed
     if not (np.all(first > 0) and np.all(rest > 0)):
@@ -184,12 +201,16 @@ def whitening(covariance: Array) -> Array:
 
 
 def parameter_unit(camera: Camera) -> Array:
-    """Return by parameter (20,) the change that moves a pixel at the image corner by about 1 px."""
+    """Return for each intrinsic (20,) the change that moves a pixel at the image corner by about
+    1 px."""
     return np.array([p.step(camera.scales) for p in LENS_PARAMETERS.values()])
 
 
 def wall_freedom(camera: Camera) -> tuple[str, ...]:
-    """Return names of the parameters that turn the window's normal, () if the normal is exact."""
+    """Return the names of the two parameters that turn the normal of a camera's window.
+
+    Returns () if there is no window or if its normal is stated as exact.
+    """
     return _WALL if camera.wall is not None and camera.wall.normal_sigma_rad > 0 else ()
 
 
@@ -202,7 +223,7 @@ def prior_sigma(camera: Camera) -> Array:
 
 
 def nominal_state(problem: Problem) -> State:
-    """Return the state with nominal cameras and dots, and every view's target at the origin."""
+    """Return the state of nominal cameras and dots, with the target at the origin in every view."""
     poses = np.array([matrix_from_camera(c) for c in problem.cameras])
     intrinsics = np.array([c.intrinsics for c in problem.cameras])
     views = np.tile(np.eye(4), (len(problem.views), 1, 1))
@@ -217,7 +238,7 @@ def matrix_from_camera(camera: Camera) -> Array:
 
 
 def held_at_nominal(problem: Problem, state: State) -> State:
-    """Return the state with every intrinsic that is not free set to its nominal value."""
+    """Return the state in which every intrinsic that is not free has its nominal value."""
     intrinsics = np.array([c.intrinsics for c in problem.cameras])
     for c in range(len(problem.cameras)):
         free = problem.free_indices(c)
@@ -355,10 +376,12 @@ def _check_distance(target: Target) -> None:
 
 
 def eccentricity_px(problem: Problem, state: State, rings: int = 2, spokes: int = 8) -> Array:
-    """Return each projected disc's centre of area minus its centre's projection (M, 2), in px.
+    """Return how far the centre of each measured dot's image lies from the image of its centre.
 
-    Each disc is sampled at ``rings`` radii (Gauss-Legendre points in r^2) and ``spokes`` equal
-    angles, weighted by the area that a sample covers in the image.
+    A dot is a disc, and the centre of area of its image differs from the projection of its centre.
+    Returns this difference (M, 2) in px. Each disc is sampled at ``rings`` radii (Gauss-Legendre
+    points in r^2) and ``spokes`` equal angles, weighted by the area that a sample covers in the
+    image.
     """
     obs = problem.unweighted()
     radius = problem.target.diameter_mm(problem.dot_ids) / 2
@@ -386,13 +409,17 @@ def _shifted(state: State, shift_mm: Array) -> State:
 
 @dataclass(frozen=True)
 class Priors:
-    """Whitened residuals other than those of images, and their derivatives.
+    """Whitened residuals of all priors, and their derivatives.
 
-    cameras : for each camera the residuals (r,) of weak priors and depth gauge, and derivatives (r,
-    S) by its S parameters: free intrinsics and, except for the first camera, the pose.
-    views : (V, 3) and (V, 3, 6) of the weak priors on positions. dots : (N, 3) of the nominal
-    positions, and the diagonal (N, 3) of their derivatives. distance : two dots of a known
-    distance, its residual, and the derivative (3,) by the first dot; None if none is known.
+    cameras : for each camera the residuals (r,) of the weak priors and of the depth gauge, and
+    their derivatives (r, S) with respect to its S parameters: the free intrinsics and, except for
+    the first camera, the pose.
+    views : the residuals (V, 3) of the weak priors on the target's position in each view, and their
+    derivatives (V, 3, 6) with respect to its pose.
+    dots : the residuals (N, 3) of the dots' nominal positions, and the diagonal (N, 3) of their
+    derivatives.
+    distance : for a known distance the indices of the two dots, the residual, and its derivative
+    (3,) with respect to the first dot; None if no distance is known.
     """
 
     cameras: list[tuple[Array, Array]]
@@ -411,9 +438,10 @@ class Priors:
 class System:
     """Computes the residuals of a problem as functions of the state.
 
-    images : for each camera its measurements, sorted by view and dot. rows : their rows in
-    `Problem.observations`. camera_places : for each camera the indices of its S parameters among
-    all D. views_at, dots_at : first parameter of the views and of the dots. size : D.
+    images : for each camera its measurements, sorted by view and dot. rows : for each camera the
+    indices of these measurements in `Problem.observations`.
+    camera_places : for each camera the indices of its S parameters among all D parameters.
+    views_at, dots_at : index of the first parameter of the views and of the dots. size : D.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -440,7 +468,11 @@ class System:
         self.images = [_components_first(observations.subset(rows)) for rows in self.rows]
 
     def columns(self, state: State, camera: int, rows: slice = slice(None)) -> Array:
-        """Return `image_columns` (S + 7, 2, M) of a camera, in units of `parameter_unit`."""
+        """Return the whitened residuals of a camera and their derivatives: `image_columns`.
+
+        They are (S + 7, 2, M) for M measurements; intrinsics are in units of `parameter_unit`.
+        rows : which of the camera's measurements are used.
+        """
         obs = self.images[camera].subset(rows)
         out = image_columns(
             state, obs, camera, self.problem.rho_mm[camera], self.free[camera].tolist()
@@ -449,7 +481,7 @@ class System:
         return out
 
     def priors(self, state: State) -> Priors:
-        """Return the residuals that do not come from images, and their derivatives."""
+        """Return the residuals of all priors, and their derivatives."""
         problem, cameras = self.problem, []
         for c, nominal in enumerate(problem.cameras):
             free, unit, sigma = self.free[c], self.unit[c], self.sigma[c]
@@ -478,7 +510,11 @@ class System:
         return Priors(cameras, views, dots, distance)
 
     def moved(self, state: State, step: Array) -> State:
-        """Return the state after a step (D,); a pose (R, t) becomes (R exp(w), t + R v)."""
+        """Return the state after a step of all D parameters.
+
+        step : (D,), with intrinsics in units of `parameter_unit`. A pose (R, t) becomes
+        (R exp(w), t + R v) for the step (w, v).
+        """
         intrinsics, cameras = state.intrinsics.copy(), state.rig_from_camera.copy()
         for c, (free, unit, places) in enumerate(zip(self.free, self.unit, self.camera_places)):
             intrinsics[c, free] += step[places[: len(free)]] * unit
@@ -495,7 +531,10 @@ class System:
 
 
 def slots(problem: Problem) -> dict[str, list[slice]]:
-    """Return for each kind of variable the slices of its parameters in the information matrix."""
+    """Return where the parameters of each variable are in the information matrix.
+
+    The result maps each kind of variable to a list of slices, one for each variable.
+    """
     out: dict[str, list[slice]] = {"intrinsics": [], "camera": [], "view": [], "dots": []}
     at = 0
     sizes = [("intrinsics", len(f)) for f in problem.free]
@@ -508,7 +547,10 @@ def slots(problem: Problem) -> dict[str, list[slice]]:
 
 
 def images_of(obs: Observations) -> list[tuple[int, int, int]]:
-    """Return (view, first row, last row + 1) for every image of one camera."""
+    """Return (view, first row, last row + 1) for every image of one camera.
+
+    obs : the camera's measurements, sorted by view.
+    """
     edges = np.flatnonzero(np.diff(obs.view, prepend=-1, append=-1)).tolist()
     return [(int(obs.view[a]), a, b) for a, b in pairwise(edges)]
 

@@ -43,7 +43,11 @@ Equations = GraphEquations | NormalEquations
 
 @dataclass(frozen=True)
 class Solution:
-    """The state at the minimum, its cost with priors, and the linearised equations there."""
+    """The result of a least-squares solution.
+
+    state : the minimum. cost : half the sum of squared whitened residuals, including those of the
+    priors. iterations : number of steps. equations : the equations, linearised at the minimum.
+    """
 
     state: State
     cost: float
@@ -57,13 +61,16 @@ class Solution:
 
 
 def is_large(problem: Problem) -> bool:
-    """Return whether the Schur complement solves the problem, not GTSAM (docs/decisions/020)."""
+    """Return whether the problem is solved by the Schur complement instead of GTSAM.
+
+    See docs/decisions/020.
+    """
     numbers = 6 * len(problem.views) + 3 * len(problem.dot_ids)
     return len(problem.view) > MANY_DOTS or numbers > MANY_PARAMETERS
 
 
 def linearisation(problem: Problem) -> tuple[System, Callable[[State], Equations]]:
-    """Return the problem's residuals, and its solver's equations as a function of the state."""
+    """Return a problem's residuals, and a function from a state to the linearised equations."""
     system = System(problem)
     if problem.solver == "schur" or (problem.solver == "auto" and is_large(problem)):
         return system, lambda state: NormalEquations(system, state)
@@ -79,10 +86,11 @@ def solve(
     relative: float = 1e-11,
     progress: Progress | None = None,
 ) -> Solution:
-    """Minimise the cost by Levenberg-Marquardt steps, until a step gains less than ``relative``.
+    """Minimise the cost of a problem by Levenberg-Marquardt steps.
 
-    Raises CalibrationError if the cost at the start is not finite, or if the measurements leave a
-    direction of the calibration undetermined.
+    relative : the iteration ends when a step lowers the cost by less than this share.
+    Raises CalibrationError if the cost at the start is not finite, or if the measurements do not
+    determine all parameters.
     """
     system, linearised = linearisation(problem)
     point, equations = start, _at(linearised, start)
@@ -125,14 +133,18 @@ def _at(linearised: Callable[[State], Equations], state: State) -> Equations | N
 
 
 LEAST_DOTS = 4
-"""A view with fewer kept measurements than this is left out, because they would not determine the
-pose of the target."""
+"""A view in which fewer dots than this are kept is left out, because so few dots do not determine
+the pose of the target."""
 _MEDIAN = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 
 @dataclass(frozen=True)
 class RobustFit:
-    """The problem with final weights and covariances, its solution, and the noise floor."""
+    """The result of a robust fit.
+
+    problem : the problem with the final weights and with covariances that contain the noise floor.
+    floor_px : noise floor, the scatter of the dots beyond their image noise.
+    """
 
     problem: Problem
     solution: Solution
@@ -140,7 +152,10 @@ class RobustFit:
 
 
 def pixel_residuals(problem: Problem, state: State) -> Array:
-    """Return residuals (M, 2) of all measured dots, left-out ones too, predicted minus measured."""
+    """Return the residuals (M, 2) in px of all measured dots, predicted minus measured.
+
+    Dots that were left out of the fit are included.
+    """
     return pixels(state, problem.unweighted(), problem.rho_mm) - problem.uv_px
 
 
@@ -151,11 +166,13 @@ def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:
 
 
 def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float) -> float:
-    """Return the sd of the residuals' scatter (M, 2) beyond their own covariance (M, 2, 2).
+    """Return the noise floor: the standard deviation of scatter beyond the dots' image noise.
 
-    It is equal in all directions, 0 if not significant, and follows from the median of the squared
-    distances, so up to half of the dots may be wrong. dof_per_row : degrees of freedom per
-    coordinate.
+    It is taken as equal along u and v, and is 0 if it is not significant. It follows from the
+    median of the squared distances, so up to half of the dots may be wrong.
+
+    residual_px : (M, 2) residuals of all dots. covariance_px2 : (M, 2, 2) their image noise.
+    dof_per_row : degrees of freedom per measured coordinate.
     """
     expected = _MEDIAN * dof_per_row
 
@@ -182,10 +199,11 @@ def dof_per_row(problem: Problem) -> float:
 def robust_solve(
     problem: Problem, start: State, *, progress: Progress | None = None, rounds: int = 25
 ) -> RobustFit:
-    """Return the robust fit from a start.
+    """Fit a problem robustly, so that wrong dots have no influence.
 
-    Each round solves the problem, estimates the noise floor and reduces the weight of dots beyond a
-    limit, which decreases to ``problem.outlier_sd``, until the set of kept dots no longer changes.
+    Each round solves the problem, estimates the noise floor, and reduces the weight of dots whose
+    residual exceeds a limit. The limit is lowered to ``problem.outlier_sd``. The fit ends when the
+    set of kept dots no longer changes, after ``rounds`` rounds at the latest.
     """
     base, least = problem.covariance_px2, problem.outlier_sd
     problem = replace(problem, weight=np.ones(len(problem.view)))
@@ -221,6 +239,9 @@ def _without_lost_views(problem: Problem, weight: Array) -> Array:
 
 
 def lost_views(problem: Problem, weight: Array) -> Ints:
-    """Return the indices of the views of which fewer than `LEAST_DOTS` measurements are kept."""
+    """Return the indices of the views in which fewer than `LEAST_DOTS` dots are kept.
+
+    weight : (M,) weight of each measurement.
+    """
     kept = np.bincount(problem.view[weight > 0], minlength=len(problem.views))
     return np.flatnonzero(kept < LEAST_DOTS)

@@ -35,18 +35,19 @@ take more time; with more, the arrays do not fit into the processor's cache."""
 def undetermined() -> CalibrationError:
     """Return the error for measurements that do not determine all parameters."""
     return CalibrationError(
-        "the measurements leave a direction of the calibration undetermined",
+        "the measurements do not determine all parameters of the calibration",
         todo="add views with other tilts, or choose a simpler lens model with --model",
     )
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """The inverse of J^T J, or those parts of it that were asked for.
+    """The covariance of K parameters of cameras and views and of N dots: the inverse of J^T J.
 
-    common : (K, K) of cameras and views. cross : (K, N, 3) of these with each dot. dots : (N, 3,
-    3). whole : (K + 3 N, K + 3 N), or None. untouched : (K + 3 N,) whether nothing measured depends
-    on the parameter, whose variance is 1 here.
+    common : (K, K) of cameras and views. cross : (K, N, 3) of cameras and views with each dot.
+    dots : (N, 3, 3) of each dot. whole : (K + 3 N, K + 3 N) of all parameters, or None if it was
+    not asked for. untouched : (K + 3 N,) whether no measurement depends on the parameter; its
+    variance is 1 here.
     """
 
     common: Array
@@ -57,7 +58,10 @@ class Posterior:
 
     @staticmethod
     def of(whole: Array, common: int, untouched: NDArray[np.bool_]) -> Posterior:
-        """Return the parts of the full inverse ``whole``; ``common`` is K."""
+        """Return the parts of a full covariance.
+
+        whole : (K + 3 N, K + 3 N). common : the number K. untouched : as in the class.
+        """
         at = common + np.arange(len(whole) - common).reshape(-1, 3)
         cross = whole[:common, common:].reshape(common, -1, 3)
         return Posterior(
@@ -145,15 +149,19 @@ class NormalEquations:
         self.squared += float(gram[:, -1, -1].sum())
 
     def step(self, damping: float) -> tuple[Array, float]:
-        """Return the step (K + 3 N,) with Marquardt's damping, and the gain by the linear model.
+        """Return a Levenberg-Marquardt step (K + 3 N,), and the predicted gain.
 
-        Raises CalibrationError if the measurements leave a direction undetermined.
+        The gain is the decrease of the cost that the linear model predicts. Raises CalibrationError
+        if the measurements do not determine all parameters.
         """
         step = self._schur_complement(damping).solve(self.right)
         return step, float(0.5 * step @ self.right)
 
     def posterior(self, whole: bool) -> Posterior:
-        """Return the inverse of J^T J, with ``whole`` in full; CalibrationError if singular."""
+        """Return the inverse of J^T J; ``whole`` says whether the full matrix is computed, too.
+
+        Raises CalibrationError if J^T J is singular.
+        """
         reduced, size = self._schur_complement(0.0), len(self.common)
         if whole:
             return Posterior.of(reduced.inverse(), size, self.untouched)
@@ -229,10 +237,13 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class SchurComplement:
-    """The factorised Schur complement, with m kept parameters and B eliminated blocks of n.
+    """The factorised Schur complement, with m kept parameters and B eliminated blocks of n each.
 
-    kept, eliminated : (m,) and (B, n). root : (B, n, n) inverse of W. coupling : (m, n B) F, by
-    component, then by block. factor : lower Cholesky factor of S, in Fortran order.
+    The letters W, F, S, K, E and D are those of the equations at the top of this module.
+
+    kept, eliminated : indices (m,) and (B, n) of the parameters. root : (B, n, n) inverse of W.
+    coupling : (m, n B) F, with columns sorted by component and then by block. factor : lower
+    Cholesky factor of S, in Fortran order.
     """
 
     kept: Ints
@@ -245,8 +256,9 @@ class SchurComplement:
     def of(
         kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Array
     ) -> SchurComplement:
-        """Return the factorisation of K (m, m), which is overwritten, E (m, n, B) and D (B, n, n).
+        """Return the factorisation of the normal equations.
 
+        matrix : (m, m) K, which is overwritten. coupling : (m, n, B) E. blocks : (B, n, n) D.
         Raises CalibrationError if a block or the Schur complement is not positive definite.
         """
         try:

@@ -24,18 +24,18 @@ from telerig.rig.pose import nearest_rotation
 NEAR_PARALLEL = 0.17
 """Sine of the angle between two optical axes below which they are nearly parallel."""
 STRONG_PERSPECTIVE = 0.01
-"""kappa * rho above which the start takes the perspective that the views show."""
+"""If kappa * rho exceeds this, the start uses the perspective that the views show."""
 _FLIP = np.array([1.0, 1.0, -1.0])
 _MIRROR = np.outer(_FLIP, _FLIP)
 
 
 @dataclass(frozen=True)
 class ImageMap:
-    """The map of the target's plane in one image, at the point imaged to the image centre.
+    """The map from the target's plane to one image, about the point that is seen in its centre.
 
-    jacobian : (2, 2) px/mm. offset_px : (2,) of the target origin from the image centre.
-    perspective : (2,) relative change of scale per mm. misfit : RMS distance of the dots from the
-    map, over their spread.
+    jacobian : (2, 2) px/mm. offset_px : (2,) offset of the target's origin from the image centre.
+    perspective : (2,) relative change of the scale per mm along the target's x and y.
+    misfit : RMS distance of the dots from the map, divided by the dots' spread.
     """
 
     jacobian: Array
@@ -45,7 +45,10 @@ class ImageMap:
 
 
 def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageMap]:
-    """Return the map of each image that has at least four dots, by (view, camera)."""
+    """Return the map of each image that has at least four dots, by (view, camera) indices.
+
+    dots_mm : (N, 3) positions of the target's dots.
+    """
     out = {}
     for v in range(len(problem.views)):
         for c, camera in enumerate(problem.cameras):
@@ -81,7 +84,10 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
 
 
 def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
-    """Return camera_from_target (3, 3), up to its mirror image, and the scale (px/mm) of a map."""
+    """Return the rotation camera_from_target (3, 3) and the scale (px/mm) that explain a map.
+
+    jacobian : (2, 2) px/mm. The mirror image of the rotation explains the map equally well.
+    """
     _, singular, vt = np.linalg.svd(jacobian)
     top = jacobian / singular[0]
     sine = np.sqrt(max(0.0, 1 - (singular[1] / singular[0]) ** 2))
@@ -107,10 +113,13 @@ def angle_between(a: Array, b: Array) -> Array:
 
 
 def rotation_hypotheses(first: Array, second: Array, count: int = 3) -> list[Array]:
-    """Return rotations second_from_first that one choice of signs per view can explain, best first.
+    """Return rotations (3, 3) second_from_first between two cameras, best first.
 
-    first, second : (V, 3, 3) camera_from_target, each up to its mirror image. Each pair of
-    candidates of every view is tried and refined by averaging; none is the mirror image of another.
+    In each view either rotation may be mirrored; a result is a rotation that one choice per view
+    explains. The candidates of all views are tried and refined by averaging.
+
+    first, second : (V, 3, 3) rotations camera_from_target, each up to its mirror image.
+    count : largest number of results; none of them is the mirror image of another.
     """
     plain = second @ np.swapaxes(first, -1, -2)
     crossed = mirrored(second) @ np.swapaxes(first, -1, -2)
@@ -140,10 +149,11 @@ def _refined(rotation: Array, plain: Array, crossed: Array) -> tuple[Array, floa
 
 
 def stereo_states(problem: Problem, dots_mm: Array, count: int = 2) -> list[State]:
-    """Return starting states of two cameras or more, best first, up to the mirror ambiguity.
+    """Return starting states for two cameras or more, best first.
 
-    count : rotations tried for each pair of cameras. Raises CalibrationError where no chain of
-    shared views connects all cameras.
+    The mirror image of each state is an equally good start. dots_mm : (N, 3) positions of the dots.
+    count : number of rotations that are tried for each pair of cameras. Raises CalibrationError if
+    no chain of shared views connects all cameras.
     """
     maps = image_maps(problem, dots_mm)
     rotations = {k: rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
@@ -184,9 +194,10 @@ def _camera_rotations(
 
 
 def overlap_tree(problem: Problem, images: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return pairs of cameras (parent, child) that share most views, from the first camera on.
+    """Return the pairs (parent, child) of camera indices that connect all cameras to the first one.
 
-    Raises CalibrationError where the cameras fall into groups without a common view.
+    They form the tree of pairs that share most views. images : the (view, camera) that can be used.
+    Raises CalibrationError if the cameras fall into groups without a common view.
     """
     count = len(problem.cameras)
     seen = np.zeros((len(problem.views), count))
@@ -208,8 +219,8 @@ def overlap_tree(problem: Problem, images: set[tuple[int, int]]) -> list[tuple[i
             for g in range(groups)
         ]
         raise CalibrationError(
-            f"cameras {', and cameras '.join(names)} have no view in common, so nothing says how "
-            "one group stands to the other",
+            f"cameras {', and cameras '.join(names)} have no view in common, so the pose of one "
+            "group relative to the other is not determined",
             todo="add views of the target that cameras of both groups see, each with "
             "4 dots or more",
         )
@@ -317,7 +328,11 @@ def _place_by_scales(
 def perspective_from_maps(
     maps: dict[tuple[int, int], ImageMap], state: State, camera: int
 ) -> float:
-    """Return a camera's kappa (1/mm): the weighted median of scale changes over tilted views."""
+    """Return an estimate of a camera's kappa (1/mm) from the maps of its images.
+
+    It is the weighted median over tilted views of the relative change of scale with depth.
+    maps : by (view, camera). camera : index of the camera.
+    """
     turn = state.rig_from_camera[camera, :3, :3].T
     kappas, weights = [], []
     for (v, c), m in maps.items():

@@ -31,13 +31,16 @@ _KAPPA = INDEX["kappa_per_mm"]
 _D = np.diag([1.0, 1.0, -1.0, 1.0])
 
 Nominal = Mapping[int, Array]
-"""Nominal rotation vectors (degrees) of cameras against the first, those that are known."""
+"""Nominal rotation vectors (3,) in degrees from the first camera's frame to that of other cameras,
+by the camera's index, as far as they are known."""
 
 ALIKE_FACTOR, ALIKE_COST = 1.5, 20.0
-"""A start fits as well as the best one up to this factor of its cost and this cost besides."""
+"""A start fits as well as the best one if its cost is below this factor times the cost of the best
+one plus this constant."""
 
 ENTOCENTRIC = 0.01
-"""kappa * rho beyond which a lens is a perspective one: no telecentric lens errs by 0.6 degrees."""
+"""A lens with a larger kappa * rho counts as a perspective lens: the rays of a telecentric lens do
+not deviate from its axis by 0.6 degrees."""
 TIE_DEG = 10.0
 BY_PLATE = "refraction in the plate"
 """``decided_by`` for a two-sided target when no nominal rotation is given."""
@@ -45,7 +48,11 @@ BY_PLATE = "refraction in the plate"
 
 @dataclass(frozen=True)
 class MirrorChoice:
-    """Holds the solution that is kept; decided_by and words say why, for calibration.json."""
+    """Holds which of the two mirror-image solutions is kept.
+
+    state : the kept solution. decided_by, words : what decided, as a short phrase and as a sentence
+    for calibration.json.
+    """
 
     state: State
     decided_by: str
@@ -53,7 +60,11 @@ class MirrorChoice:
 
 
 def mirrored_state(state: State) -> State:
-    """Return the mirror image: D R D and D t for poses, D X for dots, -kappa for cameras."""
+    """Return the mirror image of a state, which has the same pixels in telecentric cameras.
+
+    With D = diag(1, 1, -1), poses (R, t) become (D R D, D t), dots X become D X, and kappa changes
+    its sign.
+    """
     intrinsics = state.intrinsics.copy()
     intrinsics[:, _KAPPA] *= -1
     cameras, views = (_D @ m @ _D for m in (state.rig_from_camera, state.rig_from_target))
@@ -76,10 +87,12 @@ def _angle_deg(rotation: Array, nominal_rotvec_deg: Array) -> float:
 def consistent_start(
     states: Sequence[State], costs: Sequence[float], problem: Problem, nominal: Nominal
 ) -> State:
-    """Return the best of several roughly fitted starts, up to its own mirror image.
+    """Return the best of several roughly fitted starts; its mirror image is not considered here.
 
-    Of those that fit alike it is the one nearest to the nominal rotations. Raises CalibrationError
-    where these do not tell them apart.
+    Among starts that fit equally well it is the one nearest to the nominal rotations. Raises
+    CalibrationError if the nominal rotations do not distinguish these starts.
+
+    costs : cost of each of the starts ``states``.
     """
     best = int(np.argmin(costs))
     if len(problem.cameras) == 2:
@@ -135,7 +148,10 @@ def _lines(problem: Problem, cameras: Sequence[int]) -> str:
 
 
 def perspective_sign(state: State, problem: Problem) -> int:
-    """Return the sign of kappa if perspective is so strong that only one is possible, else 0."""
+    """Return the sign of kappa if the perspective of all lenses is strong, else 0.
+
+    A true kappa is positive, so a strong negative one shows that the state is the mirror image.
+    """
     strength = state.intrinsics[:, _KAPPA] * np.array(problem.rho_mm)
     if np.all(strength > ENTOCENTRIC):
         return 1
@@ -145,12 +161,16 @@ def perspective_sign(state: State, problem: Problem) -> int:
 
 
 def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
-    """Return the solution with which the final fit starts; with one camera it stays undecided.
+    """Return which of a state and its mirror image the final fit starts from.
 
-    The plate's refraction decides where no nominal rotation is given. Raises as `choose_solution`.
+    With one camera nothing decides, and the state is returned. The refraction in a two-sided plate
+    decides if no nominal rotation is given, otherwise `choose_solution`, whose errors are raised.
     """
     if len(problem.cameras) == 1:
-        words = "one camera: the mirrored solution has the same pixels and nothing decides"
+        words = (
+            "one camera: a solution and its mirror image have the same pixels, so nothing decides "
+            "between them"
+        )
         return MirrorChoice(state, "mono", words)
     if nominal_rotvec_deg or not np.any(problem.plate_shift):
         return choose_solution(state, problem, nominal_rotvec_deg)
@@ -161,9 +181,10 @@ def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) ->
 
 
 def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
-    """Return the solution that the nominal rotations or strong perspective decide for.
+    """Return which of a state and its mirror image is right.
 
-    Raises CalibrationError when nothing decides, or when these contradict each other.
+    The nominal rotations decide, or strong perspective. Raises CalibrationError if there is neither
+    or if they contradict each other.
     """
     other = mirrored_state(state)
     perspective = perspective_sign(state, problem)
@@ -188,7 +209,7 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
         if margin < TIE_DEG and perspective == 0:
             raise CalibrationError(
                 f"the two mirror solutions are {angles[0]:.0f} and {angles[1]:.0f} degrees from "
-                "the nominal rotation: too alike to choose",
+                "the nominal rotation, which is too similar to choose one of them",
                 where="rig.toml [stereo]",
                 todo=f"correct {' and '.join(stated)} to within 20 degrees",
             )
@@ -218,17 +239,19 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
             kept, "perspective", "the lenses' perspective: farther dots are smaller"
         )
     raise CalibrationError(
-        "nothing says on which side the second camera stands: both mirror solutions fit alike",
+        "both mirror solutions fit equally well, and rig.toml does not state on which side of the "
+        "first camera the second one stands",
         where="rig.toml [stereo]",
-        todo=f"add {_lines(problem, [1])}, 20 degrees is near enough",
+        todo=f"add {_lines(problem, [1])} with your own angles; an error of up to 20 degrees is "
+        "allowed",
     )
 
 
 def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
-    """Return the cost of the mirror image of a solution with this state and cost.
+    """Return the cost of the mirror image of a solution.
 
-    Raises CalibrationError when it is far lower: the plate's refraction contradicts the nominal
-    rotation.
+    state, cost : the solution. Raises CalibrationError if the mirror image fits far better, because
+    the refraction in the plate then contradicts the nominal rotation.
     """
     if len(problem.cameras) == 1:
         return cost
@@ -238,7 +261,8 @@ def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
             "the nominal rotation puts the second camera on one side, the refraction in the "
             f"two-sided plate on the other (cost {cost:.4g} against {other:.4g})",
             where="rig.toml [stereo]",
-            todo="check the sign of the nominal rotation, and the plate's thickness and index",
+            todo="check the sign of the nominal rotation, and plate_thickness_mm and plate_index "
+            "in [target]",
         )
     return other
 
@@ -257,10 +281,12 @@ def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
 
 
 def with_tilt_signs(problem: Problem, state: State) -> State:
-    """Return the state in which views seen alone have the tilts that agree with the relief.
+    """Return the state in which views with dots in one camera only have the right tilt.
 
-    With one camera every view is of this kind, up to the mirror ambiguity of the whole. All signs
-    are set by `_from_relief`, then each by the cost of the view's two poses.
+    One camera alone does not show the sign of the target's tilt. All signs are first set such that
+    they agree with the target's deviations from a plane (`_from_relief`), then each by the cost of
+    the two poses. With one camera every view is of this kind, and the mirror image of the whole
+    state remains possible.
     """
     alone, cameras = views_seen_alone(problem)
     relief = float(problem.dot_sigma_mm[:, 2].max())

@@ -23,9 +23,10 @@ TIE_DEG = 15.0
 
 
 def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[Problem, list[str]]:
-    """Return images renumbered so that cameras and views agree, and notes on how it was decided.
+    """Renumber the dots of a symmetric target such that all cameras and views agree.
 
-    Raises CalibrationError when two numberings explain two cameras alike.
+    Returns the problem with the new numbers, and notes for the user on how they were decided.
+    Raises CalibrationError if two numberings explain the images of two cameras equally well.
     """
     labels = problem.target.turns()
     if len(problem.cameras) > 1:
@@ -36,15 +37,16 @@ def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[
     many = f"{len(labels)}-fold symmetric target without marks"
     if contrast > 3:
         return problem, [
-            f"{many}: numbered so that {cameras} and all views agree; the dots' print errors "
-            f"decide the turn ({contrast:.0f} standard deviations in the least certain view)",
+            f"{many}: numbered so that {cameras} and all views agree. The dots' print errors show "
+            f"by which angle the target is turned in each view ({contrast:.0f} standard "
+            "deviations in the least certain view)",
             *about_scale,
         ]
     return problem, [
-        f"{many}: {cameras} agree within each view. Between views the dots' print errors are "
-        f"too small to decide the turn ({contrast:.1f} standard deviations in the least certain "
-        "view), so the dots' estimated positions may be averages over turns; marks on the target "
-        "would decide it",
+        f"{many}: {cameras} agree within each view. The dots' print errors are too small to show "
+        f"by which angle the target is turned between views ({contrast:.1f} standard deviations "
+        "in the least certain view), so each estimated position may be an average over several "
+        "dots. Marks on the target would avoid this",
         *about_scale,
     ]
 
@@ -59,10 +61,10 @@ def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, l
         return problem, []
     either = float(np.hypot(sigma, np.sqrt(2) * problem.target.print_sigma_mm))
     words = (
-        f"the stated distance of dots {tuple(int(e) for e in ends)} may be that of another pair, "
-        "because a turn of the target puts other dots in their place. Its standard deviation is "
-        f"therefore taken as {1e3 * either:.0f} µm; choose two dots that are opposite each other, "
-        "or put marks on the target"
+        f"the stated distance of dots {tuple(int(e) for e in ends)} may belong to two other dots, "
+        "because the symmetric target may be turned. The standard deviation of the distance is "
+        f"therefore taken as {1e3 * either:.0f} µm. State the distance of two dots that are "
+        "opposite each other, or put marks on the target"
     )
     return replace(problem, scale=(pair, distance, either)), [words]
 

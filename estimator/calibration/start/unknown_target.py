@@ -20,15 +20,18 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
 
 LEAST_VIEWS = 4
-"""Of one camera, for the shape of a target of unknown dots."""
+"""Least number of views of one camera that determine the shape of a target whose dots are
+unknown."""
 
 _SWEEPS = 200
 
 
 def dots_from_images(problem: Problem) -> Array:
-    """Return dot positions (N, 3), from pixels and the known distance, nearest to the nominal ones.
+    """Return positions (N, 3) in mm of a target's dots that are not known beforehand.
 
-    Raises CalibrationError when the views do not determine the target's shape.
+    They follow from the pixels and the known distance of two dots. The frame is chosen such that
+    the positions are as near as possible to the nominal ones.
+    Raises CalibrationError if the views do not determine the target's shape.
     """
     maps, plane = _factorise(problem)
     views = np.bincount([c for _, c in maps], minlength=len(problem.cameras))

@@ -70,8 +70,9 @@ p2 are exchanged, and the power of length in HALCON's unit of it."""
 class HalconCamera:
     """Hold one camera's parameters in HALCON's names, order and units (m, px, degrees).
 
-    kind : HALCON's camera type. camera_from_rig : its external parameters, here in mm. misfit : to
-    telerig's camera over the working volume. notes : what was fitted or left out.
+    kind : HALCON's camera type. camera_from_rig : pose of the camera, here in mm.
+    misfit : difference of the pixels from those of telerig's camera, over the working volume.
+    notes : what was fitted or left out.
     """
 
     camera: str
@@ -108,11 +109,13 @@ def export_halcon(
 def halcon_cameras(
     cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[HalconCamera, ...]:
-    """Convert every camera to HALCON's model, with its misfit over ``volume`` (`working_volume`).
+    """Convert every camera to HALCON's model.
 
-    A camera becomes telecentric unless that moves points of the volume by more than
-    `PERSPECTIVE_PX`. Raises InputError when the cameras do not see the volume, and for an unknown
-    lens parameter.
+    A camera becomes a telecentric one, unless this moves points of the volume by more than
+    `PERSPECTIVE_PX` in the image.
+
+    volume : where HALCON's model is compared with telerig's; None takes `working_volume`.
+    Raises InputError if the cameras do not see the volume, and for an unknown lens parameter.
     """
     refuse_unknown_parameters(cameras, "HALCON")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
@@ -268,9 +271,11 @@ _DAT = {
 def write_halcon(
     cameras: Sequence[HalconCamera], folder: str | PathLike[str], remarks: Sequence[str] = ()
 ) -> list[str]:
-    """Write cameras.hdev.txt and each camera's <camera>.dat and _pose.dat; return the names.
+    """Write cameras.hdev.txt, and <camera>.dat and <camera>_pose.dat for each camera.
 
-    A camera with a tilted sensor gets no `.dat` file, because its layout is not documented.
+    A camera with a tilted sensor gets no `.dat` file, because the layout of such a file is not
+    documented. remarks : sentences that are written as comments.
+    Returns the names of the files.
     """
     names = []
     for camera in cameras:
@@ -285,7 +290,10 @@ def write_halcon(
 
 
 def hdevelop_lines(cameras: Sequence[HalconCamera], remarks: Sequence[str] = ()) -> str:
-    """Return assignments for HDevelop: CamParam<i> (type first) and Pose<i>, below ``remarks``."""
+    """Return lines of HDevelop code that assign CamParam<i> and Pose<i> for each camera.
+
+    remarks : sentences that come first, as comments.
+    """
     lines = [
         *(f"* {remark}" for remark in remarks),
         "* World: telerig's rig frame, the first camera's.",
@@ -308,7 +316,10 @@ def hdevelop_lines(cameras: Sequence[HalconCamera], remarks: Sequence[str] = ())
 
 
 def pose_tuple(pose: Pose) -> Array:
-    """Return a pose (6,) in HALCON's form (type 0, R = Rx Ry Rz): m, then degrees."""
+    """Return a pose in HALCON's form of type 0, as (6,): translation in m, then angles in degrees.
+
+    The rotation matrix is Rx Ry Rz.
+    """
     r = pose.rotation
     beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))
     alpha = np.arctan2(-r[1, 2], r[2, 2]) if np.hypot(r[1, 2], r[2, 2]) > 1e-9 else 0.0

@@ -37,10 +37,11 @@ _POINTS_PER_EDGE = 25
 class Matrices:
     """Hold the matrices of one camera, which map (x, y, z, 1) in mm in the rig frame to pixels.
 
-    undistorted : (3, 4) exact except for the distortion, whose effect is its misfit. affine : (3,
-    4) the best matrix with last row 0 0 0 1.
-    camera_matrix (3, 3), distortion (12,) : for cv2.undistortPoints with P = camera_matrix; None
-    where OpenCV's model cannot express this camera's skew or sensor tilt.
+    undistorted : (3, 4) matrix of the camera without distortion; undistorted_misfit : the effect of
+    the distortion that is left out.
+    affine : (3, 4) matrix with last row 0 0 0 1 that fits best; affine_misfit : its error.
+    camera_matrix, distortion : (3, 3), (12,) arguments of cv2.undistortPoints, with
+    P = camera_matrix; None if OpenCV's model cannot express this camera's skew or sensor tilt.
     """
 
     camera: str
@@ -123,9 +124,11 @@ def projected(matrix: Array, points_mm: Array) -> Array:
 def camera_matrices(
     cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[Matrices, ...]:
-    """Compute the matrices of every camera; misfits are over what all see of ``volume``.
+    """Compute the matrices of every camera.
 
-    Raises InputError when the cameras do not see it, and for an unknown lens parameter.
+    volume : misfits are computed over the part of this box that all cameras see; None takes
+    `working_volume`. Raises InputError if the cameras do not see the volume, and for an unknown
+    lens parameter.
     """
     refuse_unknown_parameters(cameras, "OpenCV")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)

@@ -122,9 +122,10 @@ def unit_of(column: str) -> str:
 
 
 def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:
-    """Return a whole number for each row's particle (rows,), and the names in that order.
+    """Return a whole number for the particle of each row, and the particles' names by this number.
 
-    There are no names if the ids are whole numbers already, which stay as they are.
+    If the ids of the particles are whole numbers already, they stay as they are, and the list of
+    names is empty.
     """
     if points["particle"].dtype.kind == "i":
         return points["particle"].to_numpy(np.int64), []
@@ -133,7 +134,7 @@ def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:
 
 
 def facts(results: RunResults) -> dict[str, str]:
-    """Return what every exported file states about its content: run, frame, source and verdict."""
+    """Return what an exported file states about its content: run, frame, source and verdict."""
     try:
         made_by = f"telerig {version('telerig')}"
     except PackageNotFoundError:
@@ -178,7 +179,10 @@ def results_root(source: Path) -> Path:
 
 @dataclass(frozen=True)
 class CalibratedCameras:
-    """Hold calibrated cameras with their windows, and why they are stale if they were read so."""
+    """Hold calibrated cameras with their refractive windows.
+
+    accepted : why the calibration is stale, if it was read although it is.
+    """
 
     cameras: tuple[Camera, ...] = ()
     accepted: tuple[str, ...] = ()
@@ -187,10 +191,13 @@ class CalibratedCameras:
 def cameras_of(
     source: Path, calibration: Path | None, *, required: bool, accept: Collection[str] = ()
 ) -> CalibratedCameras:
-    """Read the calibrated cameras of ``calibration``, or of ``source``, or of its dataset.
+    """Read calibrated cameras for an export.
 
-    required : raise InputError when there is none; otherwise no camera is returned. accept : as in
-    `read_results`. Raises InputError for a calibration that is stale or cannot be read.
+    source : a calibration.json, or a dataset or one of its results folders, whose calibration is
+    read. calibration : a calibration.json to read instead; None for none.
+    required : whether InputError is raised if there is no calibration; otherwise the result holds
+    no camera then. accept : as in `read_results`.
+    Raises InputError for a calibration that is stale or cannot be read.
     """
     trials = [results_root(source) / "calibration" / "calibration.json"]
     if source.suffix == ".json":
@@ -214,9 +221,11 @@ def cameras_of(
 
 
 def run_folder(source: Path, run: str | None) -> Path:
-    """Return the results folder of a run; None takes ``source``, or the only run with results.
+    """Return the results folder of a run.
 
-    Raises InputError when that is no run, or several.
+    source : a dataset or one of its results folders. run : name of the run; None takes ``source``
+    if it is the results folder of a run, otherwise the only run of the dataset with results.
+    Raises InputError if there is no such run, or if there are several.
     """
 
     def holds(folder: Path) -> bool:

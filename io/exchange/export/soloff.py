@@ -78,10 +78,11 @@ def terms(points_mm: Array, count: int = len(POWERS)) -> Array:
 def fit_soloff(
     cameras: Sequence[Camera], volume: Volume | None = None, *, full_cubic: bool = False
 ) -> tuple[Soloff, ...]:
-    """Fit one polynomial per camera by least squares, over the part of the volume that all see.
+    """Fit one polynomial per camera by least squares.
 
-    full_cubic : adds z^3 (20 terms), for programs that take the exponents from the file. Raises
-    InputError when the cameras do not see the volume.
+    volume : the fit uses the part of this box that all cameras see; None takes `working_volume`.
+    full_cubic : whether the term z^3 is added (20 terms), for programs that take the exponents from
+    the file. Raises InputError if the cameras do not see the volume.
     """
     box = volume or working_volume(cameras)
     fitted = seen_points(cameras, box, FIT_POINTS_PER_EDGE)

@@ -63,7 +63,11 @@ EXPORTED = (
 
 
 def refuse_unknown_parameters(cameras: Sequence[Camera], program: str) -> None:
-    """Raise InputError for a camera with a lens parameter that is not 0 and not in `EXPORTED`."""
+    """Raise InputError for a camera with a lens parameter that the export cannot express.
+
+    It is a parameter that is not 0 and not in `EXPORTED`. program : name of the program, for the
+    message.
+    """
     for camera in cameras:
         for name, value in zip(PARAMETERS, camera.intrinsics):
             if name not in EXPORTED and value != 0:

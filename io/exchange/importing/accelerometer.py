@@ -45,14 +45,16 @@ _SEEN_CELLS = 200
 
 @dataclass(frozen=True)
 class Layout:
-    """State where the readings are in a file, and what they mean; None uses what the file says.
+    """State where in a file the readings are, and what they mean; None uses what the file states.
 
-    channels : names or numbers from 0 of the channels x, y, z. time : that of the channel of times.
-    time_unit : one of `TIME_UNITS`. rate_hz : the sampling rate in Hz, in place of times.
-    start_s : is added to every time (s), to bring the sensor's clock to that of the run.
-    unit : one of `ACCELERATION_UNITS`. scale_m_s2 : in its place, the acceleration in m/s^2 that 1
-    in the file means, one number or three (WAV: full scale; volts: 9.80665 / (V per g)).
-    group : the group of a TDMS file.
+    channels : names, or numbers from 0, of the channels x, y, z. time : name or number of the
+    channel that holds the times.
+    time_unit : one of `TIME_UNITS`. rate_hz : sampling rate, for a file without times.
+    start_s : time in s that is added to all times, to bring the sensor's clock to that of the run.
+    unit : unit of the readings, one of `ACCELERATION_UNITS`. scale_m_s2 : instead of a unit, the
+    acceleration in m/s^2 of a reading of 1, as one number or three (WAV files: of full scale;
+    volts: 9.80665 divided by the sensitivity in V per g).
+    group : name of the group in a TDMS file.
     """
 
     channels: tuple[str | int, str | int, str | int] | None = None
@@ -87,7 +89,7 @@ def read_accelerations(
 def import_accelerations(
     path: str | PathLike[str], sensor: str, layout: Layout | None = None
 ) -> Imported:
-    """Read a recording as `read_accelerations` does, and say how it was understood."""
+    """Read a recording as `read_accelerations` does, with sentences on how it was understood."""
     layout = layout or Layout()
     recording = open_recording(Path(path), layout.group)
     names = _channels(recording, layout)
@@ -109,7 +111,7 @@ def import_accelerations(
     channels = f"x, y, z are the channels {', '.join(map(repr, names))} in {unit}"
     notes = [*recording.notes, channels, *said]
     if not kept.all():
-        notes.append(f"{int((~kept).sum())} rows without any reading are left out")
+        notes.append(f"{int((~kept).sum())} rows are left out, because they have no reading")
     _check_numbers(recording, np.c_[raw, t_s], [*names, "time"], kept)
     _check_order(recording, t_s, kept)
     table = pd.DataFrame({"t_s": t_s[kept], "sensor": sensor})
@@ -126,8 +128,8 @@ def _check_numbers(recording: Recording, values: Array, names: Sequence[str], ke
         row, column = (int(i) for i in bad[0])
         raise recording.error(
             f"reading {row} of {names[column]!r} is no finite number up to {LARGEST_NUMBER:g} "
-            f"({len(bad)} such)",
-            "cut it out, or export the recording again",
+            f"({len(bad)} such readings)",
+            "remove the row, or export the recording again",
             row,
         )
 
@@ -139,7 +141,8 @@ def _check_order(recording: Recording, t_s: Array, kept: Bools) -> None:
     if len(late):
         before, row = (int(i) for i in rows[late[0] : late[0] + 2])
         raise recording.error(
-            f"time {t_s[row]:.9g} s follows {t_s[before]:.9g} s (reading {row}, {len(late)} such)",
+            f"time {t_s[row]:.9g} s follows {t_s[before]:.9g} s (reading {row}; {len(late)} such "
+            "readings)",
             "times must increase; if they are rounded, give the sampling rate instead: "
             "--rate-hz 1600",
             row,
@@ -156,7 +159,7 @@ def _channels(recording: Recording, layout: Layout) -> list[str]:
         if not found and len(there) == 3:
             return there
         raise recording.error(
-            f"has {len(found)} groups of channels x, y and z"
+            f"has {len(found)} sets of channels x, y and z"
             if found
             else "does not say which channels are x, y and z",
             f"name three of them with --channels {','.join(found[0]) if found else 'x,y,z'}"
@@ -232,11 +235,12 @@ def _times(recording: Recording, layout: Layout, rows: int) -> tuple[Array, list
         )
     counted = _counted(recording, rows)
     if counted is None:
-        return recording.offset_s + np.arange(rows) / rate, [f"times are counted at {rate:g} Hz"]
+        said = [f"times follow from the number of the sample at {rate:g} Hz"]
+        return recording.offset_s + np.arange(rows) / rate, said
     name, count = counted
-    said = [f"times are those of the counter {name!r} at {rate:g} Hz"]
+    said = [f"times follow from the counter {name!r} at {rate:g} Hz"]
     lost = int(count[-1] - count[0]) + 1 - rows
-    said += [f"{lost} samples are missing by the counter {name!r}"] if lost else []
+    said += [f"the counter {name!r} shows that {lost} samples are missing"] if lost else []
     return recording.offset_s + count / rate, said
 
 
@@ -257,7 +261,7 @@ def _times_in(recording: Recording, layout: Layout, name: str) -> tuple[Array, l
                 "name another one with --time, or give the sampling rate with --rate-hz 1600",
             )
         first = str(recording.channels[name][0])
-        return t_s, [f"times are counted from the first stamp of {name!r}, {first}"]
+        return t_s, [f"times are in s since the first time stamp of {name!r}, {first}"]
     values = _values(recording, name)
     unit = layout.time_unit or time_unit_in(name, recording.units)
     unit = unit or _unit_of_times(recording, values, name)
@@ -265,11 +269,14 @@ def _times_in(recording: Recording, layout: Layout, name: str) -> tuple[Array, l
         todo = f"use --time-unit with one of: {', '.join(TIME_UNITS)}"
         raise InputError(f"--time-unit {unit}: there is no such unit", todo=todo)
     t_s = values * TIME_UNITS[unit]
-    said = [f"times are those of {name!r} in {unit}"]
+    said = [f"times are taken from the channel {name!r} in {unit}"]
     step = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
     stated = recording.rate_hz
     if stated and step > 0 and abs(1 / step / stated - 1) > _SAME_RATE:
-        said.append(f"the times have {1 / step:.6g} Hz, the file states {stated:g} Hz")
+        said.append(
+            f"the times give a sampling rate of {1 / step:.6g} Hz, but the file states "
+            f"{stated:g} Hz; the times are used"
+        )
     return t_s, said
 
 
@@ -297,7 +304,7 @@ def _unit_of_times(recording: Recording, values: Array, name: str) -> str:
             if found:
                 return found[0]
     raise recording.error(
-        f"does not say the unit of the times in {name!r}, which increase by {step:g}",
+        f"does not state the unit of the times in {name!r}, which increase by {step:g}",
         f"give it with --time-unit {'ms' if step >= 1 else 's'} ({', '.join(TIME_UNITS)})",
     )
 
@@ -337,9 +344,9 @@ def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> tuple[
         raise recording.error(
             f"the unit of its readings is {unknown[0]!r}"
             if unknown[0]
-            else "does not say the unit of its readings",
-            f"say the unit with --unit g ({', '.join(ACCELERATION_UNITS)}), or with --scale the "
-            "m/s^2 of a reading of 1",
+            else "does not state the unit of its readings",
+            f"give the unit with --unit, one of {', '.join(ACCELERATION_UNITS)}, or with --scale "
+            "the acceleration in m/s^2 of a reading of 1",
         )
     sizes = np.array([ACCELERATION_UNITS[unit] for unit in units])
     return sizes, ", ".join(dict.fromkeys(units))

@@ -36,7 +36,7 @@ _FREE = ("scale_px_per_mm", "aspect", "skew", "centre_u_px", "centre_v_px",
 
 @dataclass(frozen=True)
 class Sensor:
-    """What OpenPTV keeps in ptv.par. pixel_size_mm : (width, height) of a pixel."""
+    """The content of OpenPTV's ptv.par: (width, height) of the image, and of a pixel in mm."""
 
     image_size_px: tuple[int, int]
     pixel_size_mm: tuple[float, float]

@@ -33,10 +33,11 @@ _RATIONAL, _TILT = slice(5, 8), slice(12, 14)
 
 @dataclass(frozen=True)
 class Pinhole:
-    """One camera: pixel = camera_matrix (rotation X + translation), homogeneous.
+    """One pinhole camera: pixel = camera_matrix (rotation X + translation_mm), homogeneous.
 
-    where : the file, for errors. camera_matrix (3, 3), rotation (3, 3), translation_mm (3,) from
-    the world. distortion : (up to 14,) in OpenCV's order.
+    X is a point in mm in the world of the program that made the file.
+    where : the file, for errors. camera_matrix, rotation : (3, 3). translation_mm : (3,).
+    distortion : up to 14 coefficients in OpenCV's order.
     """
 
     where: str
@@ -57,8 +58,10 @@ class Pinhole:
 
 
 class ImportedCameras(NamedTuple):
-    """rig_from_world : for points in the other program's world; its rotation has determinant -1
-    where that world is mirrored. notes : what is not exact, for the user."""
+    """Cameras that were imported from another program.
+
+    rig_from_world : pose for points in the other program's world; its rotation has the determinant
+    -1 if that world is mirrored. notes : sentences for the user on what is not exact."""
 
     cameras: tuple[Camera, ...]
     rig_from_world: Pose
@@ -66,13 +69,15 @@ class ImportedCameras(NamedTuple):
 
 
 def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> ImportedCameras:
-    """Return the cameras of this library that give the same pixels.
+    """Return cameras of telerig that give the same pixels as pinhole cameras.
 
-    The rig frame is the first camera's, its origin where the first two optical axes come closest
-    (for one camera: at the depth of the world's origin).
+    The rig frame is that of the first camera; its origin is where the first two optical axes come
+    closest (for one camera: at the depth of the world's origin).
 
-    Raises InputError for names that do not fit, cameras of unequal handedness, a matrix that is no
-    pinhole, and distortion that this library's model cannot express exactly.
+    names : of the cameras, all different.
+    Raises InputError if the number of names differs, if some cameras are mirrored, for a matrix
+    that is not that of a pinhole camera, and for distortion that telerig's model cannot express
+    exactly.
     """
     if len(names) != len(pinholes) or len(set(names)) != len(names):
         raise InputError(

@@ -18,10 +18,13 @@ _MOSTLY = 0.9
 
 
 def sensor_toml(name: str, table: pd.DataFrame, cameras: Sequence[str]) -> str:
-    """Return the table [accelerometers.<name>] for rig.toml.
+    """Return a proposal for the table [accelerometers.<name>] of rig.toml.
 
-    The axis that reads gravity points up, which is -y in the rig frame of a level first camera. The
-    user states the directions of the other two, and the sensor's place.
+    The sensor's axis that reads gravity is taken to point up, which is -y in the rig frame of a
+    level first camera. The user has to correct the directions of the other two axes and the place
+    of the sensor.
+
+    table : readings as `read_accelerations` returns them. cameras : names of the cameras.
     """
     readings = table[AXES].to_numpy()
     rows = ", ".join(str(row) for row in _axes(readings.mean(0)))

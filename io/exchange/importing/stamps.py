@@ -27,10 +27,10 @@ def is_stamp(text: str) -> bool:
 
 
 def seconds_of(stamps: Sequence[str]) -> Array | None:
-    """Return the (N,) times in s since the first stamp; None if a text is not a time of day.
+    """Return the times (N,) in s since the first of N time stamps; None if one is no time of day.
 
-    Stamps may lack dates and go on beyond midnight. In dates with slashes the order of day and
-    month is the one that is possible and in which the record takes less time. A zone is not used.
+    Stamps may have no dates, and may pass midnight. In dates with slashes, day and month are in the
+    order that is possible and that gives the shorter record. A time zone is ignored.
     """
     matches = [_STAMP.fullmatch(text.strip()) for text in stamps]
     clock, dates = np.empty(len(matches)), []

@@ -196,7 +196,9 @@ def test_a_last_step_that_predicts_worse_is_taken_back(fitted: Any) -> None:
     steps = [model_choice.Step(0, ("k1",), f.lenses, 50.0, 40.0, True, "", f) for f in fits]
     after = model_choice._without_worse_predictions(steps)
     assert [s.taken for s in after] == [True, True, True, False, False]
-    assert after[3].words == "left-out views are predicted 10.5% worse with it"
+    assert after[3].words == (
+        "not added: with it, views that the fit leaves out are predicted 10.5% worse"
+    )
 
 
 # --- simulated truth ----------------------------------------------------------------------------
@@ -213,14 +215,14 @@ def test_each_camera_gets_its_own(left: str, right: str, scene: Any) -> None:
     _, choice = choose_model(problem, start_of(made, problem), ("auto", "auto"))
     assert choice.chosen.names == (left, right), choice.words
     step = choice.steps[-1]
-    assert not step.taken and step.bic_gain < 0 and step.words.startswith("held: ")
+    assert not step.taken and step.bic_gain < 0 and step.words.startswith("held at nominal: ")
 
 
 def test_a_bilateral_tilt_is_a_stretch_and_says_so(scene: Any) -> None:
     made = made_of(scene, BILATERAL, {})
     calibration = made.calibrate("auto")
     assert calibration.model["by_camera"] == {"left": "affine", "right": "none"}
-    assert "no image can tell which" in calibration.model["words"]
+    assert "images cannot distinguish the two" in calibration.model["words"]
     size = float(np.hypot(*BILATERAL.values()))
     said = f"stretched by {100 * (np.sqrt(1 + size**2) - 1):.2g} %"
     assert said in calibration.model["words"]
@@ -253,7 +255,7 @@ def test_the_user_may_fix_it(model: Any, names: tuple[str, str], scene: Any) -> 
     expected = tuple(("scale_px_per_mm", *_parameters(name)) for name in names)
     assert calibration.free == expected
     if "auto" not in model:
-        assert calibration.model["ladder"] == [] and "as asked" in calibration.model["words"]
+        assert calibration.model["ladder"] == [] and "as given" in calibration.model["words"]
     with pytest.raises(CalibrationError, match="camera 'top'"):
         made.calibrate({"top": "brown"})
 

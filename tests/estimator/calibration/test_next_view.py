@@ -283,7 +283,7 @@ def test_enough_is_said_with_its_reason() -> None:
     assert "0.361 to 0.359" in advice(12, 0.361, 0.359).verdict()
     nowhere = NextView(8, 0.4, ())
     assert not nowhere.enough()
-    assert "no pose was found" in nowhere.words()
+    assert "no further pose was found" in nowhere.words()
 
 
 def test_one_camera_gets_no_advice(scene: Any) -> None:

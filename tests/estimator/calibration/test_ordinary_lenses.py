@@ -97,7 +97,7 @@ def test_a_smooth_error_of_the_lens_model_widens_the_standard_deviations() -> No
         found = calibrated(3000.0, 45.0, 0.0, seed, wave_px=0.15)
         widening = found.diagnostics["structure"]["widening"]
         assert 3.0 < widening < 8.0
-        assert f"{widening:.2g} times" in found.report()
+        assert f"multiplied by {widening:.2g}" in found.report()
         for camera, centre in zip(found.cameras, CENTRES):
             for name, truth in zip(("centre_u_px", "centre_v_px"), centre):
                 error = camera.intrinsics[INDEX[name]] - truth

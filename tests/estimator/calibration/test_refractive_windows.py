@@ -162,13 +162,13 @@ def test_words_on_walls_are_right(in_air: Calibration) -> None:
         return " ".join(window_notes(calibration, SimpleNamespace(walls={"left": described})))
 
     assert "wrong by less than 0.1 µm" in said(wall(0.0))
-    assert "denser medium" not in said(wall(1.0)) and "leans" not in said(wall(1.0))
+    assert "denser medium" not in said(wall(1.0)) and "off the camera" not in said(wall(1.0))
     assert "denser medium" in said(replace(wall(1.0), indices=INDICES[::-1]))
-    assert "leans 79 degrees" in said(wall(79.0))
+    assert "79 degrees off the camera's axis" in said(wall(79.0))
     assert "calibrate with the target in the water" in said(wall(0.0, sigma_deg=0.5))
     assert not window_notes(dry, SimpleNamespace(walls={}))
     wet = window_notes(replace(dry, medium="water"), SimpleNamespace(walls={}))
-    assert len(wet) == 1 and "without [walls]" in wet[0]
+    assert len(wet) == 1 and "no windows ([walls])" in wet[0]
 
 
 def test_the_errors_in_space_hold_the_walls_share(in_air: Calibration) -> None:
@@ -411,7 +411,7 @@ def test_a_wall_without_distance_says_what_that_costs(tank: Path, tmp_path: Path
     found = telerig.calibrate(load_dataset(bare), model="radial")
     (words,) = (n for n in found.notes if "has no distance_mm" in n)
     assert "[walls.left]" in words
-    shift = float(words.split("points by ")[1].split(" µm")[0])
+    shift = float(words.split("shifted by ")[1].split(" µm")[0])
     assert shift == pytest.approx(SHEAR_UM / 3, rel=0.02)
     wrong = error_mm(found, tank)
     assert np.abs(wrong).max() < 3e-3

@@ -124,7 +124,7 @@ def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:
     structure = found.diagnostics["structure"]
     assert not structure["sound"]
     assert any("the lens model lacks a term" in words for words in structure["words"])
-    assert "! calibrated from" in found.report()
+    assert "! of two calibrations" in found.report()
 
 
 def test_halves_need_views(scene: Any) -> None:
@@ -184,7 +184,7 @@ def test_each_structure_is_named() -> None:
     found = _structure(dots, region)
     assert "row" in _only(found, "region", "left")
     assert 5 < found["widening"] < 8
-    assert f"{found['widening']:.2g} times" in found["words"][-1]
+    assert f"multiplied by {found['widening']:.2g}" in found["words"][-1]
     direction = np.where(left[:, None], noise * [1.6, 1.0], noise)
     assert "along" in _only(_structure(dots, direction), "direction", "left")
     view = noise * np.where((dots.view == 4) & left, 2.0, 1.0)[:, None]

@@ -99,9 +99,9 @@ def test_views_are_solved_as_they_arrive_and_enough_ends_it(
 ) -> None:
     names = views(paper_images)
     with watching(empty, until_um=0.42) as it:
-        it.wait_for("0 complete views, 6 more to begin with")
+        it.wait_for("0 complete views; 6 more needed")
         arrive(paper_images, empty, names[0])
-        it.wait_for("1 complete view, 5 more to begin with. Next: face the plate")
+        it.wait_for("1 complete view; 5 more needed. Next: face the plate")
         arrive(paper_images, empty, names[1])
         it.wait_for("2 complete views")
         for count, name in enumerate(names[2:], 3):
@@ -111,7 +111,7 @@ def test_views_are_solved_as_they_arrive_and_enough_ends_it(
                 break
         until(lambda: not it.thread.is_alive(), "the end")
     data, run = it.result
-    assert "enough, 0.42 µm were asked for" in it.lines[-1]
+    assert "enough: 0.42 µm were asked for" in it.lines[-1]
     assert 6 <= len(data.views) < 12
     assert run.calibration.diagnostics["next_view"]["before_um"] <= 0.42
     assert len(run.detected.images) == 2 * len(data.views)
@@ -125,7 +125,7 @@ def test_what_was_watched_is_what_a_plain_calibration_finds(
     for name in views(paper_images)[:6]:
         arrive(paper_images, empty, name)
     with watching(empty, until_um=10.0) as it:
-        it.wait_for("enough, 10 µm were asked for")
+        it.wait_for("enough: 10 µm were asked for")
         until(lambda: not it.thread.is_alive(), "the end")
     assert it.lines[-1].startswith("6 complete views") and len(it.lines) == 1
     plain = telerig.calibrate(load_dataset(empty), model="radial")
@@ -255,7 +255,7 @@ def test_standing_in_words(scene: Any, paper_images: Path) -> None:
     data = load_dataset(paper_images)
     calibration = scene("paper", 1, views=7).calibrate()
     words, enough = standing(calibration, data, 7, None)
-    assert words.startswith("7 complete views") and "points are good to" in words
+    assert words.startswith("7 complete views") and "standard deviation of points in space" in words
     assert enough == calibration.diagnostics["next_view"]["enough"]
     assert standing(calibration, data, 7, 10.0)[1]
     assert not standing(calibration, data, 5, 10.0)[1]

@@ -74,7 +74,7 @@ def test_truncated_multi_page(imagej: bool, run_folder: Path) -> None:
         with pytest.raises(InputError, match=r"page 4, from 0.: is truncated"):
             run.image("left", 4)
     else:
-        error_of(run_folder, "the cameras differ in their frames", "right 6")
+        error_of(run_folder, "the cameras have different numbers of frames", "right 6")
 
 
 def test_file_that_is_no_tiff(run_folder: Path) -> None:
@@ -123,10 +123,10 @@ def test_a_number_that_both_cameras_miss_keeps_its_time(full_run: Path) -> None:
 def test_counts_that_differ_without_numbers(run_folder: Path) -> None:
     tifffile.imwrite(run_folder / "left.tif", LEFT)
     tifffile.imwrite(run_folder / "right.tif", RIGHT[:4], photometric="minisblack")
-    error_of(run_folder, "the cameras differ in their frames: left 6, right 4", "missing")
+    error_of(run_folder, "the cameras have different numbers of frames: left 6, right 4", "missing")
     run = load_run(run_folder, pair_by="order")
     assert run.frame_count == 6 and run.image("right", 4) is None
-    error_of(run_folder, "do not count the frames", pair_by="numbers")
+    error_of(run_folder, "do not contain the number", pair_by="numbers")
 
 
 def test_counters_of_their_own(run_folder: Path) -> None:

@@ -144,7 +144,7 @@ def test_tdms(tmp_path: Path) -> None:
 
 def test_units_and_channels_are_never_guessed(tmp_path: Path) -> None:
     path = write_text(tmp_path / "a.csv", ["t_s,ax,ay,az"], ",")
-    with pytest.raises(InputError, match="does not say the unit"):
+    with pytest.raises(InputError, match="does not state the unit"):
         readings(path)
     with pytest.raises(InputError, match="give one of them"):
         readings(path, unit="g", scale_m_s2=2.0)

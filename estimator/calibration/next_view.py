@@ -471,7 +471,7 @@ class ViewGain:
 
     @property
     def size_um(self) -> float:
-        """Standard deviation per axis of points, in um, that the uncertainty of the target's size
+        """Standard deviation per axis of points, in µm, that the uncertainty of the target's size
         alone causes. It scales all points by a common factor.
         """
         problem = self.problem
@@ -488,7 +488,7 @@ class ViewGain:
         return np.asarray(1e3 * np.sqrt(np.maximum(whole - less, 0) / self.points_mm.size))
 
     def after_um(self, poses: Candidates, dots: Ints) -> Array:
-        """Return the standard deviation (K,) per axis, in um, of points after each of K views.
+        """Return the standard deviation (K,) per axis, in µm, of points after each of K views.
 
         Each view is added alone. dots : indices of the dots that it shows.
         With A the whitened derivatives of the view, its pose projected out, and C the covariance,

@@ -460,8 +460,9 @@ def _check_pixels(
     rows_of(table, path).refuse(
         (frame < 0) | (frame > last),
         "frame",
-        lambda i: f"is {frame[i]}, "
-        + ("before 0" if frame[i] < 0 else f"but the last frame is {last}"),
+        lambda i: (
+            f"is {frame[i]}, " + ("before 0" if frame[i] < 0 else f"but the last frame is {last}")
+        ),
         "frames count from 0; correct the cell, or add the frame to frames.csv",
     )
 

@@ -57,9 +57,11 @@ class ClockFit:
 
     host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6), all times
     in s, and ``bend_s``, a correction at knots_s (from device_mean_s) where the rate changed.
-    sd_offset_us : scatter of the least delays in parts of the record; wander_us : their range.
-    sd_drift_ppm : from a jackknife, or from that scatter if it is larger; NaN for a drift that was
-    taken from a longer record. delay_* : above the least delay.
+    sd_offset_us : standard deviation of the least delays in parts of the record. wander_us : range
+    of these least delays.
+    sd_drift_ppm : standard deviation of the drift, by a jackknife or by the scatter of the least
+    delays, whichever is larger; NaN for a drift that was taken from a longer record.
+    delay_median_ms, delay_max_ms : delay of the readings beyond the least delay.
     """
 
     device_mean_s: float
@@ -85,10 +87,11 @@ class ClockFit:
 
 @dataclass(frozen=True)
 class ClockRecord:
-    """Hold the host times (readings,) of a device's readings, NaN for a wrong stamp.
+    """Hold the times of a device's readings on the host's clock.
 
-    segment : (readings,) index of the fit, -1 for a wrong stamp. fits : one for each uninterrupted
-    count. wraps : how often the counter wrapped. wrong : number of wrong stamps.
+    t_s : (readings,) times, NaN for a wrong time stamp. segment : (readings,) index of the fit that
+    was used, -1 for a wrong stamp. fits : one clock fit for each uninterrupted count.
+    wraps : how often the counter wrapped. wrong : number of wrong stamps.
     """
 
     t_s: Array
@@ -123,10 +126,12 @@ def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockReco
 
 
 def stamp_rate(host_s: Array, device_s: Array) -> float | None:
-    """Return how many of its stamps' seconds a device counts in a second; None for too few
-    readings.
+    """Return how many seconds of a device's time stamps pass in one second of the host's time.
 
-    It is the rate of most readings: wraps, restarts, lost readings and wrong stamps do not matter.
+    It is the rate of the majority of readings, so that wraps, restarts, lost readings and wrong
+    stamps do not matter. Returns None if there are too few readings.
+
+    host_s, device_s : (readings,) times of arrival and stamps.
     """
     lag = 1
     while 2 * lag + _RATE_READINGS <= len(host_s):
@@ -140,7 +145,10 @@ def stamp_rate(host_s: Array, device_s: Array) -> float | None:
 
 
 def check_unit(host_s: Array, stamps: Array, device: DeviceDescription) -> None:
-    """Raise InputError when a device's stamps (readings,) count in another unit than is stated."""
+    """Raise InputError if a device's time stamps count in another unit than rig.toml states.
+
+    host_s, stamps : (readings,) times of arrival in s, and the stamps as they were sent.
+    """
     rate = stamp_rate(host_s, stamps * device.time_unit_s)
     if rate is None or 1 - _WRONG_UNIT < rate < 1 / (1 - _WRONG_UNIT):
         return
@@ -158,7 +166,10 @@ def check_unit(host_s: Array, stamps: Array, device: DeviceDescription) -> None:
 
 
 def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
-    """Return the device's times (readings,) in s without wraps, as many as the host time says."""
+    """Return the device's times (readings,) in s with all wraps of its counter undone.
+
+    The number of wraps between two readings follows from the host's times.
+    """
     if not wrap_s or not len(device_s):
         return np.array(device_s)
     ahead = device_s - host_s
@@ -167,10 +178,10 @@ def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
 
 
 def lower_line(x: Array, y: Array, at: float | None = None) -> tuple[float, float]:
-    """Return y at ``at`` (by default the mean of x) and slope of the line below all points, highest
-    there.
+    """Return the line that lies below all points and is highest at ``at``: its y there, its slope.
 
-    At the mean it is the line with the least sum of distances. x (points,) must increase.
+    x, y : (points,); x must increase. at : None takes the mean of x; the line is then the one with
+    the least sum of distances to the points.
     """
     hull = _lower_hull(x, y)
     middle = float(np.mean(x)) if at is None else at
@@ -233,7 +244,11 @@ def _in_order(u: Array, part: Ints) -> Bools:
 
 
 def fit_counts(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, ...]:
-    """Fit each uninterrupted count of a clock; short ones take the drift of the longest."""
+    """Fit each uninterrupted count of a clock; short counts take the drift of the longest one.
+
+    host_s, device_s : (readings,) in s. number : (readings,) number of the count to which each
+    reading belongs.
+    """
     edges = np.searchsorted(number, np.arange(int(number[-1]) + 2))
     parts = [slice(begin, end) for begin, end in pairwise(edges.tolist())]
     spans = [float(np.ptp(device_s[p])) for p in parts]
@@ -248,7 +263,10 @@ def fit_counts(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, 
 
 
 def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) -> ClockFit:
-    """Fit the line below all stamps of one count, for times in s; None estimates the drift."""
+    """Fit the clock of one uninterrupted count: the line below all arrivals.
+
+    host_s, device_s : (readings,) in s. drift_ppm : known drift of the clock; None estimates it.
+    """
     x_mean, y_mean = float(np.mean(device_s)), float(np.mean(host_s))
     x, late = device_s - x_mean, (host_s - y_mean) - (device_s - x_mean)
     edge, least = _least_delays(x, late)

@@ -29,15 +29,18 @@ _REACH = 5
 _BLOCK = 32
 _QUANTILE = 0.8
 _MOTION = 3
-"""So many far readings in a row are motion: damage affects lines one by one."""
+"""This many far readings in a row count as true motion, because damage affects single lines."""
 _AROUND = 16
 """Garbage is looked for in so many readings' lengths on each side."""
 
 
 def amid_garbage(spans: Ints, garbage: Ints) -> Bools:
-    """Return (N,) True for a reading around which more than half of the bytes are garbage.
+    """Return (N,) which readings are unreliable, because most bytes around them are no readings.
 
-    spans, garbage : (N, 2) and (M, 2) first byte and number of bytes, in increasing order.
+    A reading is True if more than half of the bytes around it belong to no reading.
+
+    spans : (N, 2) first byte and number of bytes of each reading. garbage : (M, 2) the same of each
+    stretch of bytes that is no reading. Both are in increasing order.
     """
     if not len(spans) or not len(garbage):
         return np.zeros(len(spans), bool)
@@ -72,13 +75,15 @@ def mostly_garbage(device: DeviceDescription, found: Readings) -> InputError | N
 
 
 def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) -> Bools:
-    """Return (N,) True for a reading with a value that is far from what its neighbours predict.
+    """Return (N,) which readings have a value that is far from what their neighbours predict.
 
-    t_s : (N,) increasing times in s. values : (N,) each. most : the largest second derivative in
-    time that the values can have, by which a value may differ.
-    A value is far if it is off a quartic through its neighbours by more than `_FAR_RESIDUALS` times
-    their largest residual and the resolution. Readings that are found are left out and the others
-    tested again, because wrong readings near each other hide each other.
+    t_s : (N,) increasing times in s. values : one or more arrays (N,) of values. most : the largest
+    second derivative in time that the values can have; a value may differ by its effect.
+
+    A value is far if it deviates from a quartic through its neighbours by more than
+    `_FAR_RESIDUALS` times the largest residual of the neighbours and the resolution. The readings
+    that are found are left out and the others are tested again, because wrong readings near each
+    other hide each other.
     """
     far = _beyond_reach(t_s, values, most)
     for _ in range(_PASSES):

@@ -41,7 +41,11 @@ RECEIVED, SENT, LOST, FOUND, END = 1, 2, 3, 4, 5
 
 @dataclass(frozen=True)
 class Entry:
-    """Hold one entry of the raw log: kind, index of the device in the header, time, bytes."""
+    """Hold one entry of the raw log.
+
+    kind : see the kinds above. device : index of the device in the header. time_ns : the host's
+    monotonic time. data : the bytes.
+    """
 
     kind: int
     device: int
@@ -165,7 +169,10 @@ def packed(entry: Entry) -> bytes:
 
 
 def log_error(path: Path, error: OSError, *, recorded: bool = True) -> InputError:
-    """Return the error for a log that cannot be written, after a part was written or before."""
+    """Return the error for a log that cannot be written.
+
+    recorded : whether a part of the recording has been written already.
+    """
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return InputError(
             "the disk is full: " + ("the recording ends here" if recorded else "nothing recorded"),
@@ -252,9 +259,10 @@ def damaged_bytes(path: Path) -> int:
 
 
 def received_bytes(path: Path, scan: LogScan, spans: Sequence[Ints]) -> list[list[bytes]]:
-    """Read the lines of each device that lie at ``spans`` (N, 2): first byte and number of bytes.
+    """Read some lines of each device from a raw log.
 
-    Bytes are counted over all that were received from the device; spans increase.
+    spans : for each device (N, 2), the first byte and the number of bytes of each line, in
+    increasing order. Bytes are counted over all bytes that were received from the device.
     """
     found: list[list[bytes]] = [[] for _ in spans]
     waiting = [[tuple(span) for span in np.asarray(s).tolist()][::-1] for s in spans]

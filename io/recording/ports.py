@@ -42,7 +42,10 @@ def known_ports() -> list[str]:
 
 
 def open_port(device: DeviceDescription) -> Any:
-    """Open a device's serial port (pyserial) and empty its buffer; InputError if that fails."""
+    """Open a device's serial port with pyserial, and empty its buffer.
+
+    Returns the open port. Raises InputError if it cannot be opened.
+    """
     import serial
 
     place = f"devices.{device.name} port {device.port:.200}"
@@ -62,7 +65,10 @@ def open_port(device: DeviceDescription) -> Any:
 
 
 def read_chunk(port: Any) -> tuple[int, bytes]:
-    """Wait for the first byte, and return the host's time in ns and all bytes there were then."""
+    """Wait for the next byte of a port, and return its time of arrival and all bytes in the buffer.
+
+    The time is the host's monotonic time in ns.
+    """
     first = port.read(1)
     if not first:
         return time.monotonic_ns(), b""

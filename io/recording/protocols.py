@@ -39,12 +39,15 @@ PACKETS: dict[Kind, list[tuple[str, str]]] = {
 
 @dataclass(frozen=True)
 class Readings:
-    """Hold the readings of some bytes of a line, and the bytes that are no reading.
+    """Hold the N readings in some bytes of a serial line, and the bytes that are no reading.
 
-    arrived_ns : (N,) the host's time of each reading's last byte. values : (N,) numbers by group.
-    spans : (N, 2) place of each reading in all bytes of the line: first byte, number of bytes.
-    malformed, malformed_spans : (M,), (M, 2) arrival in ns and place of each line or run of bytes
-    that is no reading. garbage : (M,) False for text that a device may send between its readings.
+    arrived_ns : (N,) the host's time at which the last byte of each reading arrived.
+    values : the numbers (N,) of the readings, by the name of the quantity.
+    spans : (N, 2) first byte and number of bytes of each reading, counted over all bytes of the
+    line.
+    malformed, malformed_spans : (M,), (M, 2) time of arrival in ns, and first byte and number of
+    bytes, of each stretch of bytes that is no reading. garbage : (M,) False for text that the
+    device may send between its readings.
     samples : the first malformed bytes, for messages.
     """
 
@@ -79,10 +82,16 @@ class Parser(Interface):
     """Keeps an incomplete reading until the rest of it arrives."""
 
     def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
-        """Return the readings whose last byte is in these (arrival_ns, bytes)."""
+        """Take the next bytes of the line, and return the readings that end in them.
+
+        chunks : (time of arrival in ns, bytes) of each piece.
+        """
 
     def cut(self) -> int:
-        """Drop the incomplete reading, as at the start of a connection; number of bytes dropped."""
+        """Drop the incomplete reading, as is necessary at the start of a connection.
+
+        Returns the number of bytes that were dropped.
+        """
 
 
 def parser(device: DeviceDescription) -> Parser:
@@ -144,7 +153,7 @@ class _Joined:
 
 
 class LineParser(_Joined):
-    """Lines that end in LF or CR LF, each of which must match an expression as a whole."""
+    """Parser of lines that end in LF or CR LF; each line must match a regular expression."""
 
     def __init__(self, device: DeviceDescription) -> None:
         super().__init__()
@@ -223,7 +232,10 @@ def _number(cell: bytes | None) -> float:
 
 
 class PacketParser(_Joined):
-    """Binary packets: `SYNC`, fields, sum of bytes; found again after any malformed bytes."""
+    """Parser of binary packets, which consist of `SYNC`, the fields, and the sum of all bytes.
+
+    After malformed bytes it continues at the next packet.
+    """
 
     def __init__(self, fields: list[tuple[str, str]]) -> None:
         super().__init__()

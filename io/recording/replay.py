@@ -46,10 +46,11 @@ _ACCELERATION_MM_S2 = 5000.0
 
 @dataclass(frozen=True)
 class Refused:
-    """Hold the R lines of a device that are in no table.
+    """Hold the R lines of a device that were refused, so that they are in no table.
 
-    spans : (R, 2) first byte and number of bytes, counted over all bytes of the device. t_s : (R,)
-    time in s, NaN where it is not known. reason : (R,) why each was refused.
+    spans : (R, 2) first byte and number of bytes, counted over all bytes of the device.
+    t_s : (R,) time in s, NaN if it is not known. arrived_s : (R,) time of arrival.
+    reason : (R,) why each line was refused. lines : the bytes of each line.
     """
 
     spans: Ints
@@ -63,12 +64,18 @@ class Refused:
 class DeviceRecord:
     """Hold the readings of one device, in the order of time.
 
-    t_s : (N,) since the beginning of the recording, strictly increasing. arrived_s : (N,) when the
-    host received it. values : (N,) each, as sent. malformed_s : arrival of what could not be read.
-    away_s : (lost, found) of each unplug; found is NaN if it never came back. faults : number of
-    readings left out, by the reason. half_width_s : half the time from question to answer.
-    time_sd_s : standard deviation of the times, apart from the least delay of the line; None where
-    the clock fits state it. error : why the readings cannot be used as described, or None.
+    t_s : (N,) times since the beginning of the recording, strictly increasing. arrived_s : (N,)
+    when the host received each reading. values : arrays (N,) by the name of the quantity, as sent.
+    malformed_s : times of arrival of bytes that are no reading. malformed_bytes : their number.
+    samples : some of them. partial_bytes : number of bytes of incomplete readings.
+    away_s : for each time that the device was unplugged, when it was lost and when it was found
+    again (NaN for never).
+    clocks : the fits of the device's clock. wraps : how often its counter wrapped.
+    faults : number of readings that were left out, by the reason. refused : these readings.
+    time_from : what the times are derived from.
+    half_width_s : for a polled device, half the time between question and answer.
+    time_sd_s : standard deviation of the times, without the unknown least delay of the line; None
+    if the clock fits state it. error : why the readings cannot be used as described, or None.
     """
 
     device: DeviceDescription
@@ -92,8 +99,10 @@ class DeviceRecord:
 
 @dataclass(frozen=True)
 class Replay:
-    """end_s : time of the last entry. ended : whether the recording was closed, not cut off.
+    """The content of a raw log.
 
+    records : the readings of each device. end_s : time of the last entry. ended : whether the
+    recording was ended properly; False if it was cut off.
     damaged_bytes : number of bytes of the log that belong to no undamaged entry of this recording.
     """
 
@@ -153,10 +162,13 @@ class _Line:
 
 
 def replay(path: Path, devices: Mapping[str, DeviceDescription] | None = None) -> Replay:
-    """Return the readings of a raw log; the same log gives the same numbers, to the last bit.
+    """Read a raw log and return the readings of all devices.
 
-    devices : descriptions by name that replace those in the log. What is wrong with one device is
-    stated in its record. Raises InputError for a file that is no log.
+    The same log always gives exactly the same numbers. A fault of one device is stated in its
+    record and does not affect the others.
+
+    devices : descriptions by name that replace those in the log. Raises InputError for a file that
+    is no log.
     """
     scan = scan_log(path)
     named = devices or {}

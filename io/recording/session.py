@@ -36,7 +36,10 @@ GARBAGE_S = 2.0
 
 
 def log_in(folder: Path) -> Path:
-    """Return the log of a recording's folder: that of a refused recording if there is no other."""
+    """Return the log in a recording's folder.
+
+    It is recording.raw, or the log of a refused recording if there is no recording.raw.
+    """
     log, failed = folder / LOG_NAME, folder / FAILED_NAME
     return failed if failed.is_file() and not log.is_file() else log
 
@@ -47,7 +50,12 @@ class GarbageError(InputError):
 
 @dataclass
 class DeviceStatus:
-    """The status of a device for the screen: counts, and what its stamps say is missing."""
+    """The status of a device for the screen.
+
+    readings, byte_count, malformed, unplugged : numbers so far; rate_hz : readings per second.
+    lost, gaps : number of missing readings, and of gaps, as the device's time stamps show.
+    sample : malformed bytes, for messages.
+    """
 
     name: str
     connected: bool = True

@@ -36,7 +36,11 @@ REFUSED_NAME = "refused.csv"
 
 @dataclass(frozen=True)
 class Recording:
-    """The tables of a log: the content of recording.json, rows by table, and errors by device."""
+    """What `write_tables` has written.
+
+    summary : the content of recording.json. rows : number of rows of each table. errors : for each
+    device with a fault, the error.
+    """
 
     folder: Path
     summary: dict[str, Any]
@@ -51,9 +55,10 @@ def write_tables(
 ) -> Recording:
     """Write the tables of the log's devices into ``folder``, by default that of the log.
 
-    devices : as in `replay`. Sensors in `accelerometer.csv` that were imported stay in it. What is
-    wrong with one device is in recording.json and in `Recording.errors`; all that can be had is
-    written. Raises InputError for a file that is no log, or a folder that cannot be written.
+    devices : as in `replay`. Sensors that were imported into `accelerometer.csv` stay there. If a
+    device has a fault, it is stated in recording.json and in `Recording.errors`, and all other
+    readings are written.
+    Raises InputError for a file that is no log, or a folder that cannot be written.
     """
     path = Path(log)
     out = Path(folder) if folder is not None else path.parent
@@ -111,7 +116,7 @@ def write_tables(
 
 
 def refuse_existing(folder: str | PathLike[str]) -> None:
-    """Raise InputError where ``folder`` holds a table that a recording would replace."""
+    """Raise InputError if ``folder`` holds a table that a recording would replace."""
     for name in (*_TABLES.values(), REFUSED_NAME, "recording.json"):
         file = Path(folder) / name
         if file.exists():
@@ -230,7 +235,7 @@ def _device_summary(record: DeviceRecord, error: InputError | None) -> dict[str,
 
 
 def gaps_of(record: DeviceRecord) -> Iterator[dict[str, Any]]:
-    """Return where readings are missing: from_s, to_s, the number lost, and the reason."""
+    """Yield for each gap in the readings from_s, to_s, the number of lost readings, the reason."""
     step = np.diff(record.t_s)
     if record.device.kind == "frames" or step.size < 8:
         return
@@ -256,9 +261,11 @@ def _rate_hz(t_s: Array) -> float | None:
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """t_s : (F,) of the frames from 0. missing : names of the cameras without it, joined by `|`.
+    """The times of F frames.
 
-    interpolated : (F,) no line reported the frame; its time is interpolated.
+    t_s : (F,) times in s. missing : for each frame the names of the cameras that have no image of
+    it, joined by `|`. interpolated : (F,) whether no line reported the frame, so that its time is
+    interpolated.
     """
 
     t_s: Array
@@ -267,10 +274,10 @@ class FrameTimes:
 
 
 def frame_times(records: list[DeviceRecord]) -> FrameTimes:
-    """Return all frames that the lines report, the first being 0.
+    """Return the times of all frames that the devices reported; the first frame is 0.
 
-    A frame that a counter skips is missing from its cameras, if its line was undamaged meanwhile;
-    otherwise only its time is interpolated.
+    If a counter skips a frame and its line was undamaged at that time, the cameras of this counter
+    miss the frame. If the line was damaged, only the time of the frame is interpolated.
     """
     records = [r for r in records if len(r.t_s)]
     if not records:
@@ -305,10 +312,11 @@ def frame_times(records: list[DeviceRecord]) -> FrameTimes:
 
 
 def frame_numbers(t_s: Array, counter: Array | None) -> Ints:
-    """Return the frame (N,) of each reading from 0; by the times where the counter is wrong.
+    """Return the number (N,), from 0, of the frame that each reading reports.
 
-    A counter may fall behind the time (a pause of the camera), but not run ahead by more than a
-    tenth, nor go back.
+    t_s : (N,) times. counter : (N,) the counter in the readings; None if there is none. Where the
+    counter is wrong, the number follows from the times. A counter may fall behind the time (the
+    camera paused), but it must not run ahead by more than a tenth, or go back.
     """
     if len(t_s) < 2:
         return np.zeros(len(t_s), np.int64)

@@ -34,10 +34,11 @@ _SEGMENT = 20
 
 @dataclass(frozen=True)
 class Spread:
-    """Hold the times (N,) of readings without stamps, strictly increasing, and their sd in s.
+    """Hold the times of N readings of a device that sends no time stamps.
 
-    regular : whether the device samples regularly; if not, the readings are spread evenly over the
-    time since the arrival before.
+    t_s : (N,) times in s, strictly increasing. sd_s : standard deviation of the times.
+    regular : whether the device samples regularly; if not, the readings of one arrival are spread
+    evenly over the time since the previous arrival.
     """
 
     t_s: Array
@@ -46,9 +47,10 @@ class Spread:
 
 
 def spread_arrivals(arrived_s: Array, slot: Ints) -> Spread:
-    """Compute when readings were made that arrive in bunches at arrived_s (N,).
+    """Estimate when readings were made that arrive several at a time.
 
-    slot : (N,) number of the line of each, increasing; malformed lines are counted, too.
+    arrived_s : (N,) times of arrival. slot : (N,) number of the line of each reading, increasing;
+    malformed lines are counted, too.
     """
     regular, even = _by_regular_clock(arrived_s, slot), _evenly(arrived_s)
     return regular if regular is not None and regular.sd_s < even.sd_s else even

@@ -286,7 +286,11 @@ class Structure(Part):
 
 
 class NextPose(Part):
-    """Check one proposed pose of the target; after_um : the error that it leaves, in µm."""
+    """Check one proposed pose of the target.
+
+    after_um : standard deviation per axis of points, in µm, if a view in this pose were added.
+    words, reasons : how to hold the target, and what the view adds.
+    """
 
     words: str
     reasons: tuple[str, ...] = ()

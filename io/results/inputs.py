@@ -20,11 +20,12 @@ _PARTS, _PART_BYTES = 16, 256
 class Input(Part):
     """Hold the fingerprint of one input.
 
-    sha256 : the hash of the file; None where there was no such file.
-    tables : the tables of a TOML file of which ``sha256`` is the hash; empty for the whole file.
-    cameras : for a folder of images, the cameras whose images count; ``files`` and ``bytes`` are
-    their number and their size, ``sampled`` is a hash of parts of their content, which results of
-    older versions do not have.
+    sha256 : the hash of the file; None if there was no such file.
+    tables : if only some tables of a TOML file count, their names; ``sha256`` is the hash of these
+    tables alone. Empty for a whole file.
+    cameras : for a folder of images, the cameras whose images count. files, bytes : number and
+    total size of these images. sampled : hash of parts of their content; None in results of older
+    versions.
     """
 
     sha256: str | None = None
@@ -35,9 +36,10 @@ class Input(Part):
     sampled: str | None = None
 
     def change(self, path: Path) -> str:
-        """Return how ``path`` differs from the fingerprint, in words; "" where it does not.
+        """Return in words how ``path`` differs from the fingerprint; "" if it does not differ.
 
-        An input that is no longer there is no change: a results folder may be copied alone.
+        An input that no longer exists does not count as changed, because a results folder may be
+        copied without its inputs.
         """
         if not path.exists():
             return ""

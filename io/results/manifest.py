@@ -49,7 +49,10 @@ _NO_MANIFEST = (
 
 
 class Written(Part):
-    """Hold the fingerprint of one written file; ``rows`` of a CSV table is without its header."""
+    """Hold the fingerprint of one written file.
+
+    rows : number of rows of a CSV table, without its header; None for other files.
+    """
 
     sha256: str
     bytes: int
@@ -144,7 +147,10 @@ class Manifest(Record):
         return cls(schema=cls.SCHEMA, kind=cls.KIND, sections=dict(sections))
 
     def settled(self, folder: Path) -> Manifest:
-        """Return the manifest with `Section.settled` of every section whose files are whole."""
+        """Return the manifest in which every section describes the files that are in ``folder``.
+
+        A section whose files are a mixture of two results stays as it is. See `Section.settled`.
+        """
         sections = {}
         for name, section in self.sections.items():
             try:

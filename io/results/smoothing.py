@@ -34,7 +34,7 @@ class Verdict(StrEnum):
 
 
 class Flag(StrEnum):
-    """Name the conditions that qualify a verdict."""
+    """Name a condition under which a verdict has to be read with care."""
 
     LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
@@ -79,7 +79,11 @@ class Grade(StrEnum):
 
 
 class Place(StrEnum):
-    """Name what a vibration moves. A line that one camera alone sees may be an arm's or common."""
+    """Name the part of the rig that a vibration moves.
+
+    If only one camera sees the axis of a vibration, it is not known whether the camera's arm or the
+    whole rig vibrates.
+    """
 
     COMMON = "common"
     ARM = "arm"
@@ -92,9 +96,9 @@ class AttributedLine(Part):
 
     owner : to whom the line is attributed. frequency_hz : its frequency in Hz.
     rms_mm : RMS of its displacement in mm; None where it is not known.
-    other_owner_costs_nats : log-likelihood ratio against the other owner; None where it was not
-    computed.
-    ambiguous : whether the data cannot decide between the two owners.
+    other_owner_costs_nats : log-likelihood ratio of this attribution to the other one; None where
+    it was not computed.
+    ambiguous : whether the data cannot decide whose motion it is.
     """
 
     owner: str = ""
@@ -132,10 +136,9 @@ class Contradiction(Part):
     source : "bubbles", "marks", "encoder", or the name of an accelerometer.
     axis : axis of the rig or of the sensor; "" for all.
     from_s, to_s : the first and the last time at which they disagree.
-    statistic : the test's value divided by the one that is expected, as a factor of standard
-        deviations.
-    test : the test that showed it; None in files of other programs.
-    against : the sources with which it disagrees; () if that was not found out.
+    statistic : how many times larger than expected the disagreement is, in standard deviations.
+    test : the test that showed the disagreement; None in files of other programs.
+    against : the sources with which this one disagrees; () if they are not known.
     """
 
     source: str
@@ -150,13 +153,13 @@ class Contradiction(Part):
 class Use(Part):
     """Hold how well a run determines one quantity of the bubbles.
 
-    axis : axis of the rig.  value : the median over the bubbles; None if there is none.
-    sd : standard deviation of the quantity of a typical bubble; None if it is not known.
-    unit : unit of both.
-    below_hz : the frequency up to which ``sd`` counts, for a path, or up to which an acceleration
-        is followed; None for other quantities.
-    assumes : records whose sign, unit or scale nothing in the run confirms, and on which the value
-        rests.
+    axis : axis of the rig. value : the median over the bubbles; None if there is none.
+    sd : standard deviation of the quantity for a typical bubble; None if it is not known.
+    unit : unit of value and sd.
+    below_hz : for a path, the frequency up to which ``sd`` holds; for an acceleration, the
+        frequency up to which it is followed; None for other quantities.
+    assumes : records on which the value depends, and whose sign, unit or scale nothing in the run
+        confirms.
     """
 
     quantity: Quantity
@@ -205,7 +208,8 @@ class PixelResiduals(Part):
 class SmoothingFile(Record):
     """Hold the content of smoothing.json, the result of smoothing a run.
 
-    verdict, flags, axes : the verdict of the run, what qualifies it, and the verdict by axis.
+    verdict, flags, axes : the verdict on the run, conditions under which it has to be read with
+        care (`Flag`), and the verdict by axis.
     contradictions : the sources that disagree, the worst first.
     inflation : factor by axis by which the standard deviations in the tables have been multiplied
         because of contradictions; () without.
@@ -219,13 +223,15 @@ class SmoothingFile(Record):
     fluid : the keys of [fluid] in rig.toml; empty without one. bodies : how far the bubbles of the
     run are from spheroids, and their outlines from ellipses. swarm : numbers per volume of liquid.
     depth_axes : by camera, unit vector (3,) in rig axes along which that camera cannot measure.
-    learning : from which part of a long run the modes were learned, and how they hold elsewhere.
+    learning : from which part of a long run the modes were learned, and how well they fit the other
+        parts.
     seconds : wall time by phase.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
     acceleration_bandwidth_hz : by axis, the frequency up to which accelerations are followed by at
         least half; {} without accelerations.
-    inertia_s, force_intensity : time of the low-pass through which forces move a bubble, and the
-        forces' intensity by axis, over that of the model; None and {} without accelerations.
+    inertia_s, force_intensity : time constant of the low-pass filter through which forces move a
+        bubble, and the intensity of the forces by axis, divided by that in the model; None and {}
+        without accelerations.
     """
 
     MISSING: ClassVar[str] = "this run is not smoothed"

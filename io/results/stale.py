@@ -16,9 +16,9 @@ _LONGEST_NAME = 80
 
 
 def stale(folder: Path, names: Collection[str] | None = None) -> tuple[str, ...]:
-    """Return one sentence for each stale result from which the files ``names`` follow.
+    """Return one sentence for each stale result on which files of a results folder depend.
 
-    folder : a results folder. names : files in it; None for all.
+    folder : a results folder. names : the files in it that count; None for all.
     A result is stale when a recorded input of it has changed, or was itself made from inputs that
     have changed since. The sentences are in the order in which the commands have to run again. A
     folder without a manifest has none.

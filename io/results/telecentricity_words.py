@@ -13,9 +13,10 @@ degrees."""
 
 
 def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each kind of lens.
+    """Return sentences on how far each camera is telecentric.
 
-    statistics : those of `calibration.json`; files of earlier versions have no "telecentricity".
+    statistics : `statistics` of `calibration.json`; files of earlier versions have no entry
+    "telecentricity", and give no sentences.
     """
     of: Mapping[str, Mapping[str, float]] = statistics.get("telecentricity") or {}
     ordinary = [name for name, lens in of.items() if lens["perspective"] > ORDINARY]

@@ -18,9 +18,10 @@ PIXEL = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 
 
 class WorstFrame(Part):
-    """Hold a frame that a person should inspect first, its score, and the reason in words.
+    """Hold a frame that a person should inspect, because its tracking is doubtful.
 
-    score : None where the file does not state one.
+    score : how doubtful the frame is; None if the file does not state it. why : the reason in
+    words.
     """
 
     frame: int
@@ -29,14 +30,15 @@ class WorstFrame(Part):
 
 
 class Pairs(Part):
-    """Hold what the pairs of detections tell about bias and scatter of the ray miss.
+    """Hold the statistics of the ray misses of all pairs of detections.
 
     The numbers are in px; None where they were not computed.
     bias_px : the systematic part of the ray miss: a constant, or the coefficients of a polynomial
     in the position whose first one is the constant.
-    rms_px : RMS of the ray misses as they are, after the constant, after the whole systematic part,
-    and with each pair left out of its own systematic part.
-    scatter_px : scatter of single pairs beyond the noise of their detections.
+    rms_px : four RMS values of the ray misses: as they are; minus the constant; minus the whole
+    systematic part; and minus the systematic part that all other pairs give.
+    scatter_px : standard deviation of the scatter of single pairs beyond the noise of their
+    detections.
     frame_px : RMS of the shift that all pairs of a frame share, for example because of shake.
     calibration_problem : whether the ray misses indicate a wrong calibration.
     words : sentences for the user.
@@ -66,7 +68,7 @@ class RigChange(Part):
 class TrackingFile(Record):
     """Hold the content of tracking.json, the result of tracking a run.
 
-    frames, detections, points, tracks : how many the run has; None where they were not counted.
+    frames, detections, points, tracks : their numbers; None where they were not counted.
     events : number of events of each kind. pairs : statistics of the ray miss, or None.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
     up : (3,) unit vector against gravity in the rig frame; None where it is not known.
@@ -113,9 +115,10 @@ EXTRAPOLATED = "extrapolated"
 
 
 def share_words(sd_mm: Sequence[float] | Array | None, extrapolated: float | None) -> list[str]:
-    """Return sentences on the calibration's share of the errors, and on what lies beyond its dots.
+    """Return sentences on the errors that the calibration causes, and on extrapolated positions.
 
-    sd_mm : (3,) as in `TrackingFile.calibration_sd_mm`. extrapolated : share of the positions.
+    sd_mm : (3,) as in `TrackingFile.calibration_sd_mm`. extrapolated : share of the positions that
+    lie beyond the dots of the calibration. None if they are not known.
     """
     words = []
     if sd_mm is not None:

@@ -24,10 +24,10 @@ class Stillness(StrEnum):
 
 
 class Rest(StrEnum):
-    """Name what a smoothing could use beside the withheld mark.
+    """Name the measurements that a smoothing could use in addition to the withheld mark.
 
-    MARKS : the other marks, and all sensors.  SENSORS : only encoder and accelerometers, as in a
-    run without marks.
+    MARKS : the other marks and all sensors. SENSORS : only encoder and accelerometers, as in a run
+    without marks.
     """
 
     MARKS = "other marks"
@@ -35,16 +35,16 @@ class Rest(StrEnum):
 
 
 class Errors(Part):
-    """Hold how far marks do not stand still.
+    """Hold the errors of marks that were smoothed as bubbles; a true mark stands still.
 
-    beside : what else the smoothing could use.
-    error_um, sd_um : RMS of the position about its mean per axis, and the stated standard
+    beside : which other measurements the smoothing could use.
+    error_um, sd_um : RMS per axis of the position about its mean, and its stated standard
         deviation.
-    velocity_error_mm_s, velocity_sd_mm_s : RMS of the velocity, which should be 0, and the stated
+    velocity_error_mm_s, velocity_sd_mm_s : RMS of the velocity, which should be 0, and its stated
         standard deviation.
-    nees, velocity_nees : squared errors over their stated variances.
-    unsmoothed_um : RMS of the pixels' places about their mean, with the encoder's travel added, in
-        place of ``error_um`` without smoothing.
+    nees, velocity_nees : mean squared errors divided by their stated variances; 1 is expected.
+    unsmoothed_um : RMS of the positions about their mean without smoothing: positions that follow
+        from the pixels, with the encoder's travel added.
     """
 
     beside: Rest
@@ -60,12 +60,12 @@ class Errors(Part):
 class WithheldMark(Errors):
     """Hold the result for one mark that was smoothed as a bubble.
 
-    cameras : the cameras whose pixels were used. Of one camera, only the two axes of its image
-        count.
-    frames : from the mark's first to its last frame.
+    cameras : the cameras whose pixels were used. If it is one camera, only the two axes of its
+        image count.
+    frames : number of frames from the mark's first to its last one.
     smoothing : the verdict of the smoothing.
-    t_s, off_um, sd_um_of_time : the distance from the mean along each axis and its standard
-        deviation over time, in at most some hundred frames.
+    t_s, off_um, sd_um_of_time : for at most some hundred frames their times, the position along
+        each axis minus its mean, and the standard deviation of this difference.
     """
 
     mark: str
@@ -115,7 +115,10 @@ class ValidationFile(Record):
 
 
 def overall(marks: Sequence[WithheldMark], beside: Rest) -> Overall:
-    """Return the numbers of all marks that were smoothed beside the same."""
+    """Return the errors of all marks together, for smoothings with the same other measurements.
+
+    beside : the measurements that the smoothings could use.
+    """
     mine = [mark for mark in marks if mark.beside is beside]
     weights = np.array([mark.frames for mark in mine], float)
 

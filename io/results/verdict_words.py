@@ -100,7 +100,11 @@ _WEAK_DAMPING, _SLOW_HZ = 0.02, 5.0
 
 
 def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
-    """Return the verdict along one axis as sentences; the stored ones if a number is missing."""
+    """Return the verdict along one axis as sentences.
+
+    If a number is missing, as in files of older versions, the stored sentences are returned.
+    name : of the axis. vertical : whether the axis is the one nearest to the vertical.
+    """
     sd, sd_known, rms = axis.sigma_mm, axis.sigma_shake_known_mm, axis.shake_rms_mm
     if axis.verdict is None or axis.q is None or sd is None or sd_known is None or rms is None:
         return axis.words
@@ -149,7 +153,7 @@ def contradiction_words(found: Sequence[Contradiction]) -> str:
 
 
 def consequence_words(file: SmoothingFile) -> str:
-    """Return what the verdict means for the bands, true for the numbers of this run."""
+    """Return what the verdict of this run means for the uncertainty bands in the plots."""
     if file.verdict is None:
         return NOT_JUDGED.consequence
     text = VERDICT_WORDS[file.verdict].consequence
@@ -226,7 +230,10 @@ def remedy_words(remedies: Sequence[Remedy]) -> str:
 
 
 def to_resolve(remedy: str) -> str:
-    """Return the sentence with a remedy; one that always helps if ``remedy`` is empty."""
+    """Return the sentence "To resolve it, ..." with a remedy.
+
+    If ``remedy`` is empty, it is one that always helps: a strip of dots or accelerometers.
+    """
     return f"To resolve it, {remedy or remedy_words((Remedy.STRIP, Remedy.ARMS))}."
 
 

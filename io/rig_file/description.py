@@ -43,7 +43,9 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 class Table:
-    """No text for numbers, no NaN. A field's description completes "must be"."""
+    """A table of rig.toml. Numbers must not be written as text, and must not be NaN.
+
+    The description of each field completes the sentence "... must be" in an error."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -67,9 +69,10 @@ class CameraDescription(Table):
 class StageDescription(Table):
     """What rig.toml states about the stage.
 
-    axis : (3,) nominal direction of travel; up : (3,) direction against gravity; unit vectors in
-    the rig frame. position_sigma_mm : standard deviation of an encoder reading. scale_sigma : that
-    of the encoder's relative scale error; None when the file does not state it.
+    axis : (3,) nominal direction of travel. up : (3,) direction against gravity. Both are unit
+    vectors in the rig frame.
+    position_sigma_mm : standard deviation of an encoder reading. scale_sigma : standard deviation
+    of the encoder's relative scale error; None if the file does not state it.
     """
 
     axis: Direction
@@ -93,10 +96,12 @@ class StageDescription(Table):
 class AccelerometerDescription(Table):
     """What rig.toml states about one accelerometer.
 
-    axes : (3, 3) whose rows are the sensor's axes as unit vectors in the rig frame. bias_sigma_m_s2
-    : prior standard deviation of the bias of each axis. range_m_s2 : reading at which it is
-    clipped. clock : "frames" if its times are those of the frames' clock, "unknown" if only the
-    images can show its offset.
+    mounted_on : name of the camera whose arm carries the sensor, or "carriage".
+    axes : (3, 3) whose rows are the sensor's axes as unit vectors in the rig frame.
+    bias_sigma_m_s2 : prior standard deviation of the bias of each axis.
+    range_m_s2 : reading at which the sensor is clipped; None if it is not stated.
+    clock : "frames" if its times come from the clock of the frames, "unknown" if the offset of its
+    clock has to be found from the images.
     """
 
     name: str
@@ -196,14 +201,19 @@ class DeviceDescription(Table):
 
     kind : what it measures; an accelerometer is named as in `[accelerometers.<name>]`.
     port : a device file, a port name or a pyserial URL. baud : ignored by USB-native devices.
-    protocol : how its bytes read, see `docs/recording.md`. pattern : its regular expression.
-    poll : what is sent to ask for one reading, `poll_hz` times a second; None for streams.
+    protocol : format of the bytes that the device sends, see `docs/recording.md`. pattern : the
+    regular expression of the protocol "regex".
+    poll : text that is sent to ask for one reading, `poll_hz` times a second; None for a device
+    that sends readings by itself.
     counts_per_mm : encoder counts (or microsteps) in 1 mm. unit_m_s2 : acceleration of one unit.
-    time_unit_s, time_bits : of the device's own clock, which wraps at 2**time_bits; 0 never.
-    checksum : "xor" demands `*hh` at a line's end, as NMEA 0183 has it.
-    latency_s : known least delay of the line, which one-way stamps cannot see; subtracted. For
-    frames stamped at the begin of their exposure add minus half the exposure.
-    axis : which of GRBL's positions. cameras : those whose frames the counter counts.
+    time_unit_s, time_bits : unit of the device's time stamps, and their number of bits: the stamps
+    wrap at 2**time_bits, or never for 0.
+    checksum : "xor" demands `*hh` at the end of a line, as in NMEA 0183.
+    latency_s : least delay of the line, which is subtracted from all times; recorded times do not
+    show it. If frames are stamped at the beginning of their exposure, subtract half the exposure
+    from it.
+    axis : which of the positions that GRBL sends. cameras : the cameras whose frames the counter
+    counts.
     """
 
     name: str

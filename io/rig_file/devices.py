@@ -20,10 +20,11 @@ _PORT_OPTIONS = re.compile(r"ign_set_control|poll_modem|timeout=\d+(?:\.\d+)?")
 
 
 class LinePattern:
-    """A regular expression of a user, matched in a time that is linear in the length of a line.
+    """A regular expression that a user gave, matched in a time that grows linearly with the line.
 
     Python's own ``re`` may need years for one line (docs/decisions/023-linear-expressions.md).
-    names : the names of its groups, sorted. Raises ValueError for a text that is no expression.
+    names : the names of the groups, sorted. Raises ValueError for a text that is no regular
+    expression.
     """
 
     def __init__(self, pattern: str) -> None:
@@ -47,7 +48,7 @@ class LinePattern:
 
 
 def port_fault(port: str) -> tuple[str, str] | None:
-    """Return what is wrong with the text of a port and what to do, or None.
+    """Return what is wrong with the text of a port and what to do; None if nothing is wrong.
 
     Allowed are device files, port names, and URLs of the schemes `PORT_SCHEMES`. Other schemes of
     pyserial are refused: ``spy://...?file=PATH`` writes over PATH.

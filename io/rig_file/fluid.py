@@ -44,9 +44,10 @@ def liquid_of(fluid: Any, gravity_m_s2: float = STANDARD_GRAVITY_M_S2) -> tuple[
 
 
 def liquid_velocity(velocity: Any, up: Array) -> Array:
-    """(3,) velocity of the liquid in mm/s from three numbers, one upwards, or None for rest.
+    """Return the velocity (3,) of the liquid in mm/s, in rig axes.
 
-    Raises InputError for anything else.
+    velocity : three numbers, one number (the upward velocity), or None for a liquid at rest. up :
+    (3,) unit vector against gravity. Raises InputError for anything else.
     """
     if velocity is None:
         return np.zeros(3)

@@ -86,7 +86,10 @@ def read_rig_toml(path: str | PathLike[str]) -> RigDescription:
 
 
 def write_rig_toml(rig: RigDescription, path: str | PathLike[str]) -> None:
-    """Write a rig.toml that reads back without a change; InputError for one that does not."""
+    """Write a rig.toml that gives the same description when it is read again.
+
+    Raises InputError for a description that cannot be written so.
+    """
     text = rig_toml(rig)
     description_from_toml(text, where=str(path))
     write_text_atomic(path, text)

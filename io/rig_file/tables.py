@@ -58,12 +58,14 @@ def read_table(
     keys: Mapping[str, str] | None = None,
     **fixed: Any,
 ) -> AnyTable | None:
-    """Return the object that a table of the file describes; its faults are added to ``problems``.
+    """Return the object that a table of rig.toml describes; faults are added to ``problems``.
 
-    kind : a dataclass whose annotated fields are the table's keys. fixed : fields that the file
-    does not hold. keys : what fields are called in the file, where that differs. homes : in which
-    table a key belongs that stands in a wrong one.
-    With faults, the object is made of the sound keys alone, or None where they are not enough.
+    kind : the dataclass of the object; its annotated fields are the keys of the table.
+    raw : content of the table. table : its name.
+    homes : for keys that users often write into a wrong table, the table to which they belong.
+    keys : the keys of fields that have another name in the file. fixed : values of fields that are
+    not in the file.
+    If keys are faulty, the object is made from the others; None if these are not enough.
     """
     if not isinstance(raw, dict):
         todo = f"write a line [{table}] with its keys below it"

@@ -29,7 +29,7 @@ Points = Annotated[
 
 @dataclass(frozen=True)
 class TargetTable(Table):
-    """The keys of [target] as the file has them; None for those that it leaves out."""
+    """The keys of the table [target] as the file states them; None for keys that are missing."""
 
     dot_diameter_mm: Positive
     layout: Layout = "grid"
@@ -56,7 +56,10 @@ class TargetTable(Table):
     plate_index: Index | None = None
 
     def target(self) -> Target:
-        """Return the target of a table without problems; `Target`'s values are for missing keys."""
+        """Return the target that a table without problems describes.
+
+        Missing keys get the default values of `Target`.
+        """
         stated = {name: value for name, value in vars(self).items() if value is not None}
         stated.setdefault("flatness_sigma_mm", self.print_sigma_mm)
         if self.pitch_mm is not None and not isinstance(self.pitch_mm, tuple):
@@ -67,10 +70,10 @@ class TargetTable(Table):
 
 
 def target_problems(table: TargetTable, faulty: Set[str] = frozenset()) -> list[Problem]:
-    """Return every fault that shows only when the keys are taken together.
+    """Return every fault of a table [target] that concerns several keys together.
 
-    What depends on a ``faulty`` key, or on one found faulty here, would only repeat that fault
-    and is left out.
+    faulty : keys that are known to be faulty. A fault that depends on one of these, or on a key
+    that is found faulty here, is left out, because it would only repeat that fault.
     """
     layout = _points_problems if table.layout == "points" else _grid_problems
     found: list[Problem] = []

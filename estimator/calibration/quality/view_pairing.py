@@ -60,9 +60,9 @@ def refuse_copies(problem: Problem) -> None:
 def wrong_pairs(problem: Problem, dots_mm: Array) -> str:
     """Return a sentence if images of one camera belong to other views than their names say.
 
-    Otherwise it is "". This happens if a camera missed a trigger or if its first image was lost. Groups of a few
-    consecutive views are solved with one camera's images from up to `FARTHEST` views later or
-    earlier, and the sentence is returned if such images fit far better.
+    Otherwise it is "". This happens if a camera missed a trigger or if its first image was lost.
+    Groups of a few consecutive views are solved with one camera's images from up to `FARTHEST`
+    views later or earlier, and the sentence is returned if such images fit far better.
 
     dots_mm : (N, 3) positions of the target's dots.
     """

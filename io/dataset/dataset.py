@@ -328,7 +328,4 @@ def _note_single(cameras_of: Mapping[Any, set[str]], rig: RigDescription, notes:
         alone = sorted((str(v) for v, seen in cameras_of.items() if seen == {camera}), key=natural)
         if alone:
             count = f"{len(alone)} view{'s' if len(alone) > 1 else ''}"
-            notes.append(
-                f"{count} with an image of camera {camera} only, so without use for the angle "
-                f"between cameras: {', '.join(alone)}"
-            )
+            notes.append(f"{count} with an image of camera {camera} only: {', '.join(alone)}")

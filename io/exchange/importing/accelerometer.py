@@ -345,8 +345,8 @@ def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> tuple[
             f"the unit of its readings is {unknown[0]!r}"
             if unknown[0]
             else "does not state the unit of its readings",
-            f"give the unit with --unit, one of {', '.join(ACCELERATION_UNITS)}, or with --scale "
-            "the acceleration in m/s^2 of a reading of 1",
+            f"give the unit, for example --unit g (one of {', '.join(ACCELERATION_UNITS)}), or "
+            "with --scale the acceleration in m/s^2 of a reading of 1",
         )
     sizes = np.array([ACCELERATION_UNITS[unit] for unit in units])
     return sizes, ", ".join(dict.fromkeys(units))

@@ -108,7 +108,7 @@ def test_views_of_dots(folder: Path) -> None:
     taken = dataset.dots()
     taken.loc[:, "u_px"] = 0.0
     assert dataset.dots()["u_px"].tolist() == [1.0] * 3, "a copy each time"
-    assert dataset.notes == ["1 view of camera left alone: v10"]
+    assert dataset.notes == ["1 view with an image of camera left only: v10"]
     assert "no image of view v2" in error_of(lambda: dataset.image(dataset.views[0], "left"))
 
 
@@ -127,7 +127,7 @@ def test_images_and_dots_must_be_told_apart(folder: Path) -> None:
     add_images(folder, "left/a.tif", "right/a.tif")
     add_dots(folder)
     message = load_error(folder)
-    assert "both images and dots.csv" in message
+    assert "images and dots.csv" in message
     assert "--from images or --from dots" in message
     assert load_dataset(folder, "images").views[0].name == "a"
     assert load_dataset(folder, "dots").views[0].name == "v2"
@@ -148,8 +148,8 @@ def test_views_of_one_camera_alone_are_kept_and_noted(folder: Path) -> None:
     assert [view.name for view in dataset.views] == ["a", "b", "c", "d"]
     assert list(dataset.views[3].image_paths) == ["right"]
     assert dataset.notes == [
-        "2 views of camera left alone: b, c",
-        "1 view of camera right alone: d",
+        "2 views with an image of camera left only: b, c",
+        "1 view with an image of camera right only: d",
     ]
 
 

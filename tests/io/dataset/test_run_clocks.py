@@ -12,7 +12,11 @@ from telerig.io.dataset.run import load_run
 
 BAD_TIMES = [
     ("shorter", "0,0\n1,.1\n2,.2\n", ("row 4", "images of 6 frames: frame 3 has no time")),
-    ("longer", GOOD + "6,.6\n7,.7\n", ("row 8, column frame", "is 6", "end with frame 5")),
+    (
+        "longer",
+        GOOD + "6,.6\n7,.7\n",
+        ("row 8, column frame", "is 6", "last frame with images is 5"),
+    ),
     ("stands still", GOOD.replace("3,.3", "3,.2"), ("row 5, column t_s", "not later than 0.2 s")),
     ("back", GOOD.replace("3,.3", "3,.15"), ("row 5, column t_s", "times must increase")),
     ("twice", GOOD.replace("4,.4", "3,.4"), ("row 6, column frame", "3 stands twice")),
@@ -38,7 +42,7 @@ def test_frames_csv_wins_over_run_toml(full_run: Path) -> None:
     (full_run / "frames.csv").write_text(times(GOOD))
     run = load_run(full_run)
     np.testing.assert_allclose(run.t_s, np.arange(6) / 10)
-    assert "frames.csv, not of run.toml" in run.notes[0]
+    assert "frames.csv; those of run.toml" in run.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -125,4 +129,4 @@ def test_references(full_run: Path) -> None:
     file.write_text(head + "0,left,a,3,4\n0,left,a,5,6\n")
     error_of(full_run, "references.csv row 3, column mark", "'a' stands twice in frame 0")
     file.write_text(head + "6,left,a,3,4\n")
-    error_of(full_run, "row 2, column frame", "is 6, the last is 5")
+    error_of(full_run, "row 2, column frame", "is 6, but the last frame is 5")

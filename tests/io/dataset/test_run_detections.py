@@ -59,7 +59,7 @@ def test_full_covariance(run_folder: Path) -> None:
 
 def test_images_and_detections(full_run: Path) -> None:
     detections(full_run, HEAD + ROWS)
-    error_of(full_run, "both images and detections.csv", "--from images or --from detections")
+    error_of(full_run, "images and detections.csv", "--from images or --from detections")
     assert_frames(load_run(full_run, source="images"), "left", LEFT)
     assert load_run(full_run, source="detections").frame_count == 3
     error_of(full_run, "source is 'both'", source="both")
@@ -97,7 +97,9 @@ def test_bad_detections(text: str, words: tuple[str, ...], run_folder: Path) -> 
 
 def test_detections_beyond_frames_csv(run_folder: Path) -> None:
     (run_folder / "frames.csv").write_text(times("0,0\n1,.1\n"))
-    error_of(detections(run_folder, HEAD + ROWS), "row 4, column frame", "is 2, the last is 1")
+    error_of(
+        detections(run_folder, HEAD + ROWS), "row 4, column frame", "is 2, but the last frame is 1"
+    )
 
 
 def test_detections_without_a_rig(run_folder: Path, tmp_path: Path) -> None:

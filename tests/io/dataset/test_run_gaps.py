@@ -156,4 +156,4 @@ def test_frames_csv_says_what_is_missing(run_folder: Path) -> None:
     (run_folder / "frames.csv").write_text(text.format("right|up"))
     error_of(run_folder, "frames.csv row 7, column missing", "'up'")
     (run_folder / "frames.csv").write_text(text.format("right"))
-    error_of(run_folder, "camera right has 5 images; frames.csv has 6 rows, 2 of them")
+    error_of(run_folder, "right has 5 images, but frames.csv has 6 rows", "misses 2 of them")

@@ -118,7 +118,7 @@ def test_the_lines_to_add_follow_from_the_record(place: Path) -> None:
         ("telerig import --list nowhere", "there is no such run"),
         ("telerig import --remove arm", "--list DATASET/runs/NAME"),
         (f"telerig import --list {RUN} openlpt a --out b", "--list and openlpt are given"),
-        (f"telerig import accelerometer arm.csv --run {RUN} --sensor a --unit lb", "--unit, one"),
+        (f"telerig import accelerometer arm.csv --run {RUN} --sensor a --unit lb", "--unit g"),
     ],
 )
 def test_bad_options_are_answered_in_words(place: Path, line: str, words: str) -> None:

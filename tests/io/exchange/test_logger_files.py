@@ -266,13 +266,13 @@ def test_a_unit_that_is_not_stated_is_asked_for_by_its_option(maker: str, tmp_pa
 
 def test_notes_say_how_a_file_was_understood(tmp_path: Path) -> None:
     notes = import_accelerations(write(tmp_path, hobo()), "arm").notes
-    assert "1 rows without any reading are left out" in notes
+    assert "1 rows are left out, because they have no reading" in notes
     assert any(
-        "first stamp of 'Date Time, GMT+00:00', 03/09/24 11:59:57.990 PM" in n for n in notes
+        "first time stamp of 'Date Time, GMT+00:00', 03/09/24 11:59:57.990 PM" in n for n in notes
     )
     notes = import_accelerations(write(tmp_path, xsens()), "arm", Layout(unit="m/s2")).notes
     assert "line 3 states a sampling rate of 100 Hz" in notes
-    assert "times are those of the counter 'PacketCounter' at 100 Hz" in notes
+    assert "times follow from the counter 'PacketCounter' at 100 Hz" in notes
     cut = write(tmp_path, phyphox() + "3.0,0.1")
     assert any("row 302 is left out" in n for n in import_accelerations(cut, "arm").notes)
 
@@ -281,7 +281,7 @@ def test_samples_that_a_counter_misses_leave_a_gap(tmp_path: Path) -> None:
     rows = xsens().splitlines()
     path = write(tmp_path, "\n".join(rows[:104] + rows[114:]) + "\n")
     found = import_accelerations(path, "arm", Layout(unit="m/s2"))
-    assert "10 samples are missing by the counter 'PacketCounter'" in found.notes
+    assert "the counter 'PacketCounter' shows that 10 samples are missing" in found.notes
     assert np.max(np.diff(found.table["t_s"])) == pytest.approx(0.11)
 
 
@@ -310,7 +310,7 @@ def test_what_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
     two = lines(
         ["t_s,LN_X (g),LN_Y (g),LN_Z (g),WR_X (g),WR_Y (g),WR_Z (g)"], seconds(), more=",1,2,3"
     )
-    with pytest.raises(InputError, match=r"2 groups of channels[\s\S]*--channels LN_X \(g\),"):
+    with pytest.raises(InputError, match=r"2 sets of channels[\s\S]*--channels LN_X \(g\),"):
         read_accelerations(write(tmp_path, two), "arm")
     same = lines(["t_s,X (g),Y (g),Z (g),X (g),Y (g),Z (g)"], seconds(), more=",1,2,3")
     with pytest.raises(InputError, match=r"--channels"):

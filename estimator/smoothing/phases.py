@@ -32,7 +32,7 @@ class Phases:
 
         Yields a callback for its share; the words that it is given follow those of the phase.
 
-        name : key of ``seconds``.  words : what the callback is told; "" for the name.
+        name : key of ``seconds``.  words : what the callback gets; "" for the name.
         """
         words, begun = words or name, time.perf_counter()
         self.progress(words, 0.0)

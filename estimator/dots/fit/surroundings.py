@@ -156,7 +156,7 @@ def without_neighbours(window: Window, neighbours: list[DotFit]) -> Window:
 
 PRIOR_GRADIENT_PER_PX = 4e-4
 _PRIOR_SCATTER, _PRIOR_SCATTER_DOTS = 0.01, 4.0
-_HUBER = 2.0
+_FAR_SDS = 2.0
 _FLOOR_PER_PX = 5e-6
 _ENOUGH_DOTS = 6
 _BLUR_SPREAD = 0.1
@@ -225,7 +225,7 @@ def _quadratic(position: Array, value: Array, own: Array, slope: float) -> tuple
         known = _PRIOR_SCATTER_DOTS * _PRIOR_SCATTER**2
         scatter = float(np.sqrt((excess + known) / (spare + _PRIOR_SCATTER_DOTS)))
         far = np.abs(residual) / np.sqrt(own**2 + scatter**2)
-        weight = np.minimum(1.0, (_HUBER / np.maximum(far, 1e-12)) ** 2)
+        weight = np.minimum(1.0, (_FAR_SDS / np.maximum(far, 1e-12)) ** 2)
     return coefficients, covariance
 
 

@@ -37,8 +37,8 @@ from telerig.rig.units import ACCELERATION_UNITS
 
 AXES = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
 _PLAUSIBLE_HZ = (50.0, 2e5)
-"""Sampling rates by which the unit of times is told, where nothing states it. Times in ms would be
-taken for seconds only from a rate of 50 kHz on."""
+"""Sampling rates from which the unit of times is inferred, where nothing states it. Times in ms
+would be taken for seconds only from a rate of 50 kHz on."""
 _SAME_RATE = 0.05
 _SEEN_CELLS = 200
 

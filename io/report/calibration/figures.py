@@ -217,7 +217,7 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
         found += [picture for picture in maps if picture is not None]
     halves = results.file.diagnostics.halves
     if "points_mm" in halves:
-        found.append(_halves(halves))
+        found.append(_split_half(halves))
     return found
 
 
@@ -278,7 +278,7 @@ def same_everywhere(results: CalibrationResults) -> str:
     )
 
 
-def _halves(halves: Mapping[str, Any]) -> Picture:
+def _split_half(halves: Mapping[str, Any]) -> Picture:
     """Draw how the halves of the views differ as arrows, and what is predicted as circles."""
     from matplotlib.patches import Circle
 

@@ -399,7 +399,7 @@ def accelerometer_before_and_after(results: SmoothingResults, sensor: str) -> Pi
         times = float(np.median(after)) / noise
         caption += f", {number(times, 2)} times the stated noise (median)"
         if times < _LITTLE:
-            caption += "; where it is below, the priors have room for motion as fast as the noise"
+            caption += "; where it is below, the priors allow motion as fast as the noise"
     caption += ". Welch's estimate, over the directions that the model moves the sensor in."
     title = f"Accelerometer {sensor}, before and after"
     return _spectra(title, "(m/s²)²/Hz", curves, caption)

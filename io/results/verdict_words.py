@@ -192,6 +192,44 @@ def words_of_use(use: Use) -> str:
     return words if use.below_hz is None else f"{words} below {use.below_hz:.2g} Hz"
 
 
+_LESS_NOISE = (
+    "Against the pixels' noise: more pixels per mm, sharper images, or means over more bubbles and "
+    "a longer record."
+)
+
+
+def words_of_refusals(file: SmoothingFile) -> list[str]:
+    """Return why a run does not determine what is graded NO, axis by axis, and what to add."""
+    lines, shaken = [], set()
+    for name in AXES:
+        refused = [u for u in file.usable_for if u.axis == name and u.grade == Grade.NO]
+        what = [
+            f"{words_of_use(use)} ({abs(use.value) / use.sd:.2g} of its standard deviations)"
+            for use in refused
+            if use.value is not None and use.sd
+        ]
+        if not what:
+            continue
+        axis = file.axes.get(name, AxisVerdict())
+        by_shake = (axis.q or 1.0) > HARDLY_WIDER
+        shaken.add(by_shake)
+        text = f"Along {name}, {' and '.join(what)}: "
+        text += "mostly because of the shake" if by_shake else "because of the pixels' noise"
+        if by_shake and axis.sigma_mm and axis.sigma_shake_known_mm:
+            text += (
+                f" (standard deviation of a position {1e3 * axis.sigma_mm:.3g} µm; "
+                f"{1e3 * axis.sigma_shake_known_mm:.3g} µm if the shake were known)"
+            )
+        path = any(use.quantity == Quantity.PATH and use.below_hz is None for use in refused)
+        text += ". At no frequency is the path nine times the power of its errors." if path else "."
+        lines.append(text)
+    if True in shaken:
+        lines.append(to_resolve(remedy_words(file.remedies) or file.remedy))
+    if False in shaken:
+        lines.append(_LESS_NOISE)
+    return lines
+
+
 def uses_words(found: Sequence[Use]) -> list[str]:
     """Return a line for each grade with the quantities and axes that have it."""
     lines = []

@@ -261,7 +261,7 @@ def _by_job(
         draw_curves(sheet, curves)
         for job in none:
             sheet.axes.axvline(job, color=LEFT_OUT, lw=0.8)
-        sheet.axes.set_ylim(0, None)
+        sheet.axes.set_ylim(0, 1.1 * max(float(np.nanmax(c.y)) for c in curves if len(c.y)))
         sheet.axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     return Picture(title, sheet.source, caption)
 

@@ -295,8 +295,11 @@ def _split_half(halves: Mapping[str, Any]) -> Picture:
         for a, b, s in zip(x, z, sd[flat]):
             radius = factor * float(np.sqrt(np.mean(s[[0, 2]] ** 2)))
             sheet.axes.add_patch(Circle((a, b), radius, facecolor=MUTED, alpha=0.25, linewidth=0))
-        sheet.axes.quiver(x, z, *(factor * shift[flat][:, [0, 2]]).T, angles="xy",
-                          scale_units="xy", scale=1, color=MODEL, width=0.006)  # fmt: skip
+        arrow = factor * shift[flat][:, [0, 2]]
+        sheet.axes.quiver(x, z, *arrow.T, angles="xy", scale_units="xy", scale=1, color=MODEL,
+                          width=0.006)  # fmt: skip
+        sheet.axes.update_datalim(np.stack([x, z], -1) + arrow)
+        sheet.axes.autoscale_view()
         sheet.axes.set_aspect("equal", adjustable="datalim")
     caption = (
         f"Split-half check. Arrows show by how much a calibration from {halves['views'][0]} views "

@@ -89,6 +89,21 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
         write_vtk(swarm(), tmp_path)
 
 
+def test_a_moved_folder_is_read_by_pyvista_with_its_times(run: Path, tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    results = read_results(run)
+    write_vtk(results, tmp_path / "out", two_cameras())
+    (tmp_path / "elsewhere").mkdir()
+    moved = (tmp_path / "out").rename(tmp_path / "elsewhere" / "moved")
+    reader = pyvista.PVDReader(str(moved / SERIES))
+    np.testing.assert_allclose(reader.time_values, results.points["t_s"])
+    reader.set_active_time_point(3)
+    bubbles = reader.read()[0]
+    place = results.points.loc[3, ["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    np.testing.assert_array_equal(bubbles.points[0], place)
+    assert bubbles["d_eq_mm"][0] == results.points["d_eq_mm"][3]
+
+
 def test_vtk_draws_the_ellipsoids(run: Path, tmp_path: Path) -> None:
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy

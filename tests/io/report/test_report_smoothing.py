@@ -20,7 +20,7 @@ from telerig.io.report.run.smoothing.figures import smoothing_drawings
 from telerig.io.report.run.smoothing.results import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.smoothing.tables import smoothing_verdict, use_rows
 from telerig.io.report.run.tracking.results import read_track_results
-from telerig.io.results.verdict_words import uses_words
+from telerig.io.results.verdict_words import uses_words, words_of_refusals
 
 TRACKING = ["verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events"]
 TRACKING += ["notes", "more", "origin"]
@@ -192,6 +192,29 @@ def test_the_page_says_what_the_run_is_good_for(folder: Path) -> None:
         "not good for: velocity in a frame (x)",
         "nothing in this run confirms the sign, unit and scale of: encoder",
     ]
+
+
+def test_the_page_says_why_it_is_not_good_for_more_and_what_to_add(folder: Path) -> None:
+    path = {"quantity": "path", "value": 0.19, "sd": 0.16, "unit": "mm", "grade": "no"}
+    speed = path | {"quantity": "velocity", "value": 10.0, "sd": 8.0, "unit": "mm/s", "axis": "x"}
+    axes = {
+        "x": {"q": 1.1, "sigma_mm": 0.02, "sigma_shake_known_mm": 0.018},
+        "y": {"q": 9.7, "sigma_mm": 0.154, "sigma_shake_known_mm": 0.0159},
+    }
+    changed(folder, usable_for=[path | {"axis": "y"}, speed], axes=axes, remedies=["arms"])
+    by_noise, by_shake, *remedies = words_of_refusals(read(folder).file)
+    assert by_noise == (
+        "Along x, velocity in a frame (1.2 of its standard deviations): because of the pixels' "
+        "noise."
+    )
+    assert by_shake == (
+        "Along y, path (1.2 of its standard deviations): mostly because of the shake (standard "
+        "deviation of a position 154 µm; 15.9 µm if the shake were known). At no frequency is the "
+        "path nine times the power of its errors."
+    )
+    assert "accelerometer on each camera arm" in remedies[0] and "pixels per mm" in remedies[1]
+    changed(folder, usable_for=[path | {"axis": "y", "grade": "good"}])
+    assert words_of_refusals(read(folder).file) == []
 
 
 def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> None:

@@ -46,6 +46,7 @@ from telerig.io.results.verdict_words import (
     to_resolve,
     words_of_axes,
     words_of_contradiction,
+    words_of_refusals,
     words_of_use,
 )
 
@@ -56,6 +57,7 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
     return {
         "verdict": verdict,
         "uses": use_rows(results),
+        "refusals": words_of_refusals(results.file),
         "figures": smoothing_figures(results),
         "axes": axis_table(results),
         "judged": bool(results.file.axes),

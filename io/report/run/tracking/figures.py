@@ -226,7 +226,7 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
             top = max(top, min(2 * top, float(curve[1].max())))
             if learnt > float(np.median(sd)):
                 curve = _mixture(edges, np.hypot(sd, learnt))
-                axes.plot(*curve, color=MODEL, linewidth=1.2, label="with shake and scatter")
+                axes.plot(*curve, color=MODEL, linewidth=1.2, label="with shake")
                 top = max(top, float(curve[1].max()))
         axes.axvline(0, color=MUTED, linewidth=0.8)
         axes.set_ylim(0, 1.05 * max(top, 1e-9))

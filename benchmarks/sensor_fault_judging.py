@@ -23,8 +23,7 @@ import telerig
 from telerig.errors import TelerigError
 from telerig.estimator.sensors.findings import SensorError, settled
 from telerig.estimator.smoothing.problem.problem import SmoothingProblem
-from telerig.estimator.smoothing.problem.sensor_alignment import aligned
-from telerig.estimator.smoothing.smooth import problem_of
+from telerig.estimator.smoothing.smooth import problem_of, with_sensors_aligned
 
 Array = NDArray[np.float64]
 
@@ -76,15 +75,20 @@ PASSED = (Class.MENDED, Class.OWNED_UP, Class.HIDDEN, Class.WIDER)
 class Score:
     """Errors of the middle 80 % of all bubbles, per axis (3,).
 
-    error_um : RMS.  nees : mean of (error / sd)^2.
+    error_um : RMS.  nees : mean of (error / sd)^2.  sd_um : RMS of the stated ones.
     """
 
     error_um: Array
     nees: Array
+    sd_um: Array
 
     @property
     def total_um(self) -> float:
         return float(np.sqrt(np.sum(self.error_um**2)))
+
+    @property
+    def total_sd_um(self) -> float:
+        return float(np.sqrt(np.sum(self.sd_um**2)))
 
     @property
     def total_nees(self) -> float:
@@ -99,7 +103,8 @@ def score(run: Run, table: Any) -> Score:
     off = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)[keep]
     off = off - run.position_mm[bubble[keep], frame[keep]]
     sd = table[["sx_mm", "sy_mm", "sz_mm"]].to_numpy(float)[keep]
-    return Score(1e3 * np.sqrt(np.mean(off**2, axis=0)), np.mean((off / sd) ** 2, axis=0))
+    rms_um = [1e3 * np.sqrt(np.mean(x**2, axis=0)) for x in (off, sd)]
+    return Score(rms_um[0], np.mean((off / sd) ** 2, axis=0), rms_um[1])
 
 
 @dataclass(frozen=True)
@@ -107,14 +112,16 @@ class Outcome:
     """One cell for one seed.
 
     verdict : with those of the axes x, y, z.  ratio : error over that of the undisturbed run.
-    axis_ratio : the same per axis.  left_out : sensors without a place in the solution.  fixes :
-    corrections applied.  said : messages and warnings.
+    sd_ratio : stated standard deviation over that of the undisturbed run; by so much the posterior
+    of what is left is wider.  axis_ratio : ratio per axis.  left_out : sensors without a place in
+    the solution.  fixes : corrections applied.  said : messages and warnings.
     """
 
     kind: Class
     verdict: str = ""
     error_um: float = np.nan
     ratio: float = np.nan
+    sd_ratio: float = np.nan
     nees: float = np.nan
     axis_ratio: tuple[float, ...] = ()
     axis_nees: tuple[float, ...] = ()
@@ -173,7 +180,7 @@ def judged(run: Run, inputs: Inputs, fault: Fault, configuration: str, clean: Sc
     kind = _class(fault, configuration, found, clean, verdict, axes, left_out, said)
     return Outcome(
         kind, " ".join([str(verdict.get("verdict", "")), *axes]), found.total_um,
-        found.total_um / clean.total_um, found.total_nees,
+        found.total_um / clean.total_um, found.total_sd_um / clean.total_sd_um, found.total_nees,
         tuple(found.error_um / clean.error_um), tuple(found.nees), left_out, tuple(codes),
         tuple(fixes), " | ".join(said), time.perf_counter() - begin, summary | verdict,
     )  # fmt: skip
@@ -183,7 +190,7 @@ def checked(inputs: Inputs) -> SmoothingProblem:
     """What `telerig.smooth` would solve. Raises what it would raise before."""
     given = {k: v for k, v in inputs.items() if k not in ("tracks", "calibration")}
     problem, _, _, known = problem_of(inputs["tracks"], inputs["calibration"], **given)
-    problem, found = aligned(problem, known)
+    problem, found = with_sensors_aligned(problem, known)
     settled(found, frozenset())
     return problem
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
+from telerig.estimator.sensors.accelerations import Grid, of_positions, of_readings
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.given import Sensor, unit_of_gravity
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
@@ -19,7 +20,7 @@ _CLEAR, _CHANCE_SIGMAS, _INDEPENDENT_S = 0.6, 3.5, 0.025
 """A correlation counts if it is above 0.6 and above 3.5 times that of independent signals, whose
 values 25 ms apart are independent."""
 
-_SMOOTHED_S = 0.03
+_STEP_S, _KNOTS, _LEAST_OVERLAP_S = 0.005, 5, 0.3
 
 
 def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> list[Finding]:
@@ -161,32 +162,20 @@ def motion_correlation(
 ) -> Array | None:
     """Return the correlation (3,) of each sensor axis with the carriage's acceleration, or None.
 
-    Both are smoothed over 30 ms. There is none if the records (N,), (N, 3) and (E,) overlap by less
-    than 0.3 s, or if the carriage does not accelerate.
+    There is none if the records (N,), (N, 3) and (E,) overlap by less than 0.3 s, or if the
+    carriage does not accelerate.
     """
-    from scipy.signal import savgol_coeffs
-
     t, stage_t = np.asarray(t_s, float), np.asarray(stage_t_s, float)
     low, high = max(t[0], stage_t[0]), min(t[-1], stage_t[-1])
-    step = _SMOOTHED_S / 6
-    if high - low < 10 * _SMOOTHED_S:
+    if high - low < _LEAST_OVERLAP_S:
         return None
-    grid = np.arange(low, high, step)
-    place = _averaged(stage_t, np.asarray(position_mm, float), grid, step)
-    sensed = np.stack([_averaged(t, a, grid, step) for a in np.asarray(reading, float).T], -1)
-    acceleration = np.convolve(place, savgol_coeffs(13, 3, deriv=2, delta=step), "valid")
-    window = np.hanning(15)[1:-1] / np.hanning(15)[1:-1].sum()
-    smooth = np.stack([np.convolve(a, window, "valid") for a in sensed.T], -1)
-    acceleration, smooth = acceleration - acceleration.mean(), smooth - smooth.mean(0)
-    size = np.sqrt((acceleration**2).sum() * (smooth**2).sum(0))
-    if not np.all(size > 0):
+    grid = Grid(float(low), _STEP_S, int((high - low) / _STEP_S) + 1, _KNOTS)
+    carriage = of_positions(grid, stage_t, np.asarray(position_mm, float)[:, None])
+    sensed, there = of_readings(grid, t, reading).at(grid.t_s)
+    known = there & carriage.known
+    if not known.any():
         return None
-    return np.asarray(smooth.T @ acceleration / size)
-
-
-def _averaged(t: Array, values: Array, grid: Array, step: float) -> Array:
-    """Return the mean of a piecewise linear signal over one grid step about each grid time."""
-    integral = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(t))])
-    ends = [np.interp(grid + s * step / 2, t, integral) for s in (-1, 1)]
-    width = np.clip(grid + step / 2, t[0], t[-1]) - np.clip(grid - step / 2, t[0], t[-1])
-    return np.asarray((ends[1] - ends[0]) / width)
+    acceleration, felt = carriage.values[known, 0], sensed[known]
+    acceleration, felt = acceleration - acceleration.mean(), felt - felt.mean(0)
+    size = np.sqrt((acceleration**2).sum() * (felt**2).sum(0))
+    return np.asarray(felt.T @ acceleration / size) if np.all(size > 0) else None

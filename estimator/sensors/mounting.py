@@ -103,19 +103,11 @@ def mounting(
     own = int(stated[0])
     length = len(parts[0].x)
     shifts = np.linspace(0.1, 0.9, _SHIFTS) * length
-    chance = [np.ptp(_scores(candidates, parts, int(s))) for s in shifts]
+    both = candidates[[best, own]]
+    chance = [float(np.ptp(_scores(both, parts, int(s)))) for s in shifts]
     lead = float(score[best] - score[own])
-    clear = best != own and lead > max(CLEAR_NATS, _CHANCE * float(np.max(chance)))
+    clear = best != own and lead > max(CLEAR_NATS, _CHANCE * max(chance))
     return Mounting(candidates[best], bool(clear), lead, gain, gain_sd)
-
-
-def lead_of_axes(
-    stated: Array, other: Array, x: Array, known: Bools, felt: Sequence[Felt]
-) -> float:
-    """Return the log-likelihood of other axes (3, 3) less that of the stated ones."""
-    parts = [p for f in felt if (p := _Part.of(f, x, known)) is not None]
-    own, best = _scores(np.array([stated, other]), parts, 0)
-    return float(best - own)
 
 
 @dataclass(frozen=True)

@@ -43,12 +43,13 @@ from telerig.estimator.smoothing.problem.tables import (
     bubbles_of,
     calibration_share,
     frames_between,
+    near_frames,
     read_tracks,
     references_of,
     stage_of,
     thinned,
 )
-from telerig.estimator.smoothing.problem.window import Window, all_of
+from telerig.estimator.smoothing.problem.window import Window, all_of, cut_out
 from telerig.estimator.smoothing.refined_pose import (
     Refinement,
     change_words,
@@ -78,6 +79,7 @@ Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _COARSE_STEP_S = 2e-3
 _MOST_ALIGNED, _MOST_PIXELS = 20_000, 500_000
+_MOST_COMPARED, _BUBBLES_COMPARED = 1500, 3
 _ENCODER_SIGMA_MM = 0.005
 _LEAST_SAMPLES = 2
 _LEAST_LEARNED_S = 0.2
@@ -169,7 +171,7 @@ def smooth(
             references=references, rig=rig, t_s=t_s,
             drift=None if refinement is None else refinement.drift,
         )  # fmt: skip
-        problem, findings = _aligned(problem, findings)
+        problem, findings = with_sensors_aligned(problem, findings)
         warnings = settled(findings, accepted)
     options = replace(options or Options(), draws=True)
     with phases.phase("learning", "learning the shake") as step:
@@ -392,7 +394,7 @@ def _silent(_what: str, _share: float) -> None:
     """Report nothing."""
 
 
-def _aligned(
+def with_sensors_aligned(
     problem: SmoothingProblem, findings: list[Finding]
 ) -> tuple[SmoothingProblem, list[Finding]]:
     """Return the problem with its sensors on the clock of the frames, and what was found.
@@ -402,9 +404,19 @@ def _aligned(
     """
     count = len(problem.t_s)
     if problem.accelerometers or count <= _MOST_ALIGNED:
-        return aligned(problem, findings)
+        return aligned(problem, findings, _log_evidence)
     first = (count - _MOST_ALIGNED) // 2
-    return problem, aligned(all_of(problem, first, first + _MOST_ALIGNED).problem, findings)[1]
+    part = all_of(problem, first, first + _MOST_ALIGNED).problem
+    return problem, aligned(part, findings, _log_evidence)[1]
+
+
+def _log_evidence(problem: SmoothingProblem) -> float:
+    """Return the log marginal likelihood of the middle of a run by the default hyper-parameters."""
+    first = max((len(problem.t_s) - _MOST_COMPARED) // 2, 0)
+    part = cut_out(problem, first, first + _MOST_COMPARED, most_bubbles=_BUBBLES_COMPARED).problem
+    sensors = tuple(near_frames(s, part.t_s) for s in part.accelerometers)
+    part = replace(part, accelerometers=thinned(sensors, _COARSE_STEP_S))
+    return solve(part, default_model(part), Options(covariances=False)).log_evidence
 
 
 def _smoothing_words(problem: SmoothingProblem) -> str:

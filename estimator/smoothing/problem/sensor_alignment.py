@@ -7,7 +7,7 @@ the clock of the frames and cut to them, and what was found. The regressions are
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -29,7 +29,6 @@ from telerig.estimator.sensors.mounting import (
     CLEAR_NATS,
     Felt,
     Mounting,
-    lead_of_axes,
     mounting,
     preference,
     slope,
@@ -75,16 +74,21 @@ _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
 
 
+LogEvidence = Callable[[SmoothingProblem], float]
+
+
 def aligned(
-    problem: SmoothingProblem, known: Sequence[Finding] = ()
+    problem: SmoothingProblem, known: Sequence[Finding], log_evidence: LogEvidence
 ) -> tuple[SmoothingProblem, list[Finding]]:
     """Return the problem with its sensors on the clock of the frames, and what was found.
 
     Sensors whose clock is unknown and cannot be found are left out. known : what other checks have
-    found, which is returned, too. Of axes that gravity alone has shown to be wrong, the images tell
-    which would be right; a clock that hardly covers the frames is no fault if they show its offset.
+    found, which is returned, too. log_evidence : the log-likelihood of all measurements of a run.
+    Of axes that gravity alone has shown to be wrong, the images tell which would be right; a clock
+    that hardly covers the frames is no fault if they show its offset.
     """
-    placed, found = _aligned(problem, [f for f in known if f.code is not None])
+    refused = [f for f in known if f.code is not None]
+    placed, found = _aligned(problem, refused, log_evidence)
     better: dict[tuple[Code | None, Any], Finding] = {
         (f.code, f.fix.get("sensor")): f for f in found if f.code is not None
     }
@@ -101,7 +105,7 @@ def aligned(
 
 
 def _aligned(
-    problem: SmoothingProblem, refused: Sequence[Finding]
+    problem: SmoothingProblem, refused: Sequence[Finding], log_evidence: LogEvidence
 ) -> tuple[SmoothingProblem, list[Finding]]:
     if not problem.bubbles and not len(problem.references):
         return _cut(problem), []
@@ -140,7 +144,7 @@ def _aligned(
             placed.update(zip(free, corrected))
             findings += found
     problem = _with(problem, [placed[i] for i in sorted(placed)])
-    findings += _mountings(problem, images, refused)
+    findings += _mountings(problem, images, refused, log_evidence)
     findings += _encoder(problem, images, encoder, [*refused, *findings])
     findings += _rise(problem)
     near = [near_frames(s, problem.t_s) for s in problem.accelerometers]
@@ -582,12 +586,16 @@ def _at_frames(images: _Images, sensor: Accelerometer) -> tuple[Array, Bools]:
 
 
 def _mountings(
-    problem: SmoothingProblem, images: _Images, refused: Sequence[Finding]
-) -> list[Finding]:
+    problem: SmoothingProblem, images: _Images, refused: Sequence[Finding],
+    log_evidence: LogEvidence,
+) -> list[Finding]:  # fmt: skip
     """Return the sensors whose axes, place or unit contradict the images, encoder and each other.
 
     The sensor with the clearest contradiction is corrected first; then the others are compared with
-    it. refused : known faults; their units are not judged twice, and without gravity no axes.
+    it. All measurements together have the last word: whether they are as likely with its axes
+    corrected, and which is wrong of two sensors of which either could be corrected.
+
+    refused : known faults; their units are not judged twice, and without gravity no axes.
     """
     without = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_GRAVITY}
     measured = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_UNIT}
@@ -612,11 +620,9 @@ def _mountings(
             for s in sensors
         }  # fmt: skip
 
-    def lead_of_images(name: str, judged: dict[str, Mounting]) -> float:
-        """Return by how much images and encoder alone prefer the axes that were found."""
-        sensor = next(s for s in sensors if s.name == name)
-        felt = _felt(problem, images, sensor, axes, {})
-        return lead_of_axes(sensor.axes, judged[name].axes, *read[name], felt)
+    def log_evidence_with(changed: dict[str, Array]) -> float:
+        changed = axes | changed
+        return log_evidence(_with(problem, [replace(s, axes=changed[s.name]) for s in sensors]))
 
     while True:
         judged = judge()
@@ -628,22 +634,26 @@ def _mountings(
         worst = max(leads, key=lambda n: leads[n], default=None)
         if worst is None or any(f.fix.get("sensor") == worst for f in findings):
             break
-        axes[worst] = judged[worst].axes
+        stated, axes[worst] = axes[worst], judged[worst].axes
         after = judge()
-        rivals = [n for n in leads if n != worst and not after[n].clear]
-        if rivals:
-            rival = max(rivals, key=lambda n: leads[n])
-            apart = lead_of_images(worst, judged) - lead_of_images(rival, judged)
-            if abs(apart) < CLEAR_NATS:
-                return [*findings, _one_of(worst, rival, judged)]
-            if apart < 0:
-                axes[worst] = next(s.axes for s in sensors if s.name == worst)
-                worst, axes[rival] = rival, judged[rival].axes
-        elif len(sensors) == 2 and np.isfinite(leads[worst]):
-            (other,) = (n for n in judged if n != worst)
-            doubtful = not np.allclose(axes[other], judged[other].axes)
-            if doubtful and lead_of_images(worst, judged) < CLEAR_NATS:
-                return [*findings, _one_of(worst, other, judged)]
+        axes[worst] = stated
+        rivals = [
+            n for n in judged
+            if n != worst and not after[n].clear and (n in leads or len(sensors) == 2)
+            and not np.allclose(axes[n], judged[n].axes)
+        ]  # fmt: skip
+        if np.isfinite(leads[worst]):
+            likely = {
+                n: log_evidence_with({n: judged[n].axes})
+                for n in [worst, *sorted(rivals, key=lambda n: -judged[n].lead_nats)[:1]]
+            }
+            first, *second = sorted(likely, key=lambda n: -likely[n])
+            if likely[first] < log_evidence_with({}):
+                break
+            if second and likely[first] < likely[second[0]] + CLEAR_NATS:
+                return [*findings, _one_of(first, second[0], judged)]
+            worst = first
+        axes[worst] = judged[worst].axes
         findings.append(_axes_finding(worst, judged[worst]))
     for name, found in judged.items():
         if found.wrong_gain and name not in measured:

@@ -13,7 +13,9 @@ from telerig.scripts.console import errors_in_words, progress, run_file, say, ty
 
 @errors_in_words()
 def bubbles(
-    images: Annotated[list[Path], typer.Argument(help="Grey images, backlit, or folders of them.")],
+    images: Annotated[
+        list[Path], typer.Argument(help="Backlit grey images, or folders of such images.")
+    ],
     out: Annotated[Path, typer.Option(help="Results folder.")] = Path("bubbles"),
     min_diameter: Annotated[
         float, typer.Option(help="Dark spots with a smaller diameter, in px, are no bubbles.")

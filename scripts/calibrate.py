@@ -61,7 +61,7 @@ def calibrate(
     ] = None,
     source: Annotated[
         str | None,
-        typer.Option("--from", help="Needed when the dataset has both: images or dots."),
+        typer.Option("--from", help="Use images or dots; needed if the dataset has both."),
     ] = None,
     watch: Annotated[
         bool,

@@ -38,7 +38,7 @@ def run_file(command: Callable[..., None]) -> None:
 
 
 def say(text: str) -> None:
-    """A line for the user, on standard output."""
+    """Print a line for the user on standard output."""
     typer.echo(text)
 
 
@@ -51,7 +51,7 @@ def typed_command() -> str:
 
 
 def say_written(folder: Path, report: bool) -> None:
-    """Where the results are, or their report if there is one."""
+    """Print where the results are, or their report if there is one."""
     say(f"written: {folder}" + ("/report.html" if report else ""))
 
 
@@ -59,7 +59,7 @@ def say_written(folder: Path, report: bool) -> None:
 def errors_in_words() -> Iterator[None]:
     """Turn telerig's errors, Ctrl-C and faults of telerig into a message and an exit code.
 
-    Every command has it as a decorator.
+    Every command is decorated with this function.
     """
     try:
         with warnings.catch_warnings():
@@ -181,7 +181,7 @@ def _leave_closed_pipe() -> None:
 
 @contextmanager
 def stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set, so that the work can end in an orderly way."""
+    """Yield an event that Ctrl-C and SIGTERM set, so that the work can end in an orderly way."""
     stop = threading.Event()
 
     def set_stop(_: int, __: FrameType | None) -> None:
@@ -200,6 +200,6 @@ def stopped_by_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def progress(quiet: bool) -> Iterator[Steps]:
-    """A callback (what, done, of): a progress bar on a terminal, plain lines elsewhere."""
+    """Yield a `Progress` that shows a progress bar on a terminal, and plain lines elsewhere."""
     with contextlib.nullcontext(Steps(None)) if quiet else steps_shown() as steps:
         yield steps

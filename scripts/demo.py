@@ -72,7 +72,9 @@ def _config() -> RunConfig:
 def track_and_compare(
     data: Dataset, calibration: Calibration, record: dict[str, int], quiet: bool
 ) -> bool:
-    """Track the only run of a simulated dataset; whether the bubble was followed throughout."""
+    """Track the only run of a simulated dataset, and print the errors.
+
+    Returns whether the bubble was followed throughout."""
     import pandas as pd
 
     from telerig.estimator.tracking.results_folder import write_tracking

@@ -52,15 +52,15 @@ def export(
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Export although: stale (the inputs have changed since the results were made). "
-            "Can be given several times."
+            help="Export results in spite of a fault: --accept stale, for results whose inputs "
+            "have changed since. Can be given several times."
         ),
     ] = None,
     first_pixel: Annotated[
         float,
         typer.Option(
-            help="For soloff: u and v that the other program gives the centre of the top-left "
-            "pixel: 0 if it counts pixels from 0, as telerig does, 1 for MATLAB."
+            help="For soloff: coordinates of the centre of the top-left pixel in the other "
+            "program: 0 if it counts pixels from 0, as telerig does; 1 for MATLAB."
         ),
     ] = 0.0,
 ) -> None:

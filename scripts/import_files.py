@@ -106,7 +106,7 @@ def accelerometer(
         float | None, typer.Option(help="Sampling rate, for a file without times.")
     ] = None,
     start_s: Annotated[
-        float, typer.Option(help="Added to all times, to bring them to the run's clock.")
+        float, typer.Option(help="Time in s that is added to bring times to the run's clock.")
     ] = 0.0,
     unit: Annotated[
         str | None,
@@ -171,12 +171,13 @@ def records(
     if listed is None:
         if remove is not None:
             raise InputError(
-                f"--remove {remove}: no run is given", todo="give it with --list DATASET/runs/NAME"
+                f"--remove {remove}: no run is given",
+                todo="give the run with --list DATASET/runs/NAME",
             )
         return
     if context.invoked_subcommand:
         raise InputError(
-            f"--list and {context.invoked_subcommand} are given", todo="give one of them"
+            f"--list and {context.invoked_subcommand} are given", todo="give only one of them"
         )
     _check_run(listed)
     file = listed / "accelerometer.csv"

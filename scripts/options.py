@@ -82,35 +82,41 @@ AcceptedFaults = Annotated[
     list[str] | None,
     typer.Option(
         "--accept",
-        help="Code of a fault of a sensor that is to be used as it is. The refusal names it.",
+        help="Use a sensor although it was refused: code of the fault, which the error names. Can "
+        "be given several times.",
     ),
 ]
 Cluster = Annotated[
     str | None,
-    typer.Option(help="Detect bubbles on a Dask cluster; its scheduler, tcp://host:port."),
+    typer.Option(
+        help="Detect bubbles on a Dask cluster: its scheduler's address, tcp://host:port."
+    ),
 ]
 Report = Annotated[bool, typer.Option(help="Write report.html.")]
 Quiet = Annotated[bool, typer.Option(help="Print the summary only.")]
 
 
 def split_names(text: str | None) -> list[str] | None:
-    """Names that commas separate; None for None."""
+    """Return the names in a text in which they are separated by commas; None for None."""
     return None if text is None else [name.strip() for name in text.split(",")]
 
 
 def numbers_of(option: str, text: str, count: int, separator: str, todo: str) -> list[float]:
-    """The numbers of an option's text. Raises InputError where there are not ``count`` of them."""
+    """Return the numbers in the text of an option.
+
+    Raises InputError, with the advice ``todo``, if there are not ``count`` of them.
+    """
     try:
         numbers = [float(word) for word in text.lower().split(separator)]
     except ValueError:
         numbers = []
     if len(numbers) != count:
-        raise InputError(f"{option} {text}: there is no such choice", todo=todo)
+        raise InputError(f"{option} {text}: {count} numbers are needed", todo=todo)
     return numbers
 
 
 def chosen(option: str, text: str | None, choices: tuple[str, ...]) -> Any:
-    """The text of an option, or None. Raises InputError for another word than ``choices``."""
+    """Return the text of an option, or None. Raises InputError if it is none of ``choices``."""
     if text is not None and text not in choices:
         todo = "use " + " or ".join(f"{option} {word}" for word in choices)
         raise InputError(f"{option} {text}: there is no such choice", todo=todo)

@@ -29,13 +29,13 @@ def plan(
     zigzag_mm: Annotated[float, typer.Option(help="RMS of the zigzag in mm.")] = 1.4,
     shake_hz: Annotated[float, typer.Option(help="Frequency of the rig's shake in Hz.")] = 20.0,
     shake_mm: Annotated[
-        float, typer.Option(help="RMS of the shake along the vertical in mm; half across it.")
+        float, typer.Option(help="RMS of the shake along the vertical in mm; half as much across.")
     ] = 0.15,
     marks: Annotated[
         int, typer.Option(help="Number of marks in each view that are fixed to the tank.")
     ] = 0,
     views: Annotated[
-        int, typer.Option(help="Views of the target, where the dataset is not calibrated yet.")
+        int, typer.Option(help="Number of views of the target, if it is not calibrated yet.")
     ] = 12,
     calibration: options.GivenCalibration = None,
     out: Annotated[Path | None, typer.Option(help="CSV file for the table [none].")] = None,

@@ -253,7 +253,10 @@ def recording_words(done: Recording) -> str:
 def _device_words(device: dict[str, Any]) -> Iterator[str]:
     yield f"{device['readings']} readings"
     if not device["readings"]:
-        yield "nothing came: is it switched on, and must it be polled (poll in rig.toml)?"
+        yield (
+            "it sent nothing: check that it is switched on, and whether it has to be polled (poll "
+            "in rig.toml)"
+        )
     if device["rate_hz"]:
         yield f"{device['rate_hz']:.6g} Hz"
     if device["lost"]:
@@ -274,13 +277,15 @@ def _clock_words(device: dict[str, Any]) -> Iterator[str]:
         yield (
             f"its clock: drift {clock['drift_ppm']:+.2f} ppm (standard deviation "
             f"{clock['sd_drift_ppm']:.2g} ppm); offset with a standard deviation of "
-            f"{clock['sd_offset_us']:.2g} µs, apart from the least delay of the line; readings "
-            f"arrive {clock['delay_median_ms']:.2g} ms later than that (median)"
+            f"{clock['sd_offset_us']:.2g} µs, not counting the unknown least delay of the line; "
+            f"readings arrive {clock['delay_median_ms']:.2g} ms later than this least delay "
+            "(median)"
         )
     if device["time_sd_ms"] is not None and device["readings"]:
         yield (
             f"it sends no time stamps: its times are from {device['time_from']}, with a standard "
-            f"deviation of {device['time_sd_ms']:.2g} ms, apart from the least delay of the line"
+            f"deviation of {device['time_sd_ms']:.2g} ms, not counting the unknown least delay of "
+            "the line"
         )
     if device["half_question_to_answer_ms"]:
         half = device["half_question_to_answer_ms"]

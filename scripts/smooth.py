@@ -35,8 +35,8 @@ def smooth(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Results folder [DATASET/results/NAME]. For several runs: a folder for the folder "
-            "of each run."
+            help="Results folder [DATASET/results/NAME]. For several runs: a folder in which each "
+            "run gets a folder."
         ),
     ] = None,
     model: Annotated[

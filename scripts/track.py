@@ -35,7 +35,7 @@ def track(
     ] = 8.0,
     source: Annotated[
         str | None,
-        typer.Option("--from", help="Needed when the run has both: images or detections."),
+        typer.Option("--from", help="Use images or detections; needed if the run has both."),
     ] = None,
     frames: Annotated[
         str | None,
@@ -90,7 +90,7 @@ def track(
 
 
 def first_frames(text: str) -> int:
-    """Return how many frames 0:N are. Raises InputError for anything else."""
+    """Return the number N of frames for the text 0:N. Raises InputError for any other text."""
     first, colon, stop = text.partition(":")
     if not colon or first not in ("", "0") or not (stop.isascii() and stop.isdecimal()):
         raise InputError(
@@ -116,7 +116,10 @@ def cameras_without_rig(run: Path, calibration: Calibration) -> dict[str, Any]:
 
 
 def default_folder(run: Path) -> Path:
-    """results/NAME of the dataset that holds the run, else results/ inside the run."""
+    """Return the results folder of a run: results/NAME in its dataset, or results/ inside the run.
+
+    The latter is for a run that belongs to no dataset.
+    """
     place = run.resolve()
     if place.parent.name == "runs":
         return place.parent.parent / "results" / place.name

@@ -22,7 +22,9 @@ def validate(
     run: options.Run,
     calibration: options.CalibrationFiles = None,
     out: options.RunFolder = None,
-    marks: Annotated[int, typer.Option(min=1, help="How many marks are withheld in turn.")] = 6,
+    marks: Annotated[
+        int, typer.Option(min=1, help="Number of marks that are withheld, one after the other.")
+    ] = 6,
     model: Annotated[
         str, typer.Option(help="Priors of the shake, as of `telerig smooth`: auto or default.")
     ] = "auto",

@@ -60,7 +60,10 @@ class Finding:
 
 
 class SensorError(InputError):
-    """A sensor's record contradicts the images, the rig, or another sensor; shows one finding."""
+    """A sensor's record contradicts the images, the rig, or another sensor.
+
+    The message is about the first finding; ``findings`` has all of them.
+    """
 
     def __init__(self, *args: Any, findings: Sequence[Finding] = (), **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

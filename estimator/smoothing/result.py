@@ -47,8 +47,8 @@ class Smoothing(ShortText):
         from the shake; empty if this was not judged.
     summary : the rest of smoothing.json.
     model : the hyper-parameters that were used.
-    tables : which hold ``trajectories``, ``shake``, ``states`` and ``bodies``; those of a long run,
-        which was smoothed in pieces, are read from files when they are asked for.
+    tables : object that holds ``trajectories``, ``shake``, ``states`` and ``bodies``. The tables of
+        a long run, which was smoothed in pieces, are read from files when they are asked for.
     states : the estimated states of the bubbles, one row for each row of ``trajectories``, and of
         the shake, one row for each frame, with their covariances and with the rows that give
         positions and velocities from them: the group "states" of results.h5. Empty if a folder has
@@ -187,9 +187,10 @@ class Smoothing(ShortText):
 
 
 def bubble_table(smoothing: Smoothing, fluid: Any = None) -> pd.DataFrame:
-    """Return what is known of each bubble in each frame: size, shape, motion and forces.
+    """Return size, shape, motion and forces of each bubble in each frame.
 
-    One row for each row of ``smoothing.trajectories``; `docs/bubbles.md` describes the columns.
+    The table has one row for each row of ``smoothing.trajectories``; `docs/bubbles.md` describes
+    the columns.
     fluid : a mapping with the keys of [fluid] in rig.toml (density_kg_m3, viscosity_pa_s,
         surface_tension_n_m, and if known velocity_mm_s, gas_density_kg_m3); None for the one of the
         run's rig.toml. Without one the dimensionless numbers are NaN.
@@ -208,7 +209,7 @@ def bubble_table(smoothing: Smoothing, fluid: Any = None) -> pd.DataFrame:
 def bubble_summary(
     smoothing: Smoothing, bubbles: pd.DataFrame | None = None, fluid: Any = None
 ) -> pd.DataFrame:
-    """Return one row per bubble: sizes, rise velocity, oscillations and forces in the mean.
+    """Return a table with one row per bubble: mean size, rise velocity, oscillations and forces.
 
     bubbles : what `bubble_table` returned for the same fluid; None to compute it.
     fluid : as for `bubble_table`. `docs/bubbles.md` describes the columns.

@@ -44,7 +44,12 @@ def write_calibration(
     images: bool,
     complete: Callable[[RigDescription], RigDescription] = lambda rig: rig,
 ) -> tuple[Mapping[str, Camera], TrueTarget]:
-    """Write `rig.toml`, `calibration/` and `truth/`; return the true cameras and the target."""
+    """Write `rig.toml`, `calibration/` and `truth/` of a simulated dataset.
+
+    images : whether images are rendered; otherwise dots.csv is written. complete : function that
+    adds further tables to rig.toml.
+    Returns the true cameras by name, and the true target.
+    """
     seed = seed_of(rng)
     scene_rng, dots_rng, image_rng = rng.spawn(3)
     cameras = true_cameras(settings)
@@ -85,7 +90,7 @@ def write_calibration(
 
 
 def rig_description(config: SimulationConfig, target: TrueTarget) -> RigDescription:
-    """Return the rig as it is known before calibration: with nominal values, not the true ones."""
+    """Return the rig as a user knows it before the calibration, with nominal values."""
     cameras = {
         c.name: CameraDescription(
             c.name, c.image_size_px, c.nominal_scale_px_per_mm, c.nominal_telecentricity_per_mm
@@ -105,7 +110,10 @@ def exact_dots(
     target: TrueTarget,
     views: list[View],
 ) -> pd.DataFrame:
-    """Return the true pixels of all dots in the images; `inside` is 1 for dots off the border."""
+    """Return a table of the true pixels of all dots in the images.
+
+    The column inside is 1 for dots that lie completely inside the image and away from its border.
+    """
     row, column = config.target.row_column_from_id(target.ids)
     tables = []
     for view in views:
@@ -214,7 +222,7 @@ def _pose_truth(pose: Pose) -> dict[str, Any]:
 
 
 def seed_of(rng: np.random.Generator) -> dict[str, Any]:
-    """Return what it takes to make the same generator again."""
+    """Return the entropy and the key with which the same random generator can be made again."""
     sequence = rng.bit_generator.seed_seq
     entropy = getattr(sequence, "entropy", None)
     key = getattr(sequence, "spawn_key", ())

@@ -18,20 +18,21 @@ GRAVITY_M_S2 = 9.80665
 """The unit g, and the gravity of a laboratory that states none; the simulator's own constant."""
 
 MARKS_AT = 0.88
-"""Where a strip of marks stands, from the image's middle over half its width."""
+"""Place of a strip of marks: its distance from the image's middle, divided by half the width of the
+image."""
 
 MARKS_JITTER = 0.25
-"""Unevenness of a strip of marks, over their spacing."""
+"""Largest deviation of a mark's place along a strip from even spacing, divided by the spacing."""
 
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """A true camera, and what the rig file will say of it.
+    """A true camera, and what `rig.toml` states about it.
 
-    scale_px_per_mm : true; nominal_scale_px_per_mm : in `rig.toml`.
-    centre_offset_px : of the optical axis from the image's centre.
+    scale_px_per_mm : true scale. nominal_scale_px_per_mm : the scale in `rig.toml`.
+    centre_offset_px : offset of the optical axis from the image's centre.
     parameters : further true parameters by their names in `telerig.rig.lens_parameters.PARAMETERS`.
-    nominal_telecentricity_per_mm : in `rig.toml`; None leaves it out.
+    nominal_telecentricity_per_mm : the value in `rig.toml`; None leaves the key out.
     """
 
     name: str
@@ -47,30 +48,41 @@ class CameraConfig:
 class SimulationConfig:
     """A rig, a target, hand-held poses and the quality of the images.
 
-    Rig: each camera is turned by ``angle_deg`` about the rig's y axis against the one before, then
-    by the mounting error ``mount_rotvec_deg`` (of alternating sign), which the rig file does not
-    know; the optical axes pass each other at ``axis_gap_mm``. One to four cameras.
+    *Rig.* It has one to four ``cameras``. Each camera is turned by ``angle_deg`` about the rig's y
+    axis relative to the camera before it, and then by the mounting error ``mount_rotvec_deg`` (with
+    alternating sign), which `rig.toml` does not state. The optical axes pass each other at a
+    distance of ``axis_gap_mm``.
 
-    Target: true dots are off by ``target.print_sigma_mm`` in the plane and
-    ``target.flatness_sigma_mm`` out of it, times ``print_factor``. The known distance is measured
-    on the true dots, within ``target.scale_sigma_mm``. Of an unbounded grid, ``margin_dots``
-    beyond the block exist. ``ring_hole_ratio`` is a ring's hole over its diameter.
+    *Target.* The true dots deviate from the nominal ``target`` with the standard deviations
+    ``print_factor * target.print_sigma_mm`` in the plane and ``print_factor *
+    target.flatness_sigma_mm`` perpendicular to it. The known distance is that of the true dots plus
+    an error with the standard deviation ``target.scale_sigma_mm``. An unbounded grid has
+    ``margin_dots`` more rows and columns of dots on each side of the block of rows and columns. The
+    plate ends ``plate_margin_mm`` beyond the dots. ``ring_hole_ratio`` is the diameter of a ring's
+    hole divided by that of the ring.
 
-    Poses: the angle between each optical axis and the plate's normal is within ``tilt_deg``, the
-    roll within +-``roll_deg``, the middle of the target within +-``shift_mm`` of the rig's origin
-    along the rig's axes. At least ``visible_fraction`` of the dots lie wholly inside the images,
-    ``border_px`` from their border, and the marks too if ``marks_visible``. All cameras see every
-    view, or the groups of ``seen_by`` (names of cameras) in turn; the plate is tilted towards those
-    that see it. The last ``single_camera_views`` views are seen by one camera only, in turn.
+    *Poses.* There are ``views`` poses. The angle between each optical axis and the plate's normal
+    lies in the range ``tilt_deg``, the roll within +-``roll_deg``, and the middle of the target
+    within +-``shift_mm`` of the rig's origin along each axis of the rig. At least
+    ``visible_fraction`` of the dots, and all marks if ``marks_visible``, lie completely inside the
+    images and ``border_px`` or more from their border. If ``seen_by`` is given, its groups (names
+    of cameras) see the views in turn, and the plate is tilted towards the cameras of the group;
+    otherwise all cameras see every view. Each of the last ``single_camera_views`` views is seen by
+    one camera only, in turn.
 
-    Dot tables (no images): ``sigma_px`` per coordinate; a share ``outlier_fraction`` is off by
-    ``outlier_px`` (standard deviation) besides. With ``sigma_px`` 0 the table is exact.
+    *Tables of dots, in place of images.* Each coordinate has noise of the standard deviation
+    ``sigma_px``; the share ``outlier_fraction`` of the dots has a further error of the standard
+    deviation ``outlier_px``. With ``sigma_px`` 0 the table is exact.
 
-    Images: ``blur_px`` (Gaussian sigma); ``noise`` is that of reading over the contrast between
-    dot and plate; ``shot_noise`` at full scale, over full scale; ``white``, ``black`` and
-    ``background`` are fractions of full scale. ``light_gradient`` per half diagonal in a random
-    direction, ``vignetting`` in the corners, ``exposure_spread`` from image to image (relative),
-    ``glare`` (strength over full scale) at a random place, ``dirt`` specks per plate.
+    *Images.* ``blur_px`` is the standard deviation of a Gaussian blur. ``noise`` is the standard
+    deviation of the read noise divided by the contrast between dot and plate. ``shot_noise`` is the
+    standard deviation of the shot noise at full scale, as a share of full scale. ``bit_depth`` is
+    the number of bits of a pixel. ``white``, ``black`` and ``background`` are grey levels as shares
+    of full scale. The light changes relatively by ``light_gradient`` over half the diagonal in a
+    random direction, by ``vignetting`` towards the corners, and by ``exposure_spread`` (standard
+    deviation) from image to image. ``glare`` is the strength, as a share of full scale, of a bright
+    spot of ``glare_radius_px`` at a random place. ``dirt`` is the number of specks on the plate, of
+    diameters in the range ``dirt_diameter_mm``.
     """
 
     name: str
@@ -130,16 +142,20 @@ class SimulationConfig:
 
 @dataclass(frozen=True)
 class BubbleConfig:
-    """Sizes, shapes and looks of bubbles; a range is drawn from evenly, once for each bubble.
+    """Sizes, shapes and appearance of bubbles.
 
-    d_eq_mm : diameter of the sphere of equal volume; aspect : large over small semi-axis, or
-    "wellek" for that of contaminated bubbles in the run's liquid (Wellek 1966); the small one along
-    the path, and half of ``triaxial`` more or less between the two large ones.
-    modes_static, modes_oscillating : greatest relative amplitude of each mode of a degree
-    (2, 3, 4), constant and swinging at the frequency that surface tension gives (Lamb), times
-    ``tone``. spin_hz : about the small axis.
-    heart_radius, heart : see `telerig.io.simulation.images.bubbles.Look`; heart 0 makes
-        bubbles dark all over.
+    For each bubble, a number is drawn from every range with equal probability.
+
+    d_eq_mm : diameter of the sphere of equal volume.
+    aspect : large over small semi-axis; "wellek" for that of contaminated bubbles in the run's
+        liquid (Wellek 1966). The small semi-axis lies along the path.
+    triaxial : relative difference of the two large semi-axes.
+    modes_static, modes_oscillating : by degree (2, 3, 4), the largest relative amplitude of each
+        shape mode that is constant, and of each that oscillates. The frequency of oscillation is
+        the one that surface tension gives (Lamb), multiplied by ``tone``.
+    spin_hz : rotation about the small semi-axis.
+    rim, heart, heart_radius, heart_sharpness, heart_offset, ring : appearance, see
+        `telerig.io.simulation.images.bubbles.Look`; with heart 0 bubbles are dark all over.
     """
 
     d_eq_mm: Range = (4.0, 5.0)
@@ -161,18 +177,23 @@ class BubbleConfig:
 class MotionConfig:
     """Paths of the bubbles in the laboratory.
 
-    path : "forces" integrates the equation of motion in the run's liquid (`FluidConfig`): buoyancy,
-    added mass, drag, and a lift across the velocity. The lift is ``lift`` times the buoyancy,
-    swinging at ``lateral_hz``, which makes the zigzag, and noise of RMS ``lift_noise`` times it,
-    which forgets within ``lift_tau_s``. Sizes decide the speed; ``rise_mm_s`` tells only how many
-    bubbles exist and how fast the stage is.
-    "zigzag" and "helix" have a constant speed ``rise_mm_s`` along the path and the lateral
-    amplitude ``lateral_mm``; "stochastic" rises at ``rise_mm_s`` in the mean, with the stochastic
-    oscillations ``height_oscillation`` and ``lateral_oscillation``.
-    wander_mm_s, wander_tau_s : Ornstein-Uhlenbeck velocity on every axis, added to any path.
-    spread : half size (x, z) of the space in which bubbles start, over half the image's width.
-    pairs : two bubbles share a path, pass at ``closest_mm``, and are ``apart_mm`` apart ``apart_s``
-    later.
+    path : kind of the paths.
+        "forces" integrates the equation of motion in the run's liquid (`FluidConfig`): buoyancy,
+        added mass, drag, and a lift across the velocity. The lift oscillates at ``lateral_hz`` with
+        the amplitude ``lift`` times the buoyancy, which causes the zigzag, and has noise of the RMS
+        ``lift_noise`` times the buoyancy and the correlation time ``lift_tau_s``. The speed follows
+        from the sizes; ``rise_mm_s`` only determines how many bubbles there are and the speed of
+        the stage.
+        "zigzag" and "helix" have a constant speed ``rise_mm_s`` along the path, and a lateral
+        amplitude ``lateral_mm`` at the frequency ``lateral_hz``.
+        "stochastic" has the mean rise velocity ``rise_mm_s`` and the stochastic oscillations
+        ``height_oscillation`` and ``lateral_oscillation``.
+    wander_mm_s, wander_tau_s : RMS and correlation time of an Ornstein-Uhlenbeck velocity along
+        every axis, which is added to any path.
+    spread : half the size (x, z) of the space in which bubbles start, divided by half the width of
+        the image.
+    pairs : whether two bubbles each share a path. They pass each other at the distance
+        ``closest_mm``, and are ``apart_mm`` apart ``apart_s`` later.
     """
 
     path: Literal["zigzag", "helix", "stochastic", "forces"] = "zigzag"
@@ -195,10 +216,10 @@ class MotionConfig:
 
 @dataclass(frozen=True)
 class FluidConfig:
-    """The liquid, at rest: written into rig.toml, and what drives bubbles of the path "forces".
+    """The liquid, which is at rest. It is written into rig.toml and drives paths of "forces".
 
-    law : whose terminal velocity gives each bubble's drag coefficient, which depends on its size
-    alone: `telerig.rig.bubble_physics`.
+    law : the law of the terminal velocity (`telerig.rig.bubble_physics`) from which the drag
+    coefficient of each bubble follows. The coefficient depends only on the size of the bubble.
     """
 
     density_kg_m3: float = 998.2
@@ -211,14 +232,23 @@ class FluidConfig:
 class StageConfig:
     """The stage and how it shakes.
 
-    follow : its speed over the bubbles' mean rise; ramp_s : of the start from rest at t = 0.
-    servo_* : the following error, seen by the encoder. encoder_sigma_mm, encoder_rate_hz;
-    it reads 1 + encoder_scale times the travel. axis_* : views of a target at rest, or none.
-    shake_mm : amplitude A; every camera's offset along the axis has RMS A / sqrt 2, across it
-    ``shake_lateral`` times that. shake_* : see `telerig.io.simulation.run.motion.rig_shake`.
-    accelerometers : mounted on cameras' arms (by name) or on the "carriage"; written if any.
-    accelerometer_delay_s : a reading stamped t describes t - delay.
-    gravity_m_s2 : of the laboratory; written into rig.toml.
+    follow : speed of the stage divided by the bubbles' mean rise velocity. ramp_s : duration of the
+        start from rest at t = 0.
+    servo_hz, servo_damping, servo_rms_mm : frequency, damping ratio and RMS of the servo's
+        following error, which the encoder measures.
+    encoder_sigma_mm, encoder_rate_hz : noise and sampling rate of the encoder. encoder_scale : its
+        relative scale error; it reads 1 + encoder_scale times the travel.
+    axis_views, axis_travel_mm : number of views of a target at rest from different positions of the
+        stage, 0 for none, and the travel that they span.
+    shake_mm : amplitude A of the shake: the offset of every camera along the axis of travel has the
+        RMS A / sqrt(2). shake_lateral : RMS across the axis, divided by that along it.
+    shake_hz, shake_common, shake_arm_ratio, shake_damping, force_hz : see
+        `telerig.io.simulation.run.motion.rig_shake`.
+    accelerometers : what carries an accelerometer: names of cameras, for their arms, or "carriage".
+    accelerometer_rate_hz, accelerometer_density_ug, accelerometer_bias_m_s2 : sampling rate, noise
+        density in micro-g per root hertz, and standard deviation of the bias.
+    accelerometer_delay_s : delay of the sensors; a reading with the time t describes t - delay.
+    gravity_m_s2 : gravity in the laboratory; it is written into rig.toml.
     """
 
     follow: float = 1.0
@@ -250,13 +280,21 @@ class StageConfig:
 class ImageConfig:
     """The images of a run.
 
-    screen : brightness over full scale; screen_fixed_to : "rig" (the screen rides on the stage and
-    stands still in the image) or "lab" (it stays behind). texture (RMS), gradient, vignetting:
-    relative. blur_px : Gaussian sigma in focus; defocus_px_per_mm : further sigma, added in
-    quadrature, per mm of depth. window_dirt : specks per image area, fixed to the lab;
-    lens_dirt : specks fixed in the image. flicker : relative, from frame to frame.
-    dropped : share of frames that a camera loses, named in the column missing of `frames.csv`.
-    pages : one multi-page file per camera.
+    screen : brightness of the backlit screen, as a share of full scale. screen_fixed_to : "rig" if
+        the screen moves with the stage, so that it stands still in the image; "lab" if it stands
+        still in the laboratory.
+    texture, gradient, vignetting : relative variations of its brightness: RMS of a random texture,
+        change over half the diagonal, loss in the corners.
+    exposure_s : exposure time, during which bubbles are smeared.
+    blur_px : standard deviation of the Gaussian blur in focus. defocus_px_per_mm : standard
+        deviation of a further blur per mm of depth, added in quadrature.
+    window_dirt : number of specks in the area of an image that are fixed to the laboratory.
+        lens_dirt : number of specks that stand still in the image.
+    flicker : relative standard deviation of the brightness from frame to frame.
+    read_noise, shot_noise : standard deviations as shares of full scale, the latter at full scale.
+    bit_depth, left_aligned : see `telerig.io.simulation.images.sensor.digitise`.
+    dropped : share of frames that a camera loses; the column missing of `frames.csv` names them.
+    pages : whether each camera's images are one multi-page file.
     """
 
     screen: float = 0.7
@@ -280,13 +318,18 @@ class ImageConfig:
 
 @dataclass(frozen=True)
 class TableConfig:
-    """`detections.csv`, which stands in for images, and `references.csv`.
+    """The tables `detections.csv`, which replaces images, and `references.csv`.
 
-    centre : what the noisy pixel is of, the silhouette's area centroid or the projected centre of
-    volume. missed : share of detections left out; false_per_image : added at random places.
-    particle_ids : whether the table says which detection is which bubble. noisy_axes : whether the
-    semi-axes and angles are noisy, too, as those of an outline whose centre has ``sigma_px``.
-    references : marks fixed to the tank that each camera sees at a time, 0 for none.
+    sigma_px : standard deviation of a detection's pixel coordinates.
+    centre : the point that is detected: "silhouette", the centroid of the silhouette's area, or
+        "volume", the projected centre of volume.
+    missed : share of bubbles that are not detected. false_per_image : mean number of false
+        detections at random places.
+    particle_ids : whether the table states which bubble each detection belongs to.
+    noisy_axes : whether the semi-axes and angles have noise, too, as those of an outline whose
+        centre has the noise ``sigma_px``.
+    references : number of marks fixed to the tank that each camera sees at a time, 0 for none.
+    reference_sigma_px : standard deviation of a mark's pixel coordinates.
     """
 
     sigma_px: float = 0.1
@@ -303,8 +346,10 @@ class TableConfig:
 class StripConfig:
     """A strip of dots fixed to the tank for each camera, drawn into the images.
 
-    dots : in view at a time. diameter_mm. transmission : of the ink. at, jitter : as `MARKS_AT`,
-    `MARKS_JITTER`. depth_mm : its depth is drawn from -depth_mm to depth_mm.
+    dots : number of dots in view at a time. diameter_mm : of a dot. transmission : share of light
+    that the ink lets through.
+    at, jitter : place of the strip and unevenness of the dots, as `MARKS_AT`, `MARKS_JITTER`.
+    depth_mm : the depth of the strip is drawn between -depth_mm and depth_mm.
     """
 
     dots: int = 6
@@ -317,8 +362,11 @@ class StripConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """A run and its calibration; ``bubbles`` in view at a time; ``strip`` drawn into images.
+    """A run and its calibration.
 
+    frames, frame_rate_hz : number of frames, and their rate. bubbles : number of bubbles in view at
+    a time. bubble, motion, stage, image, table : the parts of the configuration.
+    strip : strip of dots that is drawn into the images; None for none.
     fluid : the liquid; None leaves it out of rig.toml.
     """
 

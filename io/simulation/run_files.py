@@ -62,8 +62,8 @@ LEAST_ACCELEROMETER_SIGMA = 1e-4
 def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images: bool) -> None:
     """Write a whole dataset into an empty folder: the calibration and `runs/<preset>/`.
 
-    The children of ``rng`` draw each part by itself, so that the same seed gives the same bubbles
-    with images or without.
+    Each part has a random generator of its own, made from ``rng``, so that the same seed gives the
+    same bubbles with and without images.
     """
     seed = seed_of(rng)
     calibration_rng, scene_rng, sensor_rng, image_rng, table_rng, stage_rng = rng.spawn(6)
@@ -369,10 +369,11 @@ def write_stage_axis(
     *,
     images: bool,
 ) -> None:
-    """Write positions.csv with images or dots.csv into ``folder / "stage_axis"``, and the truth.
+    """Write views of a target at rest, from several stage positions, into ``folder/stage_axis``.
 
-    The travel is ``stage.axis_travel_mm``, or less where the target would leave the images. Raises
-    InputError for fewer than three views, or when no pose keeps the target in them.
+    These are positions.csv, with images or dots.csv; the truth is written, too. The travel is
+    ``stage.axis_travel_mm``, or less if the target would leave the images. Raises InputError for
+    fewer than three views, or if no pose keeps the target in the images.
     """
     if config.stage.axis_views < _LEAST_VIEWS:
         raise InputError(

@@ -27,11 +27,13 @@ def simulate(
     """Write a dataset with known truth and load it: a calibration, or a run with its calibration.
 
     config : the name of a preset, or a configuration (`telerig.io.simulation.presets`).
-    rng : the same seed gives the same bytes, and the same rig, target, poses and bubbles with
-    images or without.
+    rng : random generator; the same seed gives the same files. With and without images, the rig,
+    the target, the poses and the bubbles are the same.
     out : a new or empty folder; None makes a temporary one, which the caller may delete.
-    images : render TIFF images; False writes dots.csv and detections.csv with noisy true centres.
-    Raises InputError for an unknown preset, demands that no pose meets, or a folder in use.
+    images : whether TIFF images are rendered; otherwise dots.csv and detections.csv are written,
+    with the true centres plus noise.
+    Returns the dataset. Raises InputError for an unknown preset, for conditions that no pose of the
+    target fulfils, or for a folder that is not empty.
     """
     settings = any_preset(config) if isinstance(config, str) else config
     final = _new_folder(out)

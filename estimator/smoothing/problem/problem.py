@@ -78,14 +78,18 @@ class CarriageModel:
 
 @dataclass(frozen=True)
 class ShakeModel:
-    """Every hyper-parameter of the smoother.
+    """All hyper-parameters of a smoothing: the priors of bubbles and shake, and the sensors' noise.
 
-    modes, broad_bands : vibrations of the rig. encoder_sigma_mm : standard deviation (sd) of one
-    reading. encoder_scale_sigma, accelerometer_scale_sigma, encoder_delay_sigma_s,
-    accelerometer_delay_sigma_s : prior sd of relative scale errors and delays; 0 if they are not
-    estimated.
-    pixel_inflation : factor of the stated pixel noise. name : origin of the values, in words.
-    learned : sd of the natural logarithm of each learned hyper-parameter, by name.
+    bubble : prior of the bubbles' motion. modes, broad_bands : vibrations of the rig. carriage :
+    prior of the carriage's motion.
+    encoder_sigma_mm : standard deviation of an encoder reading.
+    encoder_scale_sigma, accelerometer_scale_sigma : prior standard deviations of the relative scale
+    errors; 0 if they are not estimated.
+    encoder_delay_sigma_s, accelerometer_delay_sigma_s : the same for the delays.
+    pixel_inflation : factor by which the stated noise of pixels is multiplied.
+    name : origin of the values, in words.
+    learned : for each learned hyper-parameter, by name, the standard deviation of its natural
+    logarithm.
     """
 
     bubble: BubbleModel = field(default_factory=BubbleModel)

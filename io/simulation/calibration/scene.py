@@ -21,9 +21,11 @@ _TRIES = 2000
 
 @dataclass(frozen=True)
 class TrueTarget:
-    """ids : (N,); points_mm : (N, 3) true centres in the target's frame; plate : as rendered.
+    """The true target with N dots.
 
-    scale_distance_mm : the known distance as measured; None when the target has none.
+    ids : (N,). points_mm : (N, 3) true centres in the target's frame. diameter_mm : (N,).
+    plate : the plate as it is rendered.
+    scale_distance_mm : the known distance of two dots, as it was measured; None if there is none.
     """
 
     ids: Ints
@@ -35,7 +37,7 @@ class TrueTarget:
 
 @dataclass(frozen=True)
 class View:
-    """One pose of the target; ``cameras`` are the names of those that see it."""
+    """One pose of the target; ``cameras`` are the names of the cameras that see it."""
 
     name: str
     rig_from_target: Pose
@@ -43,7 +45,10 @@ class View:
 
 
 def nominal_rotation(config: SimulationConfig, camera: int = 1) -> Array:
-    """Return (3, 3) <camera>_from_first of a camera, counted from 0, as the rig file states it."""
+    """Return the nominal rotation (3, 3) from the first camera to another, as rig.toml states it.
+
+    camera : index of the other camera.
+    """
     return rotation_from_rotvec([0.0, np.radians(camera * config.angle_deg), 0.0])
 
 
@@ -91,7 +96,7 @@ def _camera(config: CameraConfig, camera_from_rig: Pose) -> Camera:
 
 
 def true_target(config: SimulationConfig, rng: np.random.Generator) -> TrueTarget:
-    """Print the target: displaced dots, a plate round them, dirt, and the measured distance."""
+    """Return a random true target: displaced dots, the plate, dirt, and the measured distance."""
     target = config.target
     ids = _all_ids(config)
     nominal = target.nominal_mm(ids)
@@ -149,7 +154,10 @@ def hand_held_views(
     target: TrueTarget,
     rng: np.random.Generator,
 ) -> list[View]:
-    """Return random views that meet ``config``. Raises InputError if no such pose is found."""
+    """Return random views of the target that fulfil the conditions of ``config``.
+
+    Raises InputError if no such pose is found.
+    """
     names = tuple(cameras)
     groups = config.seen_by or (names,)
     unknown = sorted({name for group in groups for name in group} - set(names))
@@ -235,7 +243,10 @@ def _rotation(normal: Array, roll_deg: float, rng: np.random.Generator) -> Array
 
 
 def wholly_inside(camera: Camera, pose: Pose, target: TrueTarget, border_px: float) -> Bools:
-    """Return (N,) whether each dot, its rim included, lies inside the image and off its border."""
+    """Return (N,) whether each dot lies completely inside the image.
+
+    border_px : least distance of its rim from the border.
+    """
     uv = pixel_from_plate(camera, pose, target.points_mm, target.plate)
     radius = 1.03 * target.diameter_mm / 2 * camera["scale_px_per_mm"] * max(1, camera["aspect"])
     to_border_px = np.minimum(uv, np.array(camera.image_size_px) - 1 - uv).min(-1)

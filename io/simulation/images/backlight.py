@@ -76,7 +76,11 @@ def random_screen(
 
 @dataclass(frozen=True)
 class Specks:
-    """Specks of dirt: places (specks, 2), sd of a Gaussian (px), and share of light absorbed."""
+    """Specks of dirt, which absorb light with a Gaussian profile.
+
+    uv_px : (specks, 2) places. sigma_px : (specks,) standard deviation of the profile.
+    depth : (specks,) share of light that is absorbed in the middle.
+    """
 
     uv_px: Array
     sigma_px: Array
@@ -108,7 +112,10 @@ def random_specks(
     sigma_px: tuple[float, float],
     depth: tuple[float, float],
 ) -> Specks:
-    """Draw ``count`` specks, evenly distributed in the rectangle between two corners (2,)."""
+    """Return ``count`` random specks in the rectangle between two corners.
+
+    low_px, high_px : (2,) the corners. sigma_px, depth : ranges of the specks' sizes and depths.
+    """
     places = rng.uniform(low_px, high_px, (count, 2))
     sigma = _log_uniform(rng, sigma_px, count)
     return Specks(places, sigma, rng.uniform(*depth, count))

@@ -28,9 +28,10 @@ _NEWTON = 4
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies in one frame (rig or lab), any leading batch shape.
+    """Deformed ellipsoids, with coordinates either in the rig or in the laboratory frame.
 
-    origin_mm : (..., 3) of the sphere that was deformed, which is not the centre of volume.
+    origin_mm : (..., 3) centre of the ellipsoid that was deformed by the modes. It is not the
+    centre of volume.
     rotation : (..., 3, 3) frame_from_body; semi_axes_mm : (..., 3) along the body's axes.
     modes : (..., 21) relative amplitudes in the order of `MODES`.
     """
@@ -112,11 +113,11 @@ def surface_modes(directions: Array) -> Array:
 
 
 def outline_px(bodies: Bodies, camera: Camera, count: int = 128) -> Array:
-    """Return the outlines (..., count, 2) of bodies in the rig frame, in px, even in a smooth
-    parameter.
+    """Return the outlines (..., count, 2) in px of bodies in the rig frame.
 
-    Points of the rim are found for the ray through the body's origin and projected one by one:
-    exact for kappa = 0, else within size * (kappa size)^2 / 8.
+    The points are evenly spaced in a smooth parameter. The points of the rim are found for the
+    direction of the ray through the body's origin and are projected one by one. This is exact for
+    kappa = 0; otherwise the error is at most size * (kappa size)^2 / 8.
     """
     shape = bodies.origin_mm.shape[:-1]
     uv = camera.project(bodies.origin_mm.reshape(-1, 3))

@@ -28,11 +28,16 @@ _STILL_PX = 0.02
 
 @dataclass(frozen=True)
 class Look:
-    """Describe how a bubble's inside looks, in transmission; lengths are relative to its radius.
+    """Describe how a bubble looks against the light.
 
-    rim : of the dark part. heart : of the bright middle (equal to rim: no heart), half as bright at
-    heart_radius, with the exponent heart_sharpness (2.5 as in real images, from 20 on a disc).
-    ring : of a faint ring at ring_radius, up to twice as bright below and fading above.
+    rim, heart, ring are transmissions, 0 (dark) to 1; all lengths are relative to the radius.
+
+    rim : transmission of the dark part.
+    heart : transmission of the bright middle; if it equals rim, there is no bright middle. It falls
+    to half at heart_radius, with the exponent heart_sharpness (2.5 as in real images; from 20 on
+    the middle is a disc with a sharp edge). heart_offset : (2,) place of the bright middle.
+    ring : transmission of a faint ring at ring_radius, of the width ring_width; it is up to twice
+    as bright at the bottom and fades towards the top.
     """
 
     rim: float = 0.1
@@ -45,9 +50,10 @@ class Look:
     ring_width: float = 0.05
 
     def transmission(self, du: Array, dv: Array, axes: Array) -> Float32:
-        """Return (len(dv), len(du)) at offsets in px from the silhouette's centroid.
+        """Return the transmission (len(dv), len(du)) at offsets du, dv in px from the centroid.
 
-        axes : (2, 2) px, maps the unit circle to the ellipse of the silhouette's moments.
+        axes : (2, 2) in px, the matrix that maps the unit circle to the ellipse that has the same
+        second moments as the silhouette.
         """
         inverse = np.linalg.inv(axes)
         metric = inverse.T @ inverse
@@ -76,7 +82,11 @@ def _square(du: Array, dv: Array, metric: Array) -> Float32:
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A bubble as a camera sees it: outline (N, 2), blur of the defocus, motion during exposure."""
+    """A bubble as a camera sees it.
+
+    outline_px : (N, 2). blur_px : standard deviation of the blur. smear_px : motion during the
+    exposure.
+    """
 
     outline_px: Array
     look: Look
@@ -94,7 +104,7 @@ class Patch:
 
 
 def absorption_patch(bubble: Silhouette) -> Patch:
-    """Return the share of light that one bubble takes, in the window that it can reach."""
+    """Return the share of light that one bubble absorbs, in the part of the image it can reach."""
     outline = bubble.outline_px
     first = np.floor(outline.min(0) + 0.5).astype(int)
     count = np.floor(outline.max(0) + 0.5).astype(int) - first + 1

@@ -81,7 +81,7 @@ def disc_coverage(
     hole_mm: Array,
     blur_px: float,
 ) -> Array:
-    """Return the share (height, width) of each pixel that N discs cover, blurred."""
+    """Return the blurred share (height, width) of each pixel that N discs cover."""
     width, height = camera.image_size_px
     near = _near_image(camera, rig_from_target, plate, centres_mm, diameter_mm, blur_px)
     centres, diameter, hole = centres_mm[near], diameter_mm[near], hole_mm[near]

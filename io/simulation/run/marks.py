@@ -20,7 +20,10 @@ _OUTLINE_POINTS = 128
 
 @dataclass(frozen=True)
 class Strip:
-    """One camera's dots: (K, 3) lab places in mm, all facing the camera, of one diameter."""
+    """The dots of a strip that is fixed to the tank, for one camera.
+
+    lab_mm : (K, 3) places in the laboratory frame; the dots face the camera. look : appearance.
+    """
 
     camera: Camera
     lab_mm: Array
@@ -28,7 +31,10 @@ class Strip:
     look: Look
 
     def seen(self, rig_from_lab_mm: Array) -> tuple[Ints, Array]:
-        """Return numbers of the dots that reach into the image, and their (M, 2) centres in px."""
+        """Return which dots reach into the image, as indices (M,), and their centres (M, 2) in px.
+
+        rig_from_lab_mm : (3,) vector that is added to a lab point to have it in the rig frame.
+        """
         rig = self.lab_mm + rig_from_lab_mm
         size = np.array(self.camera.image_size_px) - 1
         reach = self.diameter_mm * self.camera["scale_px_per_mm"]
@@ -82,10 +88,13 @@ def random_strips(scene: RunScene, rng: Generator) -> list[Strip]:
 def strip_places(
     camera: Camera, position_mm: Array, count: int, rng: Generator, *, at: float, jitter: float
 ) -> Array:
-    """Return (K, 3) lab places of a strip along the travel, ``count`` in view at a time.
+    """Return the places (K, 3) in mm, in the laboratory frame, of a strip's dots.
 
-    at : where it stands, on a random side, from the image's middle over half its width. jitter : of
-    the heights, over their spacing.
+    The strip runs along the travel, and ``count`` dots are in view at a time.
+
+    position_mm : positions of the stage. at : distance of the strip from the image's middle, on a
+    random side, divided by half the width of the image. jitter : largest deviation of the dots'
+    heights from even spacing, divided by the spacing.
     """
     size = np.array(camera.image_size_px) - 1
     height_mm = size[1] / camera["scale_px_per_mm"]
@@ -100,7 +109,7 @@ def strip_places(
 
 
 def references_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
-    """Return `references.csv`: marks on a strip for each camera, which pass through the image."""
+    """Return the content of `references.csv`: noisy pixels of the marks of one strip per camera."""
     table = scene.config.table
     parts = []
     for j, (name, camera) in enumerate(scene.cameras.items()):
@@ -121,9 +130,9 @@ def references_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
 
 
 def strip_truth(scene: RunScene, strips: Sequence[Strip]) -> pd.DataFrame:
-    """Return `truth/runs/<run>/references.csv`: every dot that reaches into an image.
+    """Return the content of `truth/runs/<run>/references.csv`: all dots that reach into an image.
 
-    The column whole is 1 when no part of the dot lies outside the image.
+    The column whole is 1 if no part of the dot lies outside the image.
     """
     parts = []
     for j, (name, strip) in enumerate(zip(scene.cameras, strips)):

@@ -123,9 +123,10 @@ def square_root(covariance: Array) -> Array:
 
 
 def ornstein_uhlenbeck(sigma: float, tau_s: float) -> LinearProcess:
-    """Return the process of the states (integral, value): a velocity of RMS sigma and time tau_s.
+    """Return the process of an Ornstein-Uhlenbeck velocity and its integral.
 
-    Its integral starts at 0.
+    The states are (integral, value). The velocity has the RMS sigma and the correlation time tau_s;
+    the integral starts at 0.
     """
     return LinearProcess(
         np.array([[0.0, 1.0], [0.0, -1 / tau_s]]), np.array([0.0, sigma * np.sqrt(2 / tau_s)])
@@ -190,9 +191,12 @@ def constant_speed_path(
     azimuth_rad: float = 0.0,
     phase_rad: float = 0.0,
 ) -> Path:
-    """Return zigzag (second amplitude 0), helix (equal ones) or between, with |velocity| constant.
+    """Return a path of constant speed whose lateral motion is an ellipse.
 
-    The lateral path is an ellipse; the height is an elliptic integral of the second kind.
+    It is a zigzag if the second of the two amplitudes is 0, and a helix if both are equal. The
+    height is an elliptic integral of the second kind.
+
+    azimuth_rad : direction of the first amplitude. phase_rad : phase at t = 0.
     Raises InputError when the lateral motion alone is faster than the speed.
     """
     from scipy.special import ellipeinc
@@ -264,10 +268,12 @@ def stochastic_paths(
 
 
 def added_mass_along(aspect: float) -> float:
-    """Return added-mass coefficient of a spheroid along its pole, by quadrature of Lamb's integral.
+    """Return the added-mass coefficient of a spheroid along its pole, by numerical integration.
 
-    gamma = a^2 c int dl / ((c^2 + l)^(3/2) (a^2 + l)) (Hydrodynamics, section 373), with l = c^2 u
-    here; the coefficient is gamma / (2 - gamma).
+    The integral is gamma = a^2 c int dl / ((c^2 + l)^(3/2) (a^2 + l)) (Lamb, Hydrodynamics, section
+    373), with l = c^2 u here; the coefficient is gamma / (2 - gamma).
+
+    aspect : equatorial semi-axis a divided by the polar one c.
     """
     from scipy.integrate import quad
 
@@ -278,12 +284,13 @@ def added_mass_along(aspect: float) -> float:
 
 @dataclass(frozen=True)
 class Forces:
-    """What drives each of B bubbles, per mass of displaced liquid.
+    """The forces on each of B bubbles, divided by the mass of the displaced liquid.
 
-    drag_1_mm : (B,) drag over speed^2; added_mass : (B,).
-    lift_mm_s2, lift_hz, lift_rad : (B,) a lift that swings; lift_azimuth : (B, 2) unit vector
-    across the vertical, to one side of which it acts. noise_mm_s2, noise_tau_s : RMS on both
-    horizontal axes, and correlation time, of an Ornstein-Uhlenbeck lift.
+    drag_1_mm : (B,) drag divided by the squared speed. added_mass : (B,) coefficient.
+    lift_mm_s2, lift_hz, lift_rad : (B,) amplitude, frequency and phase of an oscillating lift.
+    lift_azimuth : (B, 2) horizontal unit vector along which it acts.
+    noise_mm_s2, noise_tau_s : RMS along both horizontal axes, and correlation time, of a random
+    lift (Ornstein-Uhlenbeck process).
     """
 
     drag_1_mm: Array
@@ -297,9 +304,9 @@ class Forces:
     gravity_mm_s2: float
 
     def acceleration(self, t_s: float, velocity: Array, noise: Array) -> Array:
-        """Return (B, 3) in mm/s^2: height first, then the two lateral axes.
+        """Return the accelerations (B, 3) in mm/s^2: along the vertical, then along lateral axes.
 
-        velocity : (B, 3). noise : (B, 2) lift in mm/s^2.
+        velocity : (B, 3) in mm/s, in the same order. noise : (B, 2) random lift in mm/s^2.
         """
         speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
         along = velocity / speed
@@ -378,7 +385,10 @@ def stage_trajectory(
 
 @dataclass(frozen=True)
 class Shake:
-    """Cameras' offsets from the carriage and their derivatives, each (cameras, steps, axes)."""
+    """The offsets of the cameras from the carriage, with their first and second derivatives.
+
+    Each array is (cameras, steps, axes).
+    """
 
     offset_mm: Array
     velocity_mm_s: Array
@@ -398,10 +408,12 @@ def rig_shake(
     damping: float = 0.03,
     force_hz: float = 60.0,
 ) -> Shake:
-    """Return the shake of one common mode and one mode of each camera's arm, on each axis.
+    """Return a random shake: on each axis one mode that is common to all cameras, and one mode of
+    each camera's arm.
 
-    rms_mm : (axes,) total of each camera. common_share : share of the variance at frequency_hz; the
-    arms' modes are at arm_ratio times that.
+    rms_mm : (axes,) RMS of each camera's whole shake. frequency_hz : frequency of the common mode.
+    common_share : share of the common mode in the variance. arm_ratio : frequency of the arms'
+    modes divided by frequency_hz. damping : damping ratio of all modes. force_hz : see `rig_mode`.
     """
     rms = np.asarray(rms_mm, float)
     offset = np.zeros((cameras, steps, len(rms)))
@@ -430,10 +442,11 @@ def accelerometer_readings(
     bias_m_s2: ArrayLike,
     gravity_m_s2: float = GRAVITY_M_S2,
 ) -> Array:
-    """Return readings (N, 3) in m/s^2, axes . (a - g) + bias, of accelerations (N, 3) in the rig
-    frame.
+    """Return the noisy readings (N, 3) in m/s^2 of an accelerometer: axes . (a - g) + bias.
 
-    up : (3,) away from gravity. axes : (3, 3) rows are the sensor's axes in rig coordinates.
+    acceleration_mm_s2 : (N, 3) in rig axes. up : (3,) unit vector against gravity. axes : (3, 3)
+    whose rows are the sensor's axes in rig coordinates. rate_hz, density_ug_sqrt_hz : sampling rate
+    and noise density.
     """
     force = np.asarray(acceleration_mm_s2, float) / 1000 + gravity_m_s2 * np.asarray(up, float)
     sigma = density_ug_sqrt_hz * MICRO_G_M_S2 * np.sqrt(rate_hz / 2)

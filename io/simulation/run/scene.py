@@ -47,10 +47,11 @@ _CLEARANCE = 1.1
 
 @dataclass(frozen=True)
 class Carriage:
-    """The stage on a fine time grid, from the first frame to one frame after the last.
+    """The motion of the stage on a fine time grid, from the first frame to one after the last.
 
-    t_s, position_mm, velocity_mm_s, acceleration_mm_s2 : (N,); shake : of each camera, (C, N, 3).
-    stride : fine samples per frame; frames : which of the N samples are frames.
+    t_s, position_mm, velocity_mm_s, acceleration_mm_s2 : (N,) at the N samples of the grid.
+    shake : of each of C cameras, with arrays (C, N, 3). stride : number of samples per frame.
+    frames : which of the N samples are frames.
     """
 
     t_s: Array
@@ -67,12 +68,13 @@ class Carriage:
 
 @dataclass(frozen=True)
 class RunScene:
-    """Everything true of a run.
+    """The truth of a simulated run with B bubbles, F frames and C cameras.
 
-    t_s, position_mm, velocity_mm_s : (F,) at the frames; shake_mm, shake_mm_s : (C, F, 3).
-    lab_mm, lab_mm_s : (B, F, 3) centres of volume and their velocities; lab_mm_s2 (B, F, 3),
-    forces : accelerations and what causes them for the path "forces", otherwise None.
-    closest_s : (pairs,) when each pair passes; empty without pairs.
+    t_s, position_mm, velocity_mm_s : (F,) times, and position and velocity of the stage.
+    shake_mm, shake_mm_s : (C, F, 3) offset of each camera due to the shake, and its velocity.
+    lab_mm, lab_mm_s : (B, F, 3) centres of volume in the laboratory, and their velocities.
+    lab_mm_s2, forces : (B, F, 3) accelerations, and the forces; None unless the path is "forces".
+    closest_s : (pairs,) time at which the two bubbles of each pair pass; empty without pairs.
     """
 
     config: RunConfig
@@ -113,7 +115,7 @@ class RunScene:
         return np.asarray(-AXIS_RIG * self.position_mm[frame] - self.shake_mm[camera, frame])
 
     def bodies_lab(self, frame: int, chosen: Ints) -> Bodies:
-        """Return M of the bubbles in the laboratory frame."""
+        """Return M bubbles in the laboratory frame. chosen : (M,) their indices."""
         population, t = self.population, self.t_s[frame]
         swing = np.cos(2 * np.pi * population.swing_hz[chosen] * t + population.swing_rad[chosen])
         modes = population.modes_static[chosen] + population.modes_swing[chosen] * swing
@@ -405,11 +407,14 @@ _DENSITY_KG_M3 = 998.0
 
 @dataclass(frozen=True)
 class Population:
-    """What stays the same of each of B bubbles.
+    """The properties of each of B bubbles that do not change with time.
 
-    d_eq_mm, aspect : (B,); semi_axes_mm : (B, 3), proportions, the third along the path.
-    modes_static, modes_swing : (B, 21) relative; swing_hz, swing_rad : (B, 21).
-    spin_hz, spin_rad : (B,).
+    d_eq_mm, aspect : (B,) equivalent diameter, and large over small semi-axis.
+    semi_axes_mm : (B, 3) semi-axes up to a common factor, the third along the path.
+    modes_static, modes_swing : (B, 21) relative amplitudes of constant and oscillating modes.
+    swing_hz, swing_rad : (B, 21) frequency and phase of the oscillating modes.
+    spin_hz, spin_rad : (B,) frequency and phase of the rotation about the third semi-axis.
+    looks : appearance of each bubble.
     """
 
     d_eq_mm: Array
@@ -425,7 +430,7 @@ class Population:
 
 
 def lamb_frequency_hz(degree: int, d_eq_mm: float) -> float:
-    """Return the frequency at which surface tension swings a bubble's mode (Lamb, sec. 275)."""
+    """Return the natural frequency of a shape mode of a bubble (Lamb, Hydrodynamics, sec. 275)."""
     radius = d_eq_mm / 2000
     n = degree
     square = (n - 1) * (n + 1) * (n + 2) * _SURFACE_TENSION_N_M / (_DENSITY_KG_M3 * radius**3)

@@ -14,7 +14,10 @@ from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
 
 
 def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
-    """Return `stage.csv`: the carriage, servo error included, with the encoder's noise."""
+    """Return the content of `stage.csv`: position of the carriage with the encoder's errors.
+
+    The carriage's servo error is part of the true position.
+    """
     carriage, stage = scene.carriage, scene.config.stage
     step = _thinning(scene, stage.encoder_rate_hz)
     position = carriage.position_mm[::step]
@@ -24,7 +27,10 @@ def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
 
 
 def accelerometer_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
-    """Return `accelerometer.csv`: sensors on the carriage or on camera arms, in the rig's axes."""
+    """Return the content of `accelerometer.csv`: readings along the rig's axes.
+
+    The sensors are on the carriage or on the cameras' arms.
+    """
     carriage, stage = scene.carriage, scene.config.stage
     step = _thinning(scene, stage.accelerometer_rate_hz)
     t = carriage.t_s[::step]

@@ -18,12 +18,15 @@ _EDGE_PX = 0.5
 
 @dataclass(frozen=True)
 class CameraView:
-    """The bubbles near one image; M of them.
+    """M bubbles in or near one image.
 
-    particle : (M,); outline_px : (M, N, 2); centre_px : (M, 2) projected centre of volume.
-    silhouette_px, area_px2, second_px2 : (M, 2), (M,), (M, 2, 2) moments of the silhouette.
-    smear_px : (M, 2) motion during the exposure; blur_px : (M,).
-    visible, whole, overlap : (M,) some of it in the image, all of it, outline crossed by another.
+    particle : (M,) ids. outline_px : (M, N, 2) outlines of N points. centre_px : (M, 2) projected
+    centres of volume.
+    silhouette_px, area_px2, second_px2 : (M, 2), (M,), (M, 2, 2) centroid, area and central second
+    moments of each silhouette.
+    smear_px : (M, 2) motion during the exposure. blur_px : (M,) standard deviation of the blur.
+    visible, whole, overlap : (M,) whether a part of the silhouette is in the image, whether all of
+    it is, and whether another outline crosses it.
     """
 
     particle: Ints
@@ -50,7 +53,10 @@ class CameraView:
         ]
 
     def ellipse_px(self) -> tuple[Array, Array, Array]:
-        """Return (M,) semi-axes a >= b and angle from +u to +v of the ellipse of equal moments."""
+        """Return semi-axes a >= b in px, and the angle in rad from +u towards +v, each (M,).
+
+        They are those of the ellipses with the same second moments as the silhouettes.
+        """
         values, vectors = np.linalg.eigh(self.second_px2)
         angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
         a, b = 2 * np.sqrt(values[:, 1]), 2 * np.sqrt(values[:, 0])
@@ -136,14 +142,14 @@ def _any_inside(points: Array, outline: Array, centre: Array) -> bool:
 
 
 def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dict[str, Any]:
-    """Return the columns of `truth/runs/<run>/bubbles.csv` of one frame: bubbles that any camera
-    sees.
+    """Return the rows of `truth/runs/<run>/bubbles.csv` for one frame, as columns by name.
 
-    Lab place and velocity of the centre of volume, and its acceleration and drag coefficient where
-    they are known; its rig place is that in the carriage's frame, without any camera's shake. Per
-    camera: pixels of the projected centre of volume and of the silhouette's centroid (both with
-    that camera's shake), area, blur, and the flags of `CameraView`; blank where the bubble is far
-    from the image.
+    There is a row for each bubble that any camera sees. It holds position and velocity of the
+    centre of volume in the laboratory, its acceleration and drag coefficient where they are known,
+    and its position in the carriage's frame, without any camera's shake. For each camera it holds
+    the pixels of the projected centre of volume and of the silhouette's centroid (both with the
+    shake of this camera), area, blur, and the flags of `CameraView`; these are blank if the bubble
+    is far from the image.
     """
     seen = np.zeros(len(scene.population.d_eq_mm), bool)
     for view in views.values():

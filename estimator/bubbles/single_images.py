@@ -104,7 +104,7 @@ def _found(name: str, bubbles: Bubbles) -> Found:
             f"{COVERED_LIMIT_EVERYWHERE:.0%} more than one in five is missed"
         )
     if bubbles.field is not None:
-        words += f"; {bubbles.field.mean():.0%} of the image is looked at"
+        words += f"; {bubbles.field.mean():.0%} of the image was searched"
     return Found(single[["image", *DETECTION_COLUMNS]], table, words)
 
 

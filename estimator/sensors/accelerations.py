@@ -22,7 +22,10 @@ _GAP = 2.5
 
 @dataclass(frozen=True)
 class Grid:
-    """Times start_s + k step_s (n,), and the knot spacing of the kernel in steps, at least 2."""
+    """A regular grid of n times start_s + k step_s, and the width of a smoothing kernel.
+
+    count : n. knots : spacing of the kernel's knots in steps, at least 2.
+    """
 
     start_s: float
     step_s: float
@@ -31,16 +34,16 @@ class Grid:
 
     @property
     def t_s(self) -> Array:
-        """The times (n,)."""
+        """The times (n,) of the grid."""
         return np.asarray(self.start_s + self.step_s * np.arange(self.count))
 
     @property
     def width_s(self) -> float:
-        """The knot spacing w."""
+        """The spacing w of the kernel's knots in s."""
         return self.knots * self.step_s
 
     def covering(self, t_s: Array) -> Grid:
-        """Return the grid with these steps, continued to the first and last of other times."""
+        """Return the grid with the same steps that covers all times t_s (N,)."""
         first = int(np.ceil((t_s[0] - self.start_s) / self.step_s - 1e-9))
         last = int(np.floor((t_s[-1] - self.start_s) / self.step_s + 1e-9))
         return replace(
@@ -49,12 +52,16 @@ class Grid:
 
     @property
     def triangle(self) -> Array:
-        """The triangle (2 knots - 1,) of half-width w, of sum 1."""
+        """The triangular kernel (2 knots - 1,) of half-width w; its sum is 1."""
         rising = np.arange(1, self.knots + 1) / self.knots**2
         return np.concatenate([rising, rising[-2::-1]])
 
     def noise_gain(self, step_s: float) -> float:
-        """Return the sd of h'' * x per sd of x, in 1/s^2, for independent errors every step_s."""
+        """Return the factor (1/s^2) from errors of positions to errors of smoothed accelerations.
+
+        It is the ratio of the standard deviations, for positions with independent errors that are
+        measured every ``step_s``.
+        """
         second = np.zeros(4 * self.knots - 1)
         for shift, factor in ((0, 1.0), (self.knots, -2.0), (2 * self.knots, 1.0)):
             second[shift : shift + 2 * self.knots - 1] += factor * self.triangle
@@ -64,14 +71,17 @@ class Grid:
 
 @dataclass(frozen=True)
 class Accelerations:
-    """Smoothed accelerations (n, D) in mm/s^2 on a grid, 0 where not known (n,)."""
+    """Smoothed accelerations along D directions at the n times of a grid.
+
+    values : (n, D) in mm/s^2, 0 where they are not known. known : (n,).
+    """
 
     grid: Grid
     values: Array
     known: Bools
 
     def at(self, t_s: Array) -> tuple[Array, Bools]:
-        """Return values (m, D) and whether they are known (m,) at other times."""
+        """Return the values (m, D) at times t_s (m,), and whether they are known (m,)."""
         place = (t_s - self.grid.start_s) / self.grid.step_s
         low = np.clip(np.floor(place).astype(int), 0, max(self.grid.count - 2, 0))
         share = (place - low)[:, None]
@@ -82,7 +92,10 @@ class Accelerations:
 
 
 def of_positions(grid: Grid, t_s: ArrayLike, positions_mm: ArrayLike) -> Accelerations:
-    """Return the accelerations of a position (N, D), measured at times t_s (N,) that increase."""
+    """Return the smoothed accelerations of measured positions.
+
+    t_s : (N,) increasing times. positions_mm : (N, D).
+    """
     t, x = np.asarray(t_s, float), np.asarray(positions_mm, float)
     there = _bridged(grid.t_s, t)
     centred = x - x.mean(0)
@@ -96,7 +109,10 @@ def of_positions(grid: Grid, t_s: ArrayLike, positions_mm: ArrayLike) -> Acceler
 
 
 def of_readings(grid: Grid, t_s: ArrayLike, readings_mm_s2: ArrayLike) -> Accelerations:
-    """Return the smoothed readings (N, 3) less their median, over the whole record."""
+    """Return the smoothed readings of an accelerometer, minus their median over the whole record.
+
+    t_s : (N,) increasing times. readings_mm_s2 : (N, 3).
+    """
     from scipy.signal import fftconvolve
 
     t, reading = np.asarray(t_s, float), np.asarray(readings_mm_s2, float)

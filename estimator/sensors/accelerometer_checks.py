@@ -24,7 +24,10 @@ _STEP_S, _KNOTS, _LEAST_OVERLAP_S = 0.005, 5, 0.3
 
 
 def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> list[Finding]:
-    """Return what is wrong with unit, gravity and axes of one sensor; up (3,) in rig axes."""
+    """Return what is wrong with unit, gravity and axes of one sensor.
+
+    up : (3,) unit vector against gravity in rig axes. gravity_m_s2 : of the laboratory.
+    """
     return _check_gravity(sensor, np.asarray(up, float), gravity_m_s2) or check_axes(sensor, up)
 
 
@@ -48,10 +51,10 @@ def _check_gravity(sensor: Sensor, up: Array, gravity_m_s2: float) -> list[Findi
         either = "mg or cm/s^2" if unit == "mg" else unit
         return [
             Finding(
-                f"the sensor reads {size:.4g} at rest, where {sensor.unit} would be {at_rest}: it "
-                f"is in {either}",
+                f"the sensor reads {size:.4g} at rest; in {sensor.unit} it would be {at_rest}. The "
+                f"readings are in {either}",
                 where,
-                f'say "unit": "{unit}", or multiply its readings (ax_m_s2, ay_m_s2, az_m_s2) by '
+                f'give "unit": "{unit}", or multiply its readings (ax_m_s2, ay_m_s2, az_m_s2) by '
                 f"{factor:.6g}",
                 Code.SENSOR_UNIT, {"sensor": name, "unit": unit},
             )
@@ -61,7 +64,7 @@ def _check_gravity(sensor: Sensor, up: Array, gravity_m_s2: float) -> list[Findi
     if ratio * STANDARD_GRAVITY_M_S2 < _FLOATING_M_S2:
         return [
             Finding(
-                f"the sensor reads {size * stated:.2g} m/s^2 at rest: gravity has been taken out",
+                f"the sensor reads {size * stated:.2g} m/s^2 at rest: gravity has been subtracted",
                 where,
                 "give the specific force as the sensor measures it, 9.81 m/s^2 upwards at rest; "
                 f"with its axes in rig.toml, add ({shown}) m/s^2 to its readings",
@@ -84,7 +87,10 @@ def _check_gravity(sensor: Sensor, up: Array, gravity_m_s2: float) -> list[Findi
 
 
 def check_axes(sensor: Sensor, up: ArrayLike) -> list[Finding]:
-    """Return a finding if gravity does not point ``up`` (3,), with axes that would fit."""
+    """Return a finding if the sensor's gravity does not point along ``up``.
+
+    The finding contains axes that would fit. up : (3,) unit vector against gravity in rig axes.
+    """
     gravity, axes = gravity_of(sensor.reading_m_s2), sensor.axes
     angle = _tilt_deg(gravity, axes, up)
     if angle < _TILTED_DEG:
@@ -109,8 +115,11 @@ def check_axes(sensor: Sensor, up: ArrayLike) -> list[Finding]:
 def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | None:
     """Return the given axes (3, 3) with rows exchanged or reversed such that gravity points up.
 
-    Of the 24 right-handed exchanges it is the one that changes the entries least; None if none
-    brings gravity within 15 degrees of up. A rotation about the vertical remains undetermined.
+    Of the 24 right-handed exchanges, the one that changes the entries least is returned; None if no
+    exchange brings gravity within 15 degrees of up. A rotation about the vertical remains
+    undetermined.
+
+    gravity : (3,) reading at rest. axes : (3, 3) stated axes. up : (3,) as in `check_axes`.
     """
     from scipy.spatial.transform import Rotation
 
@@ -132,7 +141,7 @@ def _tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
 
 
 def check_motion(sensor: Sensor, stage: Array, along: Array) -> list[Finding]:
-    """Return a warning if another axis of the sensor than stated feels the carriage accelerate.
+    """Return a warning if the carriage's acceleration appears on another axis than stated.
 
     stage : (E, 2) times (s) and positions (mm). along : (3,) travel axis in the sensor's axes.
     """
@@ -148,11 +157,11 @@ def check_motion(sensor: Sensor, stage: Array, along: Array) -> list[Finding]:
     sign = "-" if found[best] < 0 else "+"
     return [
         Finding(
-            f"the carriage's acceleration is felt along {sign}{'xyz'[best]} of the sensor "
-            f"(correlation {abs(found[best]):.2f}), not where its axes put the travel direction "
-            f"(correlation {stated:.2f})",
+            f"the carriage's acceleration appears along {sign}{'xyz'[best]} of the sensor "
+            f"(correlation {abs(found[best]):.2f}) and not along the direction of travel that "
+            f"follows from its stated axes (correlation {stated:.2f})",
             sensor.where,
-            "check axes",
+            f"check axes in rig.toml [accelerometers.{sensor.name}]",
         )
     ]
 

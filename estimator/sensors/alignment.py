@@ -36,7 +36,11 @@ _RIDGE = 1e-5
 
 @dataclass(frozen=True)
 class Channel:
-    """An acceleration (n,) in mm/s^2, on the grid of the images, that some sensors explain."""
+    """An acceleration that images show, and that some sensors have to explain.
+
+    values, known : (n,) acceleration in mm/s^2 on the grid of the images, and whether it is known.
+    sensors : indices of the sensors whose readings explain it.
+    """
 
     name: str
     values: Array
@@ -63,14 +67,18 @@ class Channel:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The offset of a clock: a sample stamped t was measured at t - offset_s.
+    """The offset of a clock: a sample with the time stamp t was measured at t - offset_s.
 
-    sd_s : includes how far the channels disagree. nats : log-likelihood ratio at the peak, against
-    no connection at all; runner_up_nats, runner_up_s : at the best other lag; reversed_nats : the
-    best with the record reversed in time; at_zero_nats : the best at offsets of a shared clock.
-    at_end : whether the peak lies at the end of the lags that were tried. explained : by channel,
-    the share of its variance that the sensors explain at the peak. lag_nats : at every lag lags_s;
-    -inf where it was not tried.
+    The offset is the lag at which the readings explain the images best.
+
+    sd_s : standard deviation of the offset; it includes how far the channels disagree.
+    nats : log-likelihood ratio at the best lag, relative to no connection between the records.
+    runner_up_nats, runner_up_s : the same at the second-best lag, and this lag.
+    reversed_nats : the largest value with the record reversed in time, where chance alone acts.
+    at_zero_nats : the largest value at lags that are possible if the clock is that of the frames.
+    at_end : whether the best lag is at the end of the lags that were tried.
+    explained : by channel, the share of its variance that the sensors explain at the best lag.
+    lags_s, lag_nats : all lags, and the log-likelihood ratio at each; -inf if it was not tried.
     """
 
     offset_s: float
@@ -87,12 +95,12 @@ class Alignment:
 
     @property
     def connected(self) -> bool:
-        """Whether the record explains the channels better than it does when it is reversed."""
+        """Whether the record explains the images clearly better than the reversed record does."""
         return self.nats > _LEAST_NATS and self.reversed_nats < _MOST_OF_PEAK * self.nats
 
     @property
     def unique(self) -> bool:
-        """Whether the record is connected with the channels at one lag alone."""
+        """Whether there is only one lag at which the record explains the images."""
         alone = self.runner_up_nats < _MOST_OF_PEAK * self.nats
         return self.connected and alone and not self.at_end
 
@@ -112,10 +120,12 @@ class Alignment:
 def align(
     frames: Grid, channels: Sequence[Channel], readings: Sequence[Accelerations], near_s: float
 ) -> Alignment | None:
-    """Return the offset of the clock that the sensors share, or None if no lag can be tried.
+    """Return the offset of the clock of one or more sensors from the clock of the frames.
 
-    frames : the grid of the channels. readings : on one grid with the same steps. near_s : the
-    largest offset of a clock that is that of the frames.
+    frames : the grid of the channels. channels : accelerations that the images show. readings : of
+    the sensors, on one grid with the same steps. near_s : largest offset that still counts as the
+    clock of the frames.
+    Returns None if the records do not overlap enough to try any lag.
     """
     own = readings[0].grid
     shift = round((frames.start_s - own.start_s) / frames.step_s)
@@ -216,7 +226,7 @@ class _Profile:
 
 
 def filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bools]:
-    """Return filtered columns (n, D) and where all their samples are known (n,)."""
+    """Return filtered columns (n, D), and where all samples under the filter are known (n,)."""
     reach = len(whitening) - 1
     out = np.stack([np.convolve(c, whitening)[: len(c)] for c in values.T], -1)
     unknown = np.convolve(~known, np.ones(reach + 1))[: len(known)] > 0.5

@@ -43,8 +43,10 @@ class Encoder:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Hold how the rig stands: axis, up (3,) unit vectors in the rig frame; the travel axis and the
-    direction opposite to gravity. gravity_m_s2 : of the laboratory.
+    """Hold how the rig stands in the laboratory.
+
+    axis, up : (3,) unit vectors in the rig frame along the travel and against gravity.
+    gravity_m_s2 : gravity of the laboratory.
     """
 
     axis: Array
@@ -172,14 +174,18 @@ def check_sensors(
 
 
 def files_of(run: RunData) -> tuple[str, str]:
-    """Return the names of a run's tables of sensors, for messages."""
+    """Return the names of the encoder's and the accelerometers' tables of a run, for messages."""
     return f"{run.name}/stage.csv", f"{run.name}/accelerometer.csv"
 
 
 def check_overlap(
     t: Array, frames_t_s: ArrayLike, *, where: str, code: Code, sensor: str = ""
 ) -> list[Finding]:
-    """Return a finding if the record (N,) does not cover all frames (F,); a code if hardly any."""
+    """Return a finding if a sensor's record does not cover all frames.
+
+    It has the code ``code``, so that the record is refused, if hardly any frame is covered.
+    t : (N,) times of the record. frames_t_s : (F,) times of the frames. where, sensor : for the
+    message."""
     frames = np.asarray(frames_t_s, float)
     share = _covered(t, frames)
     if share >= _COVERED:
@@ -195,7 +201,7 @@ def check_overlap(
                 Finding(words, where, todo, Code.FRAME_TIMES, {"frame_time_factor": 1 / factor})
             ]
     if share == 0:
-        words = f"the record's clock does not overlap the frames': it covers {spans}"
+        words = f"the record does not overlap the frames in time: it covers {spans}"
     offset = {"sensor": sensor or "encoder", "offset_s": float(frames[0] - t[0])}
     return [Finding(words, where, _clock_remedy(t, frames), code, offset)]
 

@@ -22,7 +22,11 @@ _REACH = 2
 def drift_of(
     middle_s: Array, parts: Sequence[Alignment], step_s: float, most: float
 ) -> tuple[float, float, float] | None:
-    """Return the offset at the mean of the parts' middles (K,), the drift and its sd, or None.
+    """Return the offset and the drift of a clock from alignments of K parts of the record.
+
+    Returns the offset in s at the mean of middle_s, the drift, and the standard deviation of the
+    drift; None if no drift fits all parts.
+    middle_s : (K,) middle time of each part.
 
     parts : K alignments, whose lags are multiples of step_s.  most : the largest absolute drift.
     """

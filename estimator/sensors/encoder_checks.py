@@ -32,7 +32,7 @@ _SHOWN = 3
 
 @dataclass(frozen=True)
 class EncoderFault:
-    """A fault in an encoder's record: its error, from t_s on, the first reading after it.
+    """A fault in an encoder's record: from the time t_s on, the readings are wrong by size_mm.
 
     kind : "jump" if the error persists, "spike" if it ends after ``readings`` readings, "wrap" if
     the counter overflows. step_s : time between the readings before and after the fault.
@@ -63,7 +63,7 @@ class EncoderFault:
         """The fault in words."""
         at = f"{self.size_mm:+.4g} mm"
         if self.kind == "spike":
-            return f"{self.readings} reading(s) from {self.t_s:.6g} s on are off by {at}"
+            return f"{self.readings} reading(s) from {self.t_s:.6g} s on are wrong by {at}"
         what = "the counter wraps round" if self.kind == "wrap" else "the reading jumps"
         return f"{what} by {at} at {self.t_s:.6g} s"
 

@@ -38,12 +38,14 @@ class Finding:
     """What a check found.
 
     words : the fault, as a sentence without its place. where : file, sensor or row. todo : what the
-    user can do. code : of a fault that is refused unless it is accepted; None for a warning.
-    fix : the correction as data, or {}. {"sensor": name} and one of "unit": "g"; "axes": rows;
-    "factor": number by which readings are multiplied; "add_m_s2": [x, y, z]; "offset_s": s, added
-    to its times. {"exchange": [name, name]} for two records. {"encoder_factor": -1.0},
-    {"encoder_offset_s": s}, {"encoder_jumps": [[t_s, mm], ...]} subtracted from t_s on.
-    {"frame_time_factor": 0.001}.
+    user can do.
+    code : name of a fault that is refused unless the user accepts it; None for a warning.
+    fix : the correction as data, or {}. For an accelerometer it is {"sensor": name} with one of
+    "unit": "g"; "axes": rows; "factor": number by which readings are multiplied; "add_m_s2":
+    [x, y, z]; "offset_s": s, which is added to its times. {"exchange": [name, name]} exchanges two
+    records. For the encoder it is {"encoder_factor": -1.0}, {"encoder_offset_s": s}, or
+    {"encoder_jumps": [[t_s, mm], ...]}, lengths that are subtracted from t_s on. For the frames it
+    is {"frame_time_factor": 0.001}.
     """
 
     words: str
@@ -83,7 +85,10 @@ def accepted_codes(accept: Iterable[str]) -> frozenset[Code]:
 
 
 def settled(findings: Sequence[Finding], accept: frozenset[Code]) -> list[str]:
-    """Return findings as warnings; SensorError for one with a code that is not accepted."""
+    """Return the findings as warnings for the user.
+
+    Raises SensorError if a finding has a code that the user does not accept.
+    """
     refused = [f for f in findings if f.code is not None and f.code not in accept]
     if refused:
         first = refused[0]

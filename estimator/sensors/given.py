@@ -78,10 +78,11 @@ _DESCRIBED = (
 class Sensor:
     """The record of one accelerometer as it was given.
 
-    where : file or argument, and sensor. t_s : (N,). reading_m_s2 : (N, 3). unit : in which
-    readings were given. mounted_on : a camera's name, or "carriage". axes : (3, 3) unit rows.
-    noise_density_ug_sqrt_hz, range_m_s2 : None if nothing states them. kept : (N,) usable samples.
-    unused_axes : indices.
+    where : file or argument, and sensor, for messages. t_s : (N,) times of the N samples.
+    reading_m_s2 : (N, 3). unit : unit in which the readings were given.
+    mounted_on : a camera's name, or "carriage". axes : (3, 3) whose rows are the sensor's axes as
+    unit vectors in rig axes. noise_density_ug_sqrt_hz, range_m_s2 : None if they are not stated.
+    kept : (N,) whether each sample can be used. unused_axes : indices of axes that are not used.
     """
 
     name: str
@@ -283,10 +284,10 @@ def _inferred(reading: Array, name: str, where: str) -> tuple[str, list[Finding]
 
 
 def unit_of_gravity(size: float) -> str | None:
-    """Return the unit in which a reading at rest of this size is gravity; None if there is none.
+    """Return the unit in which a reading of this size at rest would be gravity; None for no unit.
 
-    A factor of 1.5 (a strong acceleration at the start) does no harm. mg and cm/s^2 differ by only
-    2 %, less than a usual bias: mg is returned.
+    The size may be wrong by a factor of 1.5, for example because of a strong acceleration. mg and
+    cm/s^2 differ by only 2 %, less than a usual bias; mg is then returned.
     """
     for unit in ("m/s^2", "g", "mm/s^2", "mg", "ft/s^2"):
         ratio = size * ACCELERATION_UNITS[unit] / STANDARD_GRAVITY_M_S2
@@ -381,7 +382,10 @@ def _positive(fields: Mapping[str, Any], key: str, where: str) -> float | None:
 
 
 def numbers(values: Any, where: str, key: str) -> Array:
-    """Return an array of floats, masked entries as NaN; InputError for anything else."""
+    """Return values as an array of floats, with NaN for masked entries.
+
+    where, key : for messages. Raises InputError for values that are no numbers.
+    """
     dtype = getattr(values, "dtype", None)
     if not isinstance(dtype, np.dtype | None) and getattr(dtype, "kind", "") in "iuf":
         # a column of pandas' own types of numbers

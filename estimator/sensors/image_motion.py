@@ -32,9 +32,12 @@ def directions(camera: Camera) -> Array:
 def frame_grid(t_s: Array, noise_mm: float, felt: Callable[[Grid], float] | None) -> Grid:
     """Return the grid on which images and sensors are compared.
 
-    It has the narrowest kernel at which the images' noise (noise_mm, of the mean position in a
-    frame) is below half the motion that sensors feel. felt : RMS in mm/s^2 with a grid's kernel;
-    None without a sensor, for a kernel in the middle.
+    Its smoothing kernel is the narrowest one with which the images' noise is below half the
+    acceleration that the sensors measure.
+
+    t_s : (F,) times of the frames. noise_mm : standard deviation of the mean position in a frame.
+    felt : function from a grid to the RMS (mm/s^2) of the sensors' readings, smoothed with the
+    grid's kernel; None if there is no sensor, for a kernel of medium width.
     """
     pace = float(np.median(np.diff(t_s)))
     step = pace / np.ceil(pace / _COARSEST_STEP_S - 1e-9)
@@ -55,7 +58,8 @@ def accelerations(
 ) -> Accelerations:
     """Return the camera's accelerations (n, 2) along its two directions, in mm/s^2.
 
-    item, frame, uv_px : (M,), (M,), (M, 2) marks or bubbles that the camera saw.
+    item, frame, uv_px : (M,), (M,), (M, 2) index, frame and pixel of each of M sightings of a mark
+    or a bubble.
     """
     total, count = np.zeros((grid.count, 2)), np.zeros(grid.count)
     if len(item):

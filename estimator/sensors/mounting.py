@@ -26,9 +26,12 @@ _LEAST_SAMPLES = 60
 
 @dataclass(frozen=True)
 class Felt:
-    """An acceleration (n,) that a sensor should feel along a direction (3,) in the rig frame.
+    """An acceleration that the images show, and that a sensor should measure.
 
-    whole : whether it feels just this, so that its gain follows; an arm also feels other motion.
+    direction : (3,) unit vector in the rig frame. values, known : (n,) acceleration in mm/s^2 along
+    it, and whether it is known.
+    whole : whether this is all of the sensor's acceleration along the direction, so that the gain
+    of the sensor follows from it; an arm also moves in ways that the images do not show.
     """
 
     direction: Array
@@ -39,9 +42,12 @@ class Felt:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Axes (3, 3) of a sensor that fit best, and whether clearly better than the stated ones.
+    """The axes of a sensor that fit best.
 
-    gain, gain_sd : the reading over the true acceleration; NaN and infinite where nothing is felt.
+    axes : (3, 3) whose rows are unit vectors in rig axes. clear : whether they fit clearly better
+    than the stated axes. lead_nats : log-likelihood ratio of these axes to the stated ones.
+    gain, gain_sd : reading divided by true acceleration, and its standard deviation; NaN and
+    infinity if the images show no acceleration.
     """
 
     axes: Array
@@ -186,7 +192,9 @@ def preference(y: Array, known: Bools, stated: Array, other: Array) -> float:
 
 
 def slope(y: Array, x: Array) -> tuple[float, float]:
-    """Return the coefficient of y on x (n,), means removed, and its sd with correlated errors."""
+    """Return the regression coefficient of y on x, both (n,), and its standard deviation.
+
+    The means are removed. The standard deviation takes into account that errors are correlated."""
     y, x = y - y.mean(), x - x.mean()
     square = float(x @ x)
     if square <= 0 or len(x) < 20:

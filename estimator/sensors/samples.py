@@ -56,7 +56,11 @@ _LEAST_UG_SQRT_HZ = 1.0
 
 @dataclass(frozen=True)
 class Clipping:
-    """One axis of a sensor that is clipped at a limit (m/s^2), and which samples (N,) are."""
+    """One axis of a sensor that is clipped.
+
+    axis : its index. value : limit in m/s^2 at which it is clipped. samples : (N,) which of the N
+    samples are clipped.
+    """
 
     axis: int
     value: float
@@ -64,10 +68,11 @@ class Clipping:
 
 
 def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
-    """Return the sensor with impossible samples masked, and warnings that count them.
+    """Return the sensor without samples that cannot be right, and warnings that count them.
 
-    An axis that is often clipped or never changes is not used. Masked readings are interpolated,
-    for filters of the record. A noise density that nothing states is estimated.
+    These samples are masked (``kept``), and their readings are interpolated, because filters need
+    a complete record. An axis that is often clipped or never changes is not used. If the noise
+    density is not stated, it is estimated.
     """
     t, reading, where = sensor.t_s, sensor.reading_m_s2, sensor.where
     findings: list[Finding] = []
@@ -235,10 +240,10 @@ def _repeated(same: Bools, first: int, last: int) -> Iterator[float]:
 
 
 def spike_samples(values: ArrayLike) -> Bools:
-    """Return which values (N,) are spikes of at most three samples that stand alone.
+    """Return which values (N,) are spikes: at most three wrong samples between good ones.
 
-    They differ from what neighbours predict by 20 standard deviations, of the record and of 64
-    samples.
+    They differ from the prediction by their neighbours by 20 standard deviations, both of the whole
+    record and of the 64 samples around them.
     """
     signal = np.asarray(values, float)
     out = np.zeros(len(signal), bool)
@@ -275,11 +280,12 @@ def _spikes(signal: Array) -> Bools:
 
 
 def shifted_samples(reading: ArrayLike) -> Bools:
-    """Return which samples (N, k), along k axes, lie in a stretch of at most 256 that is shifted.
+    """Return which of N samples (N, k) along k axes belong to a shifted part of the record.
 
-    A shift begins with a jump between two samples, of 12 standard deviations over all axes, and
-    ends with the opposite jump. No other jump near it is a third as large: an impact rings. A jump
-    is the difference of what straight lines through five samples on each side extrapolate.
+    A shifted part has at most 256 samples. It begins with a jump between two samples, of 12
+    standard deviations over all axes, and ends with the opposite jump. No other jump nearby is a
+    third as large; after an impact, which rings, there are such jumps. The size of a jump is the
+    difference between straight lines through five samples on each side, extrapolated to the jump.
     """
     from scipy.ndimage import maximum_filter1d
 

@@ -128,9 +128,10 @@ def _moved(tracks: Tracks | StoredTracks | Any) -> list[str]:
     if not change.get("moved"):
         return []
     return [
-        f"camera {change['camera']!r} had moved since the calibration by which the run was tracked "
-        f"(by {1e3 * change['offset_mm']:+.0f} µm along the shared coordinate): positions are off "
-        "by it; calibrate again and track again, or smooth with --refine-rig"
+        f"camera {change['camera']!r} had moved since the calibration with which the run was "
+        f"tracked (by {1e3 * change['offset_mm']:+.0f} µm along the shared coordinate), so all "
+        "positions are wrong by this movement. Calibrate again and track again, or smooth with "
+        "--refine-rig"
     ]
 
 

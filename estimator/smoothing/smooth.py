@@ -512,9 +512,9 @@ def problem_of(
     at_frames = frame_times if tracked is None else tracked.t_s
     if at_frames is None:
         raise InputError(
-            "without tracks nothing says when the frames are taken",
+            "there are no tracks, so the times of the frames are unknown",
             where="smooth",
-            todo="give t_s, the times at which offsets are wanted",
+            todo="give t_s, the times of the frames",
         )
     check_increasing(at_frames, "frames")
     described = None if rig is None else rig.stage

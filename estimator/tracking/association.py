@@ -301,14 +301,17 @@ def update_pixels(
 _MERGE_FRAMES = 2
 
 History = dict[int, list[tuple[int, int]]]
-"""Per particle: (frame, column) since the conflict opened, column -1 where it was missed."""
+"""For each track, by its id, the measurements (frame, column) since the conflict began; the column
+is -1 in a frame without a measurement."""
 
 
 @dataclass
 class Branch:
-    """Holds one way to continue the tracks of a cluster.
+    """Holds one hypothesis about tracks that compete for the same measurements.
 
-    weight : logarithm, 0 for the best branch.  tracks : in the same order in every branch.
+    weight : log-likelihood ratio to the best hypothesis, 0 for the best one itself.
+    tracks : the tracks as they are under this hypothesis, in the same order in every hypothesis.
+    history : the measurements of each track.
     """
 
     weight: float
@@ -318,7 +321,11 @@ class Branch:
 
 @dataclass
 class Cluster:
-    """Holds the branches, best first. A track without conflict has one branch and no history."""
+    """Holds a group of tracks that compete for the same measurements (a conflict).
+
+    branches : the hypotheses, best first. A track without competitors forms a group of its own,
+    with one hypothesis and no history.
+    """
 
     branches: list[Branch]
 
@@ -342,8 +349,12 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Broken:
-    """track : its best continuation, with all its entries; kept : the certain ones before the
-    conflict; new : those that stay together after it; entries between belong to no track."""
+    """A track that is cut, because its continuation through a conflict is not safe.
+
+    track : its best continuation. entries : all its measurements (frame, column) in the conflict.
+    kept : the safe ones at the beginning, which remain with the track. new : those at the end that
+    safely belong together and form a new track. The measurements in between belong to no track.
+    """
 
     track: Track
     entries: list[tuple[int, int]]
@@ -353,8 +364,12 @@ class Broken:
 
 @dataclass(frozen=True)
 class Decision:
-    """still : the cluster that stays open, if any; free : tracks that leave it, with their
-    entries; broken : tracks that cannot be continued; runner_up_log_ratio : how close it was."""
+    """What was decided about a conflict in one frame.
+
+    still : the tracks that remain undecided; None if there are none. free : tracks that are
+    decided, with their measurements (frame, column). broken : tracks that are cut.
+    runner_up_log_ratio : log-likelihood ratio of the best to the second-best hypothesis.
+    """
 
     still: Cluster | None
     free: list[tuple[Track, list[tuple[int, int]]]]
@@ -363,16 +378,18 @@ class Decision:
 
 
 def recent(entries: Sequence[tuple[int, int]], depth: int) -> list[tuple[int, int]]:
-    """Return the last ``depth`` entries in which the track was seen."""
+    """Return the last ``depth`` of a track's entries (frame, column) with a measurement."""
     return [e for e in entries if e[1] >= 0][-depth:]
 
 
 def merged(
     scored: Iterable[tuple[float, tuple[object, ...], int]], settings: TrackerSettings
 ) -> list[tuple[float, int]]:
-    """(weight, what it came from) of (weight, key, index): equal keys as one, best first, 0 on top.
+    """Merge hypotheses with equal keys, and leave out improbable ones.
 
-    Improbable ones and those beyond the largest number allowed are left out.
+    scored : (log weight, key, index) of each hypothesis.
+    Returns (log weight, index of the most probable of the merged ones), best first, at most
+    ``max_hypotheses`` of them; the weight of the best one is 0.
     """
     groups: dict[tuple[object, ...], list[tuple[float, int]]] = {}
     for weight, key, index in scored:
@@ -390,12 +407,19 @@ def merged(
 
 
 def merge_key(histories: Iterable[Sequence[tuple[int, int]]]) -> tuple[object, ...]:
-    """Return the recent pairings, by which branches are merged."""
+    """Return the most recent measurements of all tracks of a hypothesis.
+
+    Hypotheses with equal recent measurements are merged.
+    """
     return tuple(tuple(h[-_MERGE_FRAMES:]) for h in histories)
 
 
 def disputed(branches: Sequence[Branch], depth: int) -> set[int]:
-    """Return the particles that two branches give different measurements, or the same one."""
+    """Return the ids of tracks about whose last measurements the hypotheses disagree.
+
+    Two hypotheses give such a track different measurements, or give one measurement to it and to
+    another track. depth : number of last measurements that count.
+    """
     columns: dict[tuple[int, int], set[int]] = {}
     claims: dict[tuple[int, int], set[int]] = {}
     for branch in branches:
@@ -410,7 +434,7 @@ def disputed(branches: Sequence[Branch], depth: int) -> set[int]:
 def decide(
     cluster: Cluster, frame: int, settings: TrackerSettings, *, at_once: bool = False
 ) -> Decision:
-    """Decide which tracks leave the cluster in this frame; all of them if ``at_once``."""
+    """Decide which tracks of a conflict are safe in this frame; all of them if ``at_once``."""
     branches = cluster.branches
     if not cluster.open:
         return Decision(None, _leave(branches[0], cluster.tracks), [], np.inf)
@@ -492,7 +516,10 @@ _SLACK_LOG_RATIO = 6.0
 
 @dataclass(frozen=True)
 class Scan:
-    """A frame: its time, its measurements, and those of them (columns) that are free."""
+    """One frame: its number, its time and its measurements.
+
+    columns : indices of the measurements that have no track yet.
+    """
 
     frame: int
     t_s: float
@@ -503,7 +530,11 @@ class Scan:
 
 @dataclass(frozen=True)
 class Child:
-    """A way to continue ``parents``: per track the index into the pairs, -1 where it is missed."""
+    """One way to continue some hypotheses with the measurements of a frame.
+
+    score : log weight. parents : the hypotheses, one for each group of tracks. edges : for each
+    track the index of its pairing, -1 if it has no measurement in this frame.
+    """
 
     score: float
     parents: tuple[Branch, ...]
@@ -511,7 +542,10 @@ class Child:
 
 
 class Association:
-    """The pairings of one frame, and the common shift that goes with the best of them."""
+    """The possible pairings of tracks and measurements in one frame.
+
+    It also holds the shift of all bubbles that follows from the best pairings.
+    """
 
     def __init__(self, clusters: Sequence[Cluster], scan: Scan, common: Common) -> None:
         self.clusters, self.scan, self.prior = clusters, scan, common
@@ -532,7 +566,10 @@ class Association:
         self.edges = self._allowed()
 
     def mean_gain(self, others: Sequence[Array]) -> Array | None:
-        """(n, 3) mean filter gain of the bubbles that are updated; None if there are none."""
+        """Return the mean Kalman gain (n, 3) of all bubbles that are updated; None if none is.
+
+        n is the number of states. others : gain (n, 3) of each bubble that was updated already.
+        """
         gains = list(others)
         if len(self.picked):
             p = np.array([self.tracks[i].filter.P for i in self.pairs.row[self.picked].tolist()])
@@ -558,7 +595,11 @@ class Association:
         return np.flatnonzero(near)
 
     def components(self) -> list[tuple[list[int], list[int]]]:
-        """Clusters that share a measurement, each with its edges (indices into the pairs)."""
+        """Return the groups of tracks that compete for measurements of this frame.
+
+        Each is given by the indices of the earlier groups that it joins, and the indices of its
+        pairings.
+        """
         owner, columns = self.owner[self.edges].tolist(), self.pairs.column[self.edges].tolist()
         label, first = list(range(len(self.clusters))), dict[int, int]()
         for cluster, column in zip(owner, columns):
@@ -586,7 +627,13 @@ class Association:
 def children(
     found: Association, members: Sequence[int], edges: Sequence[int], outside: Common
 ) -> list[Child]:
-    """The likely ways to continue some clusters together, equal recent pasts merged, best first."""
+    """Return the likely ways to continue some groups of tracks together, best first.
+
+    Those with the same recent measurements are merged.
+
+    members : indices of the groups. edges : indices of the pairings that are possible for them.
+    outside : the shift that all bubbles share, estimated from the other bubbles.
+    """
     settings, pairs = found.scan.settings, found.pairs
     score = pairs.scores(outside.shift_mm)
     by_row: dict[int, list[int]] = {}
@@ -625,7 +672,11 @@ def _histories(child: Child, pairs: Pairs, frame: int) -> History:
 
 
 def grow(found: Association, outside: Common, child: Child, mean_gain: Array) -> Branch:
-    """The branch of a child, its tracks updated with the common shift that its pairings imply."""
+    """Return the hypothesis that continues some hypotheses in the way ``child``.
+
+    Its tracks are updated with the measurements, and with the shift of all bubbles that follows
+    from them. outside : as for `children`. mean_gain : (n, 3) mean Kalman gain of the bubbles.
+    """
     pairs, scan = found.pairs, found.scan
     used = np.array([e for e in child.edges if e >= 0], int)
     common = outside.informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
@@ -638,7 +689,11 @@ def grow(found: Association, outside: Common, child: Child, mean_gain: Array) ->
 def continue_tracks(
     tracks: Sequence[Track], columns: Sequence[int], scan: Scan, common: Common, mean_gain: Array
 ) -> None:
-    """Update in place with the measurements' columns, -1 for none."""
+    """Update tracks in place with their measurements in a frame.
+
+    columns : for each track the index of its measurement, -1 for none. common : the shift that all
+    bubbles share. mean_gain : (n, 3) mean Kalman gain of the bubbles.
+    """
     measured, at = scan.measured, np.array(columns, np.int64)
     points, covariances = np.full((len(at), 3), np.nan), np.full((len(at), 3, 3), np.nan)
     points[at >= 0] = measured.points_mm[at[at >= 0]]
@@ -652,10 +707,14 @@ def continue_tracks(
 def advance(
     clusters: Sequence[Cluster], scan: Scan, common: Common, other_gains: Sequence[Array] = ()
 ) -> tuple[list[Cluster], Common, Array | None]:
-    """The clusters after this frame (not decided yet), the common part, the mean gain.
+    """Continue all tracks with the measurements of a frame, without deciding conflicts.
 
-    other_gains : (n, 3) each, of the bubbles that were updated already. Tracks without a rival are
-    updated in place. A cluster whose history is not empty is open.
+    Tracks that compete with no other track are updated in place.
+
+    common : what is known of the shift that all bubbles share. other_gains : Kalman gains (n, 3) of
+    the bubbles that were updated already.
+    Returns the groups of tracks after this frame, the shift that all bubbles share, and the mean
+    gain (n, 3) or None.
     """
     found = Association(clusters, scan, common)
     mean_gain = found.mean_gain(other_gains)
@@ -680,9 +739,10 @@ def advance(
 def follow_labelled(
     tracks: Sequence[Track], scan: Scan, common: Common
 ) -> tuple[Common, list[Array], list[int]]:
-    """Update tracks whose ids came with the measurements, in place: no association is needed.
+    """Update in place tracks whose ids came with the measurements, so that nothing is ambiguous.
 
-    Returns the common shift that they imply, their gains, and the columns without a track yet.
+    Returns the shift of all bubbles that follows from these tracks, their Kalman gains, and the
+    indices of the measurements that have no track yet.
     """
     columns = {int(scan.measured.particle[c]): int(c) for c in scan.columns}
     at = [columns.pop(t.particle, -1) for t in tracks]

@@ -46,10 +46,10 @@ _ANYWHERE_MM = 100.0
 
 @dataclass(frozen=True)
 class Readings:
-    """Measurements of K bubbles in F frames in information form.
+    """Measurements of K bubbles in F frames, in information form.
 
-    information : (F, K, 3, 3) on their points (1/mm2), 0 where nothing was seen.
-    pull : (F, K, 3) information @ point (1/mm).
+    information : (F, K, 3, 3) inverse covariance of each measured point (1/mm^2), 0 where a bubble
+    was not measured. pull : (F, K, 3) information @ point (1/mm).
     """
 
     information: Array
@@ -62,7 +62,10 @@ class Readings:
     def add(
         self, frames: Ints, bubbles: Ints, values: Array, covariances: Array, by_points: Array
     ) -> None:
-        """M measurements: values (M, k) = by_points (M, k, 3) @ point, covariances (M, k, k)."""
+        """Add M measurements with k components each.
+
+        frames, bubbles : (M,) indices. values : (M, k) equal to by_points (M, k, 3) @ point plus
+        noise. covariances : (M, k, k) of the noise."""
         weighted = np.swapaxes(np.linalg.solve(covariances, by_points), -1, -2)
         np.add.at(self.information, (frames, bubbles), weighted @ by_points)
         np.add.at(self.pull, (frames, bubbles), (weighted @ values[..., None])[..., 0])
@@ -73,9 +76,9 @@ def smooth_points(
     motions: Sequence[Motion | None],
     settings: TrackerSettings,
 ) -> tuple[Array, Array]:
-    """(F, K, 3) points (mm, rig) and (F, K, 3, 3) covariances.
+    """Return the smoothed points (F, K, 3) in mm in the rig frame, and covariances (F, K, 3, 3).
 
-    motions : into each frame; the first is not used.
+    motions : motion of the bubbles from the frame before into each frame; the first is not used.
     """
     from telerig.estimator.tracking import kernels
 
@@ -95,7 +98,7 @@ Tables = tuple["pd.DataFrame", "pd.DataFrame"]
 """One frame's detections in the two cameras."""
 
 Pixels = tuple[Array, Array]
-"""(N, 2) centres and (N, 2, 2) covariances of a view's detections."""
+"""Centres (N, 2) and covariances (N, 2, 2) of the N detections of one camera."""
 
 COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
 CENTRE_PX = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
@@ -103,11 +106,15 @@ CENTRE_PX = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 
 @dataclass(frozen=True)
 class Pairs:
-    """Rows of the two tables that show the same bubble, M of them.
+    """M pairs of detections of one frame, each of which shows one bubble in both cameras.
 
-    rows : (M, 2); confidence, ambiguous : (M,); given : (M,) ids given by the user, -1 where the
-    pair was found here; points_mm (M, 3), covariance_mm2 (M, 3, 3), d_eq_mm (M,), NaN if unknown;
-    particle : (M,) of its track, -1 for none; known once the frame is final.
+    rows : (M, 2) row of the detection in the table of each camera.
+    confidence : (M,) probability that the pair is right. ambiguous : (M,) whether another pair is
+    nearly as probable.
+    given : (M,) id that the user gave to the pair, -1 for none.
+    points_mm, covariance_mm2, d_eq_mm : (M, 3), (M, 3, 3), (M,) position, its covariance, and the
+    equivalent diameter (NaN if it is unknown).
+    particle : (M,) id of the track, -1 for none; it is known when the frame is final.
     """
 
     rows: Ints
@@ -154,7 +161,11 @@ class Sight:
 
 @dataclass(frozen=True)
 class Single:
-    """A particle that one camera sees alone: its row there, and its approximate position."""
+    """A bubble with a track that only one camera sees in a frame.
+
+    particle : id of the track. camera, row : the camera, and the row of its table of detections.
+    point_mm : (3,) approximate position in the rig frame. d_eq_mm : equivalent diameter.
+    """
 
     particle: int
     camera: int
@@ -165,10 +176,15 @@ class Single:
 
 @dataclass
 class Frame:
-    """offset_px : (2, 2) per camera, shift of all that both cameras see; the cameras shake.
+    """One frame of a run while its tracks may still change.
 
-    unpaired : rows of the tables without a partner; alone : by index into these (first the first
-    camera's), tracks that one camera continued. singles : those in the end, after `take_final`.
+    tables : its detections in both cameras. sight : the same as arrays.
+    offset_px : (2, 2) for each camera the shift of all detections, because the cameras shake.
+    pairs : the pairs of detections. unpaired : for each camera the rows of its table that are in no
+    pair.
+    alone : tracks that only one camera continued, by index into the rows of ``unpaired``, those of
+    the first camera first. singles : the same with the final ids, after `take_final`.
+    motion : motion of all bubbles since the frame before; None for the first frame.
     """
 
     number: int
@@ -196,11 +212,11 @@ class Frame:
 
     @property
     def particle(self) -> Ints:
-        """(M,) of the pairs."""
+        """The ids (M,) of the tracks of the M pairs, -1 for none."""
         return self.pairs.particle
 
     def owners(self, camera: int) -> Ints:
-        """(N,) particle of each of a camera's rows, -1 for none."""
+        """Return the id (N,) of the track of each of a camera's N detections, -1 for none."""
         out = self.sight.given[camera].copy()
         taken = self.particle != NO_PARTICLE
         out[self.pairs.rows[taken, camera]] = self.particle[taken]
@@ -213,11 +229,11 @@ class Frame:
         return [s for s in self.singles if s.particle == particle]
 
     def hidden(self) -> list[Single]:
-        """Particles that exactly one camera sees."""
+        """Return the bubbles with tracks that exactly one camera sees."""
         return [s for s in self.singles if len(self.of(s.particle)) == 1]
 
     def claim(self, pair: Pairs) -> None:
-        """Give the rows of one pair to its particle; pairs with only one of them are undone."""
+        """Add one pair with its track. Earlier pairs with one of its two detections are removed."""
         same = self.pairs.rows == pair.rows
         if same.all(1).any():
             self.particle[same.all(1)] = pair.particle
@@ -226,7 +242,7 @@ class Frame:
 
 
 def given_ids(table: pd.DataFrame) -> Ints:
-    """(N,) ids that came with the detections, -1 for none."""
+    """Return the ids (N,) that came with N detections, -1 for none."""
     if "particle" not in table:
         return np.full(len(table), NO_PARTICLE)
     return table["particle"].to_numpy(np.int64)
@@ -235,7 +251,10 @@ def given_ids(table: pd.DataFrame) -> Ints:
 def readings_of(
     frames: Sequence[Frame], particles: Sequence[int], cameras: tuple[Camera, Camera]
 ) -> Readings:
-    """The frames' measurements of the particles, in the particles' order."""
+    """Return the measurements of some tracks in several frames, in the order of ``particles``.
+
+    particles : ids of the tracks.
+    """
     place = {p: k for k, p in enumerate(particles)}
     out = Readings.none(len(frames), len(place))
     who = np.array([place.get(p, -1) for frame in frames for p in frame.particle.tolist()], int)
@@ -282,7 +301,10 @@ _DOUBTFUL = {"overlap", "merged", "border"}
 
 @dataclass
 class SmoothedTracks:
-    """Tracks smoothed over consecutive frames with final ids; kept until their readings change."""
+    """Smooths tracks over consecutive frames with final ids, and keeps the results.
+
+    The result for a track is kept until `forget` says that its measurements have changed.
+    """
 
     frames: Sequence[Frame]
     cameras: tuple[Camera, Camera]
@@ -290,12 +312,15 @@ class SmoothedTracks:
     _known: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
     def at(self, index: int, particles: Sequence[int]) -> tuple[Array, Array]:
-        """Points (K, 3) and covariances (K, 3, 3) in one frame, of particles given to `prepare`."""
+        """Return the points (K, 3) and covariances (K, 3, 3) of K tracks in one frame.
+
+        index : of the frame. particles : ids of the tracks, which `prepare` must have smoothed.
+        """
         points, covariances = zip(*(self._known[p] for p in particles))
         return np.array([x[index] for x in points]), np.array([c[index] for c in covariances])
 
     def prepare(self, particles: Iterable[int]) -> None:
-        """Smooth the particles that are not known."""
+        """Smooth those of the given tracks for which no result is kept."""
         new = sorted(set(particles) - set(self._known))
         if new:
             readings = readings_of(self.frames, new, self.cameras)
@@ -303,13 +328,16 @@ class SmoothedTracks:
             self._known |= zip(new, zip(*(np.swapaxes(values, 0, 1) for values in found)))
 
     def forget(self, particles: Iterable[int]) -> None:
-        """Readings of these particles have changed."""
+        """Drop the results of tracks whose measurements have changed."""
         for particle in particles:
             del self._known[particle]
 
 
 def follow_back(tracks: SmoothedTracks, changeable: set[int]) -> None:
-    """Give free detections of the ``changeable`` frames to the tracks that they continue."""
+    """Give detections without a track to the tracks that they continue.
+
+    changeable : numbers of the frames in which tracks may still change.
+    """
     frames, cameras = tracks.frames, tracks.cameras
     sizes = _sizes(frames)
     for frame in frames:

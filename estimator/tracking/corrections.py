@@ -29,10 +29,11 @@ _COLUMNS = [
     Column("reason", "text"),
 ]
 _TODO = {
-    "drop": "give particle, and in frame from which frame on it is dropped, or leave it blank",
-    "join": "give particle and other, the track that gets the id of particle",
-    "split": "give particle, frame (the first one of the new track) and other (the new id)",
-    "rename": "give particle and other, the new id",
+    "drop": "give particle (the track's id) and frame (the first one to drop; blank for all)",
+    "join": "give particle (an id) and other (the id of the track that gets this id)",
+    "split": "give particle (the track's id), frame (the first frame of the new track) and other "
+    "(the new track's id)",
+    "rename": "give particle (the track's id) and other (its new id)",
 }
 
 
@@ -75,7 +76,7 @@ class Corrections:
             f"{FILE} row {c.row}: {c.action} changed nothing: there is no track "
             f"{c.other if c.action == 'join' else c.particle}"
             + (f" from frame {c.frame} on" if c.frame else "")
-            + "; the tracks may have other ids since the file was written"
+            + ". The ids of the tracks may have changed since the file was written: check the row"
             for c in self.corrections
             if c not in self.used
         ]

@@ -323,7 +323,8 @@ def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, C
         raise CalibrationError(
             f"the run's cameras are {', '.join(run.cameras)}, the calibration's {', '.join(names)}",
             where=str(run.path),
-            todo="give the calibration of this rig (--calibration), cameras named alike",
+            todo="give the calibration of this rig (--calibration), or use the same camera names "
+            "in both",
         )
     for camera in calibration.cameras:
         size = run.image_sizes_px.get(camera.name)

@@ -132,7 +132,7 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
     if length < 0.05:
         raise InputError(
             "both cameras look along nearly the same direction",
-            todo="views less than 3 deg apart cannot be matched by a shared coordinate",
+            todo="turn the cameras: at less than 3 deg between them, bubbles cannot be paired",
         )
     in_first = (cameras[0].camera_from_rig.rotation @ perpendicular)[:2]
     return np.asarray(perpendicular / length * np.sign(in_first[np.argmax(np.abs(in_first))]))
@@ -434,19 +434,22 @@ class PairModel:
     def sentences(self, without: Collection[Finding] = ()) -> list[str]:
         """Return a summary and a text for each finding except those in ``without``."""
         if Finding.NO_DETECTIONS in self.findings:
-            return ["No frame has detections in both cameras: nothing was learnt about the pairs."]
+            return [
+                "No frame has detections in both cameras, so there are no pairs, and offset and "
+                "scatter of the ray misses are unknown."
+            ]
         offset, error = self.mean_gap_px
         raw, after_constant, after_all, left_out = self.rms_px
         texts = {
             Finding.CALIBRATION_OFFSET: (
-                "This is a calibration problem: the coordinate that both cameras share is off by "
-                f"{offset:+.2f} px. With that constant removed, {after_constant:.2f} px RMS "
-                "remain. The matching removes the offset; the positions keep it until the rig is "
-                "calibrated again."
+                "This is a calibration problem: in the coordinate that both cameras share, the "
+                f"cameras differ by {offset:+.2f} px. Without this constant offset the ray misses "
+                f"are {after_constant:.2f} px RMS. The offset does not affect the pairing, but all "
+                "positions contain it: calibrate the rig again."
             ),
             Finding.OFFSET_VARIES: (
                 "The offset changes over the volume: a smooth function of position reduces the "
-                f"gaps from {after_constant:.2f} px RMS to {after_all:.2f} px "
+                f"ray misses from {after_constant:.2f} px RMS to {after_all:.2f} px "
                 f"({left_out:.2f} px for pairs left out of the fit). Possible causes are "
                 "distortion, refraction and the cameras' timing."
             ),
@@ -454,13 +457,12 @@ class PairModel:
                 "There are too few pairs to distinguish a biased calibration from wrong pairs."
             ),
             Finding.UNCLEAR_OFFSET: (
-                "The offset hardly stands out among the possible ones, because the bubbles' sizes "
-                "are too similar. Trust these pairs only where tracks confirm them, or calibrate "
-                "again."
+                "Other offsets explain the run almost as well, because the bubbles' sizes are too "
+                "similar. Trust these pairs only where tracks confirm them, or calibrate again."
             ),
             Finding.CAMERA_SHAKE: (
-                f"All gaps of a frame shift together by {self.frame_px:.2f} px RMS: the cameras "
-                "shake against each other."
+                f"All ray misses of a frame shift together by {self.frame_px:.2f} px RMS from "
+                "frame to frame, because the cameras shake relative to each other."
             ),
         }
         return [

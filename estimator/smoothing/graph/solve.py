@@ -276,7 +276,8 @@ def _check_variances(found: Covariances | None) -> None:
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         if variance.size and np.any(variance < -_ROUNDING * variance.max(axis=0)):
             raise CalibrationError(
-                f"a state of a {what} has a negative variance: it is hardly determined",
+                f"a state of a {what} has a negative variance because of rounding: the data hardly "
+                "determine it",
                 where="smooth",
                 todo="look for short or broken tracks in tracking's report and drop them in "
                 "corrections.csv, or smooth with other sensors",

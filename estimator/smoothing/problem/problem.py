@@ -359,7 +359,7 @@ class SmoothingProblem:
         """Raise InputError for times that do not increase or a run of fewer than two frames."""
         if len(self.t_s) < 2:
             raise InputError(
-                f"a run of {len(self.t_s)} frame(s) has no motion to smooth",
+                f"the run has {len(self.t_s)} frame(s), which show no motion",
                 todo="give at least two frames",
             )
         stage = [] if self.stage is None else [("stage", self.stage.t_s)]

@@ -496,15 +496,15 @@ def _unconfirmed_words(clock: Alignment | None) -> str:
             "images"
         )
     if not clock.connected:
-        return "its clock is unknown, and at no offset do its readings explain the images"
+        return "its clock is unknown, and there is no offset at which its readings fit the images"
     if clock.at_end:
         return (
-            f"its clock is unknown, and the offset that fits best, {clock.offset_s:.3f} s, lies at "
-            "the end of the record"
+            f"its clock is unknown, and the offset that fits best, {clock.offset_s:.3f} s, is the "
+            "last one that the record permits, so the true one may be beyond it"
         )
     return (
         f"its clock is unknown, and offsets of {clock.offset_s:.3f} and {clock.runner_up_s:.3f} s "
-        "fit the images alike, as they do for a shake of one frequency"
+        "fit the images equally well, as happens if the shake has only one frequency"
     )
 
 
@@ -687,7 +687,7 @@ def _one_of(first: str, second: str, judged: dict[str, Mounting]) -> Finding:
         "they contradict each other: the axes of one of them are wrong, and images and encoder do "
         "not show clearly which",
         f"accelerometers {first} and {second}",
-        f"look how both are mounted; either {_axes_line(first, judged[first])} or "
+        f"check how both are mounted; either {_axes_line(first, judged[first])} or "
         f"{_axes_line(second, judged[second])} would fit",
         Code.SENSOR_AXES,
     )

@@ -589,7 +589,7 @@ def test_bad_input(run: Run) -> None:
         smooth(run.tracks, "calibration.json", **good)
     with pytest.raises(InputError, match="model is 'best'"):
         smooth(run.tracks, run.calibration, model="best", **good)
-    with pytest.raises(InputError, match="nothing says when the frames are"):
+    with pytest.raises(InputError, match="the times of the frames are unknown"):
         smooth(None, run.calibration, **good)
     with pytest.raises(InputError, match="no camera 'top'"):
         smooth(run.tracks, run.calibration, references=run.references.assign(camera="top"), **good)

@@ -234,7 +234,7 @@ def test_accelerometers_in_another_unit(factor: float, unit: str, run: Path) -> 
 
 def test_gravity_taken_out(run: Path) -> None:
     spoil(run / "accelerometer.csv", add("ay_m_s2", 9.80665))
-    refused(run, "gravity has been taken out")
+    refused(run, "gravity has been subtracted")
 
 
 def test_gravity_in_no_unit(run: Path) -> None:
@@ -304,7 +304,7 @@ def test_axes_that_gravity_cannot_tell(felt: int, sign: int, told: str, run: Pat
     rig = replace(data.rig, stage=StageDescription((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), 0.001))
     words = settled(check_sensors(replace(data, rig=rig, accelerometers=table)), frozenset())
     assert len(words) == (2 if told else 0), words
-    assert all(f"felt along {told} of the sensor" in w for w in words), words
+    assert all(f"appears along {told} of the sensor" in w for w in words), words
 
 
 @pytest.mark.parametrize(("turned", "axis"), [("arm_left", "ax"), ("arm_right", "az")])

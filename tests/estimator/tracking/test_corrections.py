@@ -78,8 +78,8 @@ def test_what_was_done_and_what_changed_nothing_is_said(tmp_path: Path) -> None:
     ("rows", "words"),
     [
         ("kill,1,,,x\n", "no action 'kill'"),
-        ("join,1,,,x\n", "give particle and other"),
-        ("join,1,1,,x\n", "give particle and other"),
+        ("join,1,,,x\n", "give particle (an id)"),
+        ("join,1,1,,x\n", "give particle (an id)"),
         ("split,1,9,,x\n", "frame"),
         ("rename,1,b,,x\n", "whole number"),
         ("drop,1,2,,x\n", "drop has particle"),

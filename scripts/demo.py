@@ -74,7 +74,8 @@ def track_and_compare(
 ) -> bool:
     """Track the only run of a simulated dataset, and print the errors.
 
-    Returns whether the bubble was followed throughout."""
+    Returns whether the bubble was followed throughout.
+    """
     import pandas as pd
 
     from telerig.estimator.tracking.results_folder import write_tracking

@@ -233,8 +233,11 @@ def _found(
 
 
 def load_compiled_loops() -> None:
-    """Load or compile what detection runs, once for all copies of this process that are yet to be
-    made; the first time on a computer takes some 10 s."""
+    """Load or compile the loops that the detection of bubbles uses.
+
+    This is done before copies of this process are made, so that it is done only once. The first
+    time on a computer it takes some 10 s.
+    """
     image = np.full((64, 96), 200, np.uint8)
     for u in (36, 56):
         cv2.circle(image, (u, 32), 14, (20,), cv2.FILLED)
@@ -252,7 +255,10 @@ def is_crowded(covered: float, bubbles: float, limit: float) -> bool:
 
 
 def crowded_words(where: str, covered: float) -> str:
-    """Return what to say of a run whose images are crowded."""
+    """Return a warning for the user about images in which bubbles hide each other.
+
+    where : the images. covered : share of the images that bubbles cover.
+    """
     return (
         f"{where}: bubbles cover {covered:.0%} of the images; beyond {COVERED_LIMIT:.0%} more than "
         "one in five is missed or merged with others"

@@ -54,7 +54,7 @@ def _full_scale(image: NDArray[Any]) -> float:
 
 
 def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Float32, bool]:
-    """Grey over background, and whether the screen is clipped at the sensor's white."""
+    """Return the image divided by its background, and whether the screen is clipped (saturated)."""
     if background is None:
         screen = screen_level(image.astype(np.float32, copy=False))
         lowest = float(screen.min())
@@ -100,10 +100,11 @@ def screen_of_field(image: NDArray[Any], field: Bools) -> Float32:
 
 
 def screen_level(image: Float32) -> Float32:
-    """Level of the lit screen (rows, columns), from an image with bubbles in front of it.
+    """Return the level of the lit screen (rows, columns), from an image with bubbles before it.
 
-    Bright closing over a quarter of the image at an eighth of its size, then a broad mean over
-    what is not darker than that; robust while the screen shows within a quarter of the image.
+    In the image at an eighth of its size, dark things up to a quarter of the image are closed. Then
+    a broad mean over all pixels that are not darker than this is taken. This works if every quarter
+    of the image shows some of the screen.
     """
     rows, columns = image.shape
     small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))

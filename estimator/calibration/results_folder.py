@@ -56,7 +56,8 @@ def sources(dataset: Dataset) -> list[Path | Source]:
 def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
     """Write the HTML report of a results folder, and return its path.
 
-    dot : pictures of the example dot if they are drawn already; None draws them."""
+    dot : pictures of the example dot if they are drawn already; None draws them.
+    """
     from telerig.io.report.calibration.report import write_calibration_report
 
     return write_calibration_report(folder, dot=dot)

@@ -185,7 +185,8 @@ def check_overlap(
 
     It has the code ``code``, so that the record is refused, if hardly any frame is covered.
     t : (N,) times of the record. frames_t_s : (F,) times of the frames. where, sensor : for the
-    message."""
+    message.
+    """
     frames = np.asarray(frames_t_s, float)
     share = _covered(t, frames)
     if share >= _COVERED:

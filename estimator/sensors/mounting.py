@@ -194,7 +194,8 @@ def preference(y: Array, known: Bools, stated: Array, other: Array) -> float:
 def slope(y: Array, x: Array) -> tuple[float, float]:
     """Return the regression coefficient of y on x, both (n,), and its standard deviation.
 
-    The means are removed. The standard deviation takes into account that errors are correlated."""
+    The means are removed. The standard deviation takes into account that errors are correlated.
+    """
     y, x = y - y.mean(), x - x.mean()
     square = float(x @ x)
     if square <= 0 or len(x) < 20:

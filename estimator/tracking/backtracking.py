@@ -65,7 +65,8 @@ class Readings:
         """Add M measurements with k components each.
 
         frames, bubbles : (M,) indices. values : (M, k) equal to by_points (M, k, 3) @ point plus
-        noise. covariances : (M, k, k) of the noise."""
+        noise. covariances : (M, k, k) of the noise.
+        """
         weighted = np.swapaxes(np.linalg.solve(covariances, by_points), -1, -2)
         np.add.at(self.information, (frames, bubbles), weighted @ by_points)
         np.add.at(self.pull, (frames, bubbles), (weighted @ values[..., None])[..., 0])

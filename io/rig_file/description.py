@@ -45,7 +45,8 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 class Table:
     """A table of rig.toml. Numbers must not be written as text, and must not be NaN.
 
-    The description of each field completes the sentence "... must be" in an error."""
+    The description of each field completes the sentence "... must be" in an error.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(strict=True, allow_inf_nan=False)
 

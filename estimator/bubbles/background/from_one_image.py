@@ -21,11 +21,14 @@ _ENOUGH_PIXELS = 10_000
 
 
 def level_of_image(image: NDArray[np.generic]) -> tuple[Float32, Bools]:
-    """(H, W) level in grey values, and (H, W) where it is interpolated under something dark.
+    """Estimate the level of the lit screen from a single image with bubbles in front of it.
 
-    The screen is a surface of degree 4 (log level), fitted to the bright side, then the smoothed
-    image itself where that is not dark. A dark band along more than a third of the border is the
-    screen's edge, not a bubble.
+    Returns the level (H, W) in grey values, and (H, W) where it was interpolated because something
+    dark hides the screen.
+
+    A surface of degree 4 is fitted to the logarithm of the brighter pixels. Where the image is not
+    dark in comparison with it, the level is the smoothed image itself. A dark band along more than
+    a third of the border is the screen's edge and not a bubble.
     """
     height, width = image.shape
     log = log_cells(image, _CELL_PX)
@@ -40,7 +43,7 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Float32, Bools]:
 
 
 def log_cells(image: NDArray[np.generic], cell_px: int) -> Float32:
-    """Logarithm of the image, averaged over square cells first."""
+    """Return the logarithm of the image after averaging over square cells of cell_px pixels."""
     size = [max(4, extent // cell_px) for extent in reversed(image.shape)]
     cells = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.asarray(np.log(np.maximum(cells, 0.5)))
@@ -49,11 +52,13 @@ def log_cells(image: NDArray[np.generic], cell_px: int) -> Float32:
 def fill_masked(
     log: Float32, mask: Bools, usable: Bools, across: tuple[float, float] | None = None
 ) -> Float32:
-    """``log`` with the masked pixels interpolated from the usable ones around them.
+    """Return an image with the masked pixels interpolated from the usable ones around them.
 
-    A surface of degree 2 through each hole's neighbourhood, and what is left of it around the
-    hole carried over it, in all directions, or along an image axis only: ``across`` is then the
-    reach (u, v) px of a pixel, small across the axis.
+    log : (H, W) logarithm of grey levels. mask, usable : (H, W).
+    A surface of degree 2 is fitted to the neighbourhood of each masked region. Its residuals around
+    the region are interpolated over the region, too, in all directions. If ``across`` is given,
+    they are interpolated along one axis of the image only; it is then the distance (u, v) in px
+    over which a pixel has influence, small across this axis.
     """
     surface = log.copy()
     for window, hole in _holes(mask):
@@ -95,8 +100,10 @@ def _carried(residual: Float32, known: Bools, across: tuple[float, float] | None
 
 
 def bright_surface(log: Float32, degree: int, known: Bools | None = None) -> Float32:
-    """Least squares over what is known and not much darker than the fit; of a large image, over
-    every second, third, ... pixel.
+    """Return a polynomial surface (H, W) of a degree that is fitted to the brighter pixels.
+
+    Pixels that are much darker than the fit, or not ``known``, are left out. Of a large image only
+    every second, third, ... pixel is used.
     """
     thin = (slice(None, None, max(1, int(np.sqrt(log.size / _ENOUGH_PIXELS)))),) * 2
     flat = log[thin].ravel().astype(np.float64)
@@ -132,7 +139,10 @@ def _dark_things(log: Float32, surface: Float32) -> Bools:
 
 
 def compact_things(dark: Bools) -> Bools:
-    """``dark`` with bright centres filled; what covers a third of a border is the screen's edge."""
+    """Return the dark regions (H, W) that may be bubbles, with bright centres filled.
+
+    A region that covers a third of a border of the image is the screen's edge and is left out.
+    """
     kept = dark.astype(np.uint8)
     outlines, _ = cv2.findContours(kept, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(kept, outlines, -1, 1, cv2.FILLED)

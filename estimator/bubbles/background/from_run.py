@@ -49,9 +49,10 @@ _KNOWN_STILL, _FEW = 5, 10
 
 
 def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Array) -> Bools:
-    """(n, H, W) pixels of n images that a bubble probably hides, where that happens often.
+    """Return (n, H, W) which pixels of n images a bubble probably hides.
 
-    Elsewhere quantiles over frames do better, as they need no threshold.
+    This is done only at places that bubbles hide in many frames. At other places quantiles over
+    frames give a better background, because they need no threshold.
 
     shifts_px : (n, 2) travel (u, v) of what is fixed in the lab; None when nothing moves.
     gains : (n,) log brightness of the frames.
@@ -148,9 +149,11 @@ _LEAST_SEEN_LAB = 2
 
 @dataclass(frozen=True)
 class Layers:
-    """Logarithms: rig (H, W), lab (Hl, Wl) or None, and gains (n,) of the frames.
+    """The background of a run as a sum of logarithms: one layer that is fixed in the image (rig),
+    one that is fixed in the laboratory (lab), and the brightness of each frame.
 
-    The lab's pixel (0, 0) is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
+    rig : (H, W). lab : (Hl, Wl), or None if nothing moves through the image; its pixel (0, 0) is
+    seen at image pixel (0, 0) if the shift is ``lab_origin_px``. gains : (n,) of n frames.
     """
 
     rig: Float32
@@ -159,7 +162,7 @@ class Layers:
     gains: Array
 
     def lab_in(self, shift_px: Array, rows: slice = slice(None)) -> Float32 | float:
-        """(H, W) of the lab layer as a frame sees it, or some rows of it."""
+        """Return the lab layer (H, W), or some rows of it, as a frame with this shift sees it."""
         if self.lab is None:
             return 0.0
         first, last, _ = rows.indices(self.rig.shape[0])
@@ -185,9 +188,12 @@ class _Sample:
 
 
 def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Layers, Bools, float]:
-    """Both layers of (n, H, W) images; shifts_px (n, 2), None for the rig layer alone.
+    """Estimate both layers of the background from n images.
 
-    Then (H, W) where a bubble hid the screen all the time, and the relative noise of a pixel.
+    stack : (n, H, W). shifts_px : (n, 2) travel of what is fixed in the laboratory; None for the
+    rig layer alone.
+    Returns the layers, (H, W) where a bubble hid the screen in all frames, and the relative noise
+    of a pixel.
     """
     shifts = np.zeros((len(stack), 2)) if shifts_px is None else shifts_px
     sample = _Sample(stack, shifts, _log_table(stack.dtype))
@@ -537,7 +543,10 @@ def crop_of_lab(
     shape: tuple[int, int],
     outside: float,
 ) -> Float32:
-    """(H, W) of the lab seen at a shift (u, v), by cubic interpolation; ``outside`` beyond it."""
+    """Return the part (H, W) of the lab layer that is seen at a shift, by cubic interpolation.
+
+    shift_px : (u, v). shape : (H, W). outside : value beyond the layer.
+    """
     left, top = shift_px[0] - origin_px[0], shift_px[1] - origin_px[1]
     column, row = math.floor(left), math.floor(top)
     window = np.full((shape[0] + 3, shape[1] + 3), outside, np.float32)
@@ -550,7 +559,10 @@ def crop_of_lab(
 
 
 def shifted(image: Float32, shift_px: tuple[float, float]) -> Float32:
-    """image(p + shift) for shifts below 1 px, by Catmull-Rom splines; borders replicated."""
+    """Return image(p + shift) for a shift below 1 px, by Catmull-Rom splines.
+
+    Pixels beyond the border are taken equal to those on the border.
+    """
     along_u, along_v = (_spline(shift) for shift in shift_px)
     out = cv2.sepFilter2D(image, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(out, np.float32)
@@ -584,10 +596,11 @@ class Background:
     """Holds the background of a run in two layers.
 
     rig_level : (H, W) level of what is fixed in the image, in grey values.
-    lab_factor : (Hl, Wl) what multiplies it, fixed in the lab; None without one. Its pixel (0, 0)
-    is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
-    covered : (H, W) True where a bubble hid the screen all the time, so that the level there is
-    interpolated. frames : those it was made of.
+    lab_factor : (Hl, Wl) factor of what is fixed in the laboratory, by which the level is
+    multiplied; None if there is none. Its pixel (0, 0) is seen at image pixel (0, 0) if the shift
+    is ``lab_origin_px``.
+    covered : (H, W) True where a bubble hid the screen in all frames, so that the level there is
+    interpolated. frames : the frames from which the background was made.
     noise : relative standard deviation of a pixel at the median level.
     shift_px : (F, 2) travel of the rig as seen in the image, for every frame; None if it is 0.
     """

@@ -15,7 +15,7 @@ Images = Callable[[int], NDArray[Any] | None]
 
 
 class RunBackground(Protocol):
-    """What a method returns for one camera."""
+    """The background of a run for one camera, as any method returns it."""
 
     def of_frame(self, frame: int) -> Float32:
         """Return the level (H, W) of the lit screen in a frame, in grey values."""

@@ -40,9 +40,13 @@ _MAX_CUT_CENTRE_SHARE = 0.6
 
 @dataclass(frozen=True)
 class Blob:
-    """One dark region: its outline ``contour_px`` (n, 2; closed, to about 0.1 px) at half depth,
-    the ``inner`` level (background is 1), the edge's ``blur_px``, and the ``box`` (u, v, width,
-    height) of the region it came from."""
+    """One dark region of an image that was divided by its background.
+
+    contour_px : (n, 2) closed outline at half depth, to about 0.1 px. inner : grey level inside
+    (the background is 1). blur_px : standard deviation of the edge's blur.
+    box : (u, v, width, height) of the region. touches_border : whether it touches the image's
+    border.
+    """
 
     contour_px: Array
     inner: float
@@ -52,7 +56,7 @@ class Blob:
 
 
 class Rejected(NamedTuple):
-    """A dark region that is no bubble, and why."""
+    """A dark region that is no bubble: its centre, its radius, and the reason in words."""
 
     u_px: float
     v_px: float
@@ -61,10 +65,13 @@ class Rejected(NamedTuple):
 
 
 def noise_share(ratio: Float32, field: Bools | None = None) -> float:
-    """Noise of the normalised image where the screen is free, as a share of the background.
+    """Return the noise of the free screen in an image divided by its background.
 
-    From the `high_pass`, which is blind to any plane, of bands of rows of a large image.
-    field : (rows, columns) where the screen is; None for everywhere.
+    It is the standard deviation of a pixel, as a share of the background. It is estimated after
+    `high_pass`, which removes smooth changes; of a large image only some bands of rows are used.
+
+    ratio : image divided by its background. field : (rows, columns) where the screen is; None for
+    everywhere.
     """
     found, lit = [], []
     for first in range(0, max(len(ratio) - _BAND_ROWS, 0) + 1, _band_step(ratio)):
@@ -87,10 +94,11 @@ def _band_step(ratio: Float32) -> int:
 
 
 def dark_noise_share(ratio: Float32, blobs: list[Blob], sigma: float) -> float:
-    """Noise within the dark rims, at most ``sigma``, that of the screen: photons are fewer there.
+    """Return the noise of pixels inside the dark rims, where there are fewer photons.
 
-    From the `high_pass` where five by five pixels are dark alike. Structure within the rims makes
-    the estimate too large rather than too small.
+    It is at most ``sigma``, the noise of the screen. It is estimated after `high_pass`, at places
+    where five by five pixels are equally dark. Structure inside the rims makes the estimate too
+    large, not too small.
     """
     found = [np.empty(0, np.float32)]
     for blob in blobs:
@@ -108,10 +116,13 @@ def dark_noise_share(ratio: Float32, blobs: list[Blob], sigma: float) -> float:
 def find_blobs(
     ratio: Float32, *, sigma: float, min_contrast: float, min_diameter_px: float
 ) -> tuple[list[Blob], list[Rejected]]:
-    """Dark regions of the normalised image that may be bubbles, and those too small or faint.
+    """Find the dark regions of an image that was divided by its background.
 
-    Hysteresis: a region is what is darker than a faint shadow, and counts when it holds pixels
-    darker than ``1 - min_contrast``. Its outline is traced at half of its own depth.
+    A region consists of connected pixels that are darker than a faint shadow, and it must contain
+    pixels darker than ``1 - min_contrast``. Its outline is traced at half of its own depth.
+
+    sigma : noise of the screen. min_diameter_px : smallest diameter of a bubble.
+    Returns the regions that may be bubbles, and those that are too small or too faint.
     """
     low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
     mask = cv2.compare(ratio, low, cv2.CMP_LT)
@@ -234,9 +245,10 @@ _SHORTEST_ARC = 5
 
 
 def contour_moments(contours: list[Array]) -> tuple[Array, Array, Array]:
-    """Ellipses (B, 5) of equal area moments, and the RMS and largest distance of their points.
+    """Return the ellipses (B, 5) with the same area moments as B contours.
 
-    Points that are NaN (beyond the image) are passed over.
+    Also returns the RMS and the largest distance (B,) of each contour's points from its ellipse.
+    Points that are NaN (beyond the image) do not count.
     """
     found, used = [], []
     for contour in contours:
@@ -258,10 +270,11 @@ def contour_moments(contours: list[Array]) -> tuple[Array, Array, Array]:
 
 
 def notch_arcs(contour: Array) -> list[Array]:
-    """The outline (n, 2) cut where it turns inwards and where it leaves the image.
+    """Cut an outline (n, 2) where it turns inwards and where it leaves the image.
 
-    Turns are measured over arms of an eighth of the size, at least 3 px and at most 8, on points
-    evenly spaced by 1 px and smoothed over 1 px. Arcs of fewer than five points are dropped.
+    Turns are measured between two arms whose length is an eighth of the outline's size, 3 to 8 px,
+    on points that are spaced by 1 px and smoothed over 1 px. Returns the arcs in between, without
+    those of fewer than five points.
     """
     inside = np.isfinite(contour[:, 0])
     if not np.any(inside):
@@ -354,9 +367,10 @@ def _trimmed(points: Array, bounds: list[int]) -> list[Array]:
 
 
 def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
-    """Ellipses (B, 5) along B arcs of points, robustly, and the RMS distance of the points (B,).
+    """Fit an ellipse robustly to each of B arcs of points.
 
-    Short arcs lean towards circles: a - b and the shear carry a prior of 12 % of the radius.
+    Returns the ellipses (B, 5) and the RMS distance (B,) of their points. A prior of 12 % of the
+    radius on a - b and on the shear keeps ellipses through short arcs nearly circular.
     """
     sizes = np.array([len(arc) for arc in arcs])
     ellipses, rms = fitted_arcs(np.concatenate(arcs), sizes)
@@ -382,8 +396,11 @@ _SHARPEST_ORDER, _WHOLE = 35.0, 0.9
 
 @dataclass(frozen=True)
 class Part:
-    """One bubble of a blob: ``ellipse`` (5,), the blob's index, and whether the blob holds
-    others (``shared``) or could not be split (``merged``)."""
+    """One bubble in a dark region.
+
+    ellipse : (5,). blob : index of the region. shared : whether the region contains other bubbles,
+    too. merged : whether the region could not be divided into bubbles.
+    """
 
     ellipse: Array
     blob: int
@@ -392,7 +409,10 @@ class Part:
 
 
 def split_blobs(blobs: list[Blob], shape: tuple[int, ...], *, min_diameter_px: float) -> list[Part]:
-    """The bubbles in every blob of an image of ``shape``; at least one part for each."""
+    """Divide every dark region of an image into bubbles; each region gives at least one part.
+
+    shape : of the image. min_diameter_px : smallest diameter of a bubble.
+    """
     if not blobs:
         return []
     whole, rms, largest = contour_moments([blob.contour_px for blob in blobs])
@@ -537,10 +557,10 @@ def _covered(ellipses: Array, contour: Array) -> float:
 
 
 def implausible_outlines(outlines: Outlines) -> Bools:
-    """Outlines (B,) that miss the rim, or have a neck: no single bubble has such an outline.
+    """Return which outlines (B,) cannot belong to a single bubble.
 
-    The slighter the neck, the worse the outline's harmonics must describe the rim. Outlines that
-    are partly hidden are not tested for necks.
+    They miss the rim, or have a neck. A slight neck counts only if the outline's harmonics describe
+    the rim badly. Outlines that are partly hidden are not tested for necks.
     """
     depth = deepest_concavity(outlines.ellipse, outlines.harmonics)
     radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
@@ -551,8 +571,11 @@ def implausible_outlines(outlines: Outlines) -> Bools:
 
 
 def implausible_parts(outlines: Outlines, parts: list[Part]) -> Bools:
-    """Implausible outlines, and parts of a blob whose fit ended far from its start: then the
-    split was wrong."""
+    """Return which parts (B,) are wrong.
+
+    They have an implausible outline (`implausible_outlines`), or their fit ended far from its
+    start, because the region was divided wrongly.
+    """
     began = np.stack([part.ellipse for part in parts])
     ended = outlines.ellipse
     growth = np.sqrt(ended[:, 2] * ended[:, 3] / (began[:, 2] * began[:, 3]))

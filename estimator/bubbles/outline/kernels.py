@@ -132,8 +132,10 @@ def _substituted(root: Array, right: Array) -> None:
 
 @compiled
 def products(rows: Array, used: int, total: Array) -> None:
-    """Write into the lower triangle of ``total`` (n, n) the products of rows (n, N) with each
-    other, summed over the first ``used`` columns; n is a multiple of 4, or less than 4 are left."""
+    """Write into the lower triangle of ``total`` (n, n) the products of all pairs of n rows.
+
+    rows : (n, N); the products are summed over the first ``used`` columns.
+    """
     n = rows.shape[0]
     for i in range(n):
         j = 0

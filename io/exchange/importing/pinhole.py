@@ -61,7 +61,8 @@ class ImportedCameras(NamedTuple):
     """Cameras that were imported from another program.
 
     rig_from_world : pose for points in the other program's world; its rotation has the determinant
-    -1 if that world is mirrored. notes : sentences for the user on what is not exact."""
+    -1 if that world is mirrored. notes : sentences for the user on what is not exact.
+    """
 
     cameras: tuple[Camera, ...]
     rig_from_world: Pose

@@ -43,10 +43,10 @@ _FAMILIES: tuple[ConstantFamily, ...] = ("sensors", "constants", "marks", "clock
 
 @dataclass(frozen=True)
 class Piece:
-    """Hold which frames a piece's results are taken for, and which it is solved with.
+    """One piece of a long run that is smoothed in pieces.
 
-    first, end : its own frames, from ``first`` to before ``end``.
-    low, high : those that it is solved with.
+    first, end : the frames for which its results are used, from ``first`` to before ``end``.
+    low, high : the frames with which it is solved, which include margins on both sides.
     """
 
     first: int
@@ -56,7 +56,7 @@ class Piece:
 
     @property
     def own(self) -> range:
-        """Its own frames as they count in its solution."""
+        """The frames for which its results are used, counted from its first solved frame."""
         return range(self.first - self.low, self.end - self.low)
 
     def without_margin(self) -> Piece:
@@ -133,11 +133,12 @@ def solved_pieces(
 
 @dataclass(frozen=True)
 class Constants:
-    """Hold what each of P pieces of a run tells of its C constants.
+    """Hold the information of each of P pieces of a run about the C constants of the run.
 
-    problem : of the run.  pieces : as they are solved at last.
-    prior : (C,) information of the priors, and prior_mean : (C,).
-    information, side : (P, C, C) and (P, C), Lambda and Lambda c of the pieces without margins.
+    problem : that of the run. pieces : with their margins.
+    prior, prior_mean : (C,) information and means of the priors.
+    information, side : (P, C, C) information matrix Lambda of each piece without its margins, and
+    (P, C) Lambda times its estimate.
     """
 
     problem: SmoothingProblem
@@ -190,21 +191,22 @@ class Constants:
 
     @property
     def mean(self) -> Array:
-        """(C,) what all pieces together tell."""
+        """The constants (C,) that all pieces together determine."""
         side = self.side.sum(0) + self.prior * self.prior_mean
         return np.asarray(np.linalg.solve(self.total, side))
 
     @property
     def total(self) -> Array:
-        """(C, C) information of all pieces and of the priors."""
+        """The information matrix (C, C) of all pieces and of the priors."""
         return np.asarray(self.information.sum(0) + np.diag(self.prior))
 
     def given(self, problem: SmoothingProblem, model: ShakeModel, number: int) -> SmoothingProblem:
-        """Return the problem of a piece with what the others tell.
+        """Return the problem of a piece with the information of all other pieces on the constants.
 
-        The share of its neighbours that its margins hold is not told twice. GTSAM's factors take
-        three keys, so that each constant is known by those of encoder and calibration and by the
-        one before it, in the order of keys; marks are in the order in which they are passed.
+        What the margins of the piece contain of its neighbours is not counted twice. Factors of
+        GTSAM have three keys at most, so the information on each constant is expressed together
+        with the constants of encoder and calibration and with the constant before it, in the order
+        of the keys; marks are in the order in which they are passed.
         """
         rest, side = self.information.sum(0), self.side.sum(0)
         for other, share in self._shares(number).items():

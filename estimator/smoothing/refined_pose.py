@@ -37,9 +37,11 @@ _LEAST_WANDER_PX = 5e-3
 
 @dataclass(frozen=True)
 class Refinement:
-    """drift : (6, 6) prior of a movement.  tangent : (6,) it, from the gaps alone.
+    """What is needed to estimate a movement of the second camera together with the smoothing.
 
-    wander_px, wander_s : of the bubbles' centres in one image.
+    drift : (6, 6) prior covariance of the movement. tangent : (6,) the movement that the ray misses
+    alone give.
+    wander_px, wander_s : RMS and correlation time of the wander of outlines' centres in an image.
     """
 
     drift: Array
@@ -51,7 +53,10 @@ class Refinement:
 def refinement_of(
     tracks: Any, calibration: Calibration, wanted: bool | DriftPrior
 ) -> Refinement | None:
-    """None unless wanted. Raises InputError for runs without two cameras or with too few pairs."""
+    """Return what `Refinement` holds for a run; None if it is not wanted.
+
+    Raises InputError for runs without two cameras or with too few pairs.
+    """
     if not wanted:
         return None
     prior = wanted if isinstance(wanted, DriftPrior) else DriftPrior()
@@ -70,14 +75,17 @@ def refinement_of(
 
 
 def for_learning(problem: SmoothingProblem, refinement: Refinement) -> SmoothingProblem:
-    """The problem with the movement that gaps show taken off, as learning holds the cameras."""
+    """Return the problem with cameras moved as the ray misses show.
+
+    It is used for learning, which holds the cameras fixed.
+    """
     first, second = problem.cameras
     pose = moved_pose(second.camera_from_rig.inverse(), refinement.tangent).inverse()
     return replace(problem, cameras=(first, replace(second, camera_from_rig=pose)))
 
 
 def with_wander(model: ShakeModel, refinement: Refinement) -> ShakeModel:
-    """The model with the centres' wander, unless it has one or there is none."""
+    """Return the model with the wander of the outlines' centres, unless it has one already."""
     if model.bubble.wander_px > 0 or refinement.wander_px < _LEAST_WANDER_PX:
         return model
     px, tau_s = refinement.wander_px, refinement.wander_s
@@ -85,7 +93,7 @@ def with_wander(model: ShakeModel, refinement: Refinement) -> ShakeModel:
 
 
 def refined_change(solution: Solution, calibration: Calibration) -> RigChange | None:
-    """The movement's posterior; None where the graph does not hold it."""
+    """Return the posterior of the movement; None if it is no variable of the graph."""
     problem, found = solution.graph.problem, solution.covariances
     share = problem.calibration
     if share is None or share.drift is None or found is None:
@@ -108,7 +116,10 @@ def refined_change(solution: Solution, calibration: Calibration) -> RigChange | 
 
 
 def change_words(change: RigChange, first: str) -> str:
-    """The change as a sentence, for smoothing.json and the command."""
+    """Return a sentence on the movement, for smoothing.json and the terminal.
+
+    first : name of the first camera.
+    """
     if not change.moved:
         return (
             f"no movement of camera {change.camera!r} against {first!r} since the calibration "

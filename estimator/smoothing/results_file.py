@@ -140,7 +140,7 @@ class Tables:
             file.finish(inflation)
 
     def parts(self) -> Iterator[Tables]:
-        """Yield the rows some at a time: all."""
+        """Yield the tables in parts; here all rows are one part."""
         yield self
 
 

@@ -24,7 +24,7 @@ _SCALE_FROM = {
 
 
 def smoothing_words(found: Smoothing) -> str:
-    """The verdict, the standard deviations, encoder and warnings, a line each."""
+    """Return lines for the terminal: verdict, standard deviations, encoder and warnings."""
     verdict, summary = found.verdict, found.summary
     lines = []
     if "verdict" in verdict:

@@ -52,7 +52,9 @@ _LOWEST_HZ, _FREQUENCIES, _ABOVE = 1e-2, 6000, 1e3
 def accelerations_of(
     solution: Solution, draws: Draws, inertia: Inertia | None = None
 ) -> Accelerations | None:
-    """Return the bubbles' accelerations at a solution; None without bubbles or covariances.
+    """Return the bubbles' accelerations at a solution.
+
+    They are None if there are no bubbles, or if the covariances were not computed.
 
     draws : at the solution.  inertia : the low-pass; None to learn it.
     """

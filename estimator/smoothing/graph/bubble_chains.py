@@ -21,10 +21,14 @@ from telerig.factors.linear_factors import LinearFactors
 
 @dataclass(frozen=True)
 class Places:
-    """Where each row of the bubbles' states stands: by age, the longest track first.
+    """The order in which the rows of K bubbles' states are stored here.
 
-    order : (K,) bubbles, the longest first.  ends : for each age the end of its stretch.
-    active : for each age how many bubbles reach it.  place_of_row : (rows,).
+    A row is one bubble in one frame. The rows are sorted by age, the number of frames since the
+    bubble's first one, and within an age by the bubble, the longest track first.
+
+    order : (K,) indices of the bubbles, the longest track first. ends : for each age the index
+    after its last row. active : for each age the number of bubbles that reach it.
+    place_of_row : (rows,) place of each row of the graph in this order.
     """
 
     order: Ints
@@ -46,17 +50,20 @@ class Places:
         return Places(order, ends, active.astype(np.int64), place)
 
     def stretches(self) -> list[slice]:
-        """Where the rows of each age stand."""
+        """Return for each age the slice of its rows."""
         return [slice(int(e - a), int(e)) for e, a in zip(self.ends, self.active)]
 
 
 @dataclass(frozen=True)
 class BubbleChains:
-    """Hold R x_i = d - S (x_i+1, U) of all rows, as covariance and gain; D states a row.
+    """Hold the eliminated states of all bubbles, with D states in each row.
 
-    own : (rows, D, D) R^-1 R^-T.  gain : (rows, D, D + 3) R^-1 S.  mean : (K, 3, 3) covariances of
-    the mean velocities U. Rows as in ``places``, bubbles in its order.
-    log_det : logarithm of the determinant of the root.
+    Elimination gives R x_i = d - S (x_i+1, U) for the state x_i of a bubble in one frame, the next
+    one x_i+1 and its mean velocity U.
+
+    own : (rows, D, D) R^-1 R^-T. gain : (rows, D, D + 3) R^-1 S. mean : (K, 3, 3) covariances of
+    the mean velocities of K bubbles. Rows and bubbles are in the order of ``places``.
+    log_det : logarithm of the determinant of the square root of the information.
     """
 
     places: Places
@@ -88,7 +95,7 @@ class BubbleChains:
         return rows, means
 
     def covariances(self, place: Ints) -> Array:
-        """Return the covariances (n, D, D) of the states at places (n,)."""
+        """Return the covariances (n, D, D) of the states of n rows. place : (n,) their places."""
         size = self.own.shape[-1]
         order = np.argsort(place, kind="stable")
         sought = place[order]
@@ -108,7 +115,7 @@ class BubbleChains:
 
 
 def bubble_chains(graph: GraphLayout, factors: Sequence[LinearFactors]) -> BubbleChains:
-    """Return the chains of all factors that bubbles take part in, everything else held."""
+    """Return the eliminated states of the bubbles, with all other variables held fixed."""
     base, size = graph.base(), graph.bubble.size
     places = Places.of(graph)
     rank = np.empty(len(places.order), np.int64)

@@ -69,20 +69,24 @@ def eliminated(
 
 
 def most_in_sight(graph: GraphLayout) -> int:
-    """Return the largest number of bubbles at one time."""
+    """Return the largest number of bubbles that are in sight in one frame."""
     return int(np.bincount(graph.frame_of_row).max(initial=0))
 
 
 @dataclass(frozen=True)
 class EliminatedCrowd:
-    """Hold the solution of a graph with many bubbles; it takes the place of `EliminatedGraph`.
+    """Hold the solution of a graph with many bubbles, in place of an `EliminatedGraph`.
 
-    chains : the bubbles, the rig held.  mean : the graph with the mean bubble.
-    mean_chains : its bubble, the rig held.
-    rig : the factors without bubbles, with the keys of ``mean``.  images_by_rig, images_by_bubble :
-    the bubbles' pixels, with the keys of ``mean``, and the rows of ``chains`` in place of keys.
-    starts : first columns of the keys of ``mean``, and of the rows.
-    steps : conjugate gradients that were needed.
+    The graph is approximated by one with a single bubble, the mean of all bubbles. It serves as the
+    preconditioner of a conjugate-gradient solution of the whole graph.
+
+    chains : the bubbles, eliminated for a fixed rig. mean : the graph with the mean bubble.
+    mean_chains : the mean bubble, eliminated for a fixed rig.
+    rig : the factors without bubbles, with the keys of ``mean``.
+    images_by_rig, images_by_bubble : the derivatives of the bubbles' pixels with respect to the
+    rig, with the keys of ``mean``, and to the bubbles, with rows of ``chains`` in place of keys.
+    starts : first column of each key of ``mean``, and of each row.
+    steps : number of conjugate-gradient steps that were needed.
     """
 
     graph: GraphLayout
@@ -97,7 +101,10 @@ class EliminatedCrowd:
     steps: int = 0
 
     def log_det(self) -> float:
-        """Return log |R|, with the mean bubble's graph in place of the Schur complement."""
+        """Return the logarithm of the determinant of the square root of the information.
+
+        The graph with the mean bubble replaces the Schur complement.
+        """
         return self.chains.log_det + self.mean.log_det() - self.mean_chains.log_det
 
     def solved(self, side: Array) -> Array:
@@ -105,7 +112,7 @@ class EliminatedCrowd:
         return self.solved_in_steps(side)[0]
 
     def solved_in_steps(self, side: Array) -> tuple[Array, int]:
-        """Return `solved`, and how many steps of conjugate gradients that took."""
+        """Return what `solved` returns, and the number of conjugate-gradient steps."""
         rig, rows, means = self._split(side)
         bubbles = self._bubbles(rows.copy(), means.copy())
         found, steps = self._by_gradients(rig - self._pull(bubbles[0]))

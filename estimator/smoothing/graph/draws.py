@@ -29,12 +29,12 @@ _REFINEMENTS = 1
 
 @dataclass(frozen=True)
 class Draws:
-    """Hold K draws of what a right model leads to.
+    """Hold K random draws of errors and residuals, as they are if the model is right.
 
-    errors : (D, K) of the increments, keys in their order.
+    errors : (D, K) errors of all D variables, in the order of their keys.
     pixels, marks : (M, 2, K) and (R, 2, K) whitened residuals of the bubbles' and the marks'
-        pixels, with the roots of their weights.
-    encoder : (E, K) of the encoder's readings.
+        pixels, multiplied by the square roots of their weights.
+    encoder : (E, K) whitened residuals of the encoder's readings.
     """
 
     errors: Array

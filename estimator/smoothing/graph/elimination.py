@@ -52,7 +52,10 @@ class Blocks:
 
 @dataclass(frozen=True)
 class EliminatedGraph:
-    """cliques : the square root of the information, in order of elimination."""
+    """Hold a graph whose variables have been eliminated.
+
+    cliques : the square root of the information, in the order of elimination.
+    """
 
     graph: GraphLayout
     cliques: list[Clique]
@@ -73,7 +76,7 @@ class EliminatedGraph:
 
     @cached_property
     def vector(self) -> Array:
-        """The solution, keys in their order."""
+        """The solution (D,) of all variables, in the order of their keys."""
         out = np.zeros(int(starts_of(self.graph)[-1]))
         for clique, (own, _) in zip(self.cliques, self._columns):
             out[own] = clique.side
@@ -98,7 +101,8 @@ class EliminatedGraph:
         return out
 
     def blocks(self) -> Blocks:
-        """Marginal covariances of all increments, and of shake with bubbles at the same frame."""
+        """Return the marginal covariances of all variables, and those of the shake with the bubbles
+        in the same frame."""
         graph = self.graph
         base, counts = graph.base(), graph.counts()
         nodes, of_frame = np.unique(graph.nodes.of_frame, return_inverse=True)
@@ -124,9 +128,10 @@ class EliminatedGraph:
 def eliminate(
     graph: GraphLayout, factors: list[LinearFactors], *, cholesky: bool
 ) -> EliminatedGraph:
-    """The graph of all factors, solved: by QR, or by Cholesky where that keeps enough digits.
+    """Eliminate all variables of a graph.
 
-    Raises CalibrationError where it is undetermined.
+    cholesky : whether Cholesky's elimination is used; otherwise QR, which is slower and keeps more
+    digits. Raises CalibrationError if the factors do not determine all variables.
     """
     import gtsam
 
@@ -197,7 +202,7 @@ def _sizes(graph: GraphLayout) -> list[int]:
 
 
 def starts_of(graph: GraphLayout) -> Ints:
-    """First column of each key, and the number of columns."""
+    """Return the first column of each key in the vector of all variables, and its length."""
     return np.asarray(np.r_[0, np.cumsum(_sizes(graph))], np.int64)
 
 

@@ -52,14 +52,17 @@ _FEW_KINDS, _AT_ONCE = 16, 4096
 
 @dataclass(frozen=True)
 class ShakeLayout:
-    """The vector of carriage and camera offsets at a node.
+    """The meaning of the D states of carriage and cameras at one time.
 
-    components : independent, one after the other.
-    position, velocity, acceleration, jerk : (D,) of the carriage along the axis.
-    offset, offset_velocity, offset_acceleration, offset_jerk : (C + 1, 3, D) of each camera in
-        rig axes; the last is what all share, measured by a sensor on the carriage.
-    seen : per camera (k, 3), the directions in which its own arm is modelled.
-    unseen_variance_mm2 : (C, 3, 3) of the arm's own shake along the camera's depth.
+    components : independent processes, whose states stand one after the other. labels : their
+        names.
+    position, velocity, acceleration, jerk : (D,) rows that give the motion of the carriage along
+        the travel axis from the states.
+    offset, offset_velocity, offset_acceleration, offset_jerk : (C + 1, 3, D) rows that give the
+        offset of each of the C cameras in rig axes, and its derivatives; the last one is that of
+        the carriage itself, which all cameras share and a sensor on the carriage measures.
+    seen : for each camera (k, 3), the directions in which the shake of its own arm is modelled.
+    unseen_variance_mm2 : (C, 3, 3) prior covariance of the arm's shake along the camera's depth.
     """
 
     components: tuple[Component, ...]
@@ -82,11 +85,13 @@ class ShakeLayout:
 
 @dataclass(frozen=True)
 class BubbleLayout:
-    """The vector of a bubble at a frame.
+    """The meaning of the D states of a bubble in one frame.
 
-    position, velocity, acceleration : (3, D) lab, rig axes; 0 where there is no acceleration.
-    wander : (C, 2, D) px.
-    path_position, path_velocity : (3,) columns of the Ornstein-Uhlenbeck path along each axis.
+    position, velocity, acceleration : (3, D) rows that give the motion in the laboratory, in rig
+        axes; those of the acceleration are 0 if it is no state.
+    wander : (C, 2, D) rows that give the wander of the outline's centre in each camera, in px.
+    path_position, path_velocity : (3,) indices of the states of the Ornstein-Uhlenbeck path along
+        each axis.
     """
 
     components: tuple[Component, ...]
@@ -104,10 +109,11 @@ class BubbleLayout:
 
 @dataclass(frozen=True)
 class Nodes:
-    """When the carriage's and the cameras' states are: frames and sensor samples together.
+    """The N times (nodes) at which carriage and cameras have states.
 
-    t_s : (N,).  of_frame, of_encoder, of_accelerometers : node of each frame or reading, and by how
-    much later than the node it is (..._late_s).
+    t_s : (N,).
+    of_frame, of_encoder, of_accelerometers : index of the node of each frame or reading.
+    frame_late_s, encoder_late_s, accelerometer_late_s : how much later than its node each is.
     """
 
     t_s: Array
@@ -120,7 +126,10 @@ class Nodes:
 
 
 def seen_directions(camera: Camera) -> Array:
-    """(2, 3) unit vectors across the camera's line of sight, in rig axes; those where they fit."""
+    """Return two unit vectors (2, 3) across a camera's line of sight, in rig axes.
+
+    An axis of the rig is taken if it is nearly perpendicular to the line of sight.
+    """
     rotation = camera.camera_from_rig.rotation
     along = int(np.argmax(np.abs(rotation[2])))
     if abs(rotation[2, along]) > _ALIGNED:
@@ -138,7 +147,7 @@ class _Placed:
 
 
 def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
-    """All components of carriage and cameras."""
+    """Return the states of carriage and cameras for a model."""
     placed = _carriage(problem, model) + _offsets(problem.cameras, model)
     parts = [p.component for p in placed]
     size, cameras = sum(c.size for c in parts), len(problem.cameras)
@@ -256,10 +265,13 @@ def bubble_layout(model: BubbleModel, cameras: int, inertia: Inertia | None = No
 
 
 def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[float]) -> Nodes:
-    """When states are: at every accelerometer sample (stamp - delay), and at frames far from one.
+    """Return the times at which carriage and cameras have states.
 
-    Accelerations are rough and have their own nodes. Positions are smooth: a frame or an encoder
-    reading within a step of a node takes its state from there, carried by the drift (`carry`).
+    There is one at every sample of an accelerometer (its time minus the sensor's delay), and at
+    every frame that is far from such a sample. A frame or an encoder reading near a node takes its
+    state from there, carried to its own time by the drift (`carry`), because positions are smooth.
+
+    delays_s : delay of each accelerometer.
     """
     rough = [a.t_s - d for a, d in zip(problem.accelerometers, delays_s)]
     times = np.sort(np.concatenate([*rough, np.zeros(0)]))
@@ -290,9 +302,10 @@ def _nearest(nodes: Array, t_s: Array) -> tuple[Ints, Array]:
 
 
 def carry(components: Sequence[Component], late_s: Array) -> Array | None:
-    """(M, D, D) exp(F late), from states to those slightly later or earlier; None: all the same.
+    """Return the matrices (M, D, D) exp(F late) from states to states slightly later or earlier.
 
-    The noise of so short a time is left out.
+    late_s : (M,) time differences. The noise of so short a time is left out. Returns None if all
+    differences are 0.
     """
     if not np.any(late_s):
         return None
@@ -320,9 +333,10 @@ class Family(NamedTuple):
 
 
 class Families(NamedTuple, Generic[T]):
-    """Something of each family of variables, in the order of their keys.
+    """One value for each kind of variable, in the order of their keys.
 
-    constants : one key for encoder and calibration, since a factor takes three keys at most.
+    constants : that of the encoder's and the calibration's constants, which share one key, because
+    a factor of GTSAM has three keys at most.
     """
 
     shake: T
@@ -336,12 +350,17 @@ class Families(NamedTuple, Generic[T]):
 
 @dataclass(frozen=True)
 class State:
-    """shake : (N, Ds), the carriage in units of the encoder's reading.
+    """The values of all variables of a smoothing.
 
-    bubbles : (sum of lengths, Db), one bubble after the other.
-    means : (K, 3) velocities over the run.  sensors : (A, 3 or 4) bias, scale.
-    encoder : (0..2,) scale, delay.  calibration : (r,).  marks : (Q, 3).  clocks : (G, 0 or 1)
-    delay of the accelerometers' clocks beyond that at which the nodes are placed.
+    shake : (N, Ds) states of carriage and cameras at N nodes; the carriage is in units of the
+    encoder's reading.
+    bubbles : (rows, Db) states of the bubbles, a row for each frame of a bubble, one bubble after
+    the other. means : (K, 3) mean velocities of K bubbles.
+    sensors : (A, 3 or 4) biases of A accelerometers, and their scale errors if these are estimated.
+    encoder : (0 to 2,) scale error and delay of the encoder, as far as they are estimated.
+    calibration : (r,) error along r directions. marks : (Q, 3) positions of Q marks.
+    clocks : (G, 0 or 1) delay of G accelerometers' clocks beyond that at which the nodes are
+    placed.
     """
 
     shake: Array
@@ -354,21 +373,25 @@ class State:
     clocks: Array
 
     def encoder_scale(self, graph: GraphLayout) -> float:
-        """0 where it is held."""
+        """The scale error of the encoder; 0 if it is held."""
         return float(self.encoder[0]) if graph.encoder_flags[0] else 0.0
 
     def encoder_delay_s(self, graph: GraphLayout) -> float:
-        """0 where it is held."""
+        """The delay of the encoder in s; 0 if it is held."""
         return float(self.encoder[-1]) if graph.encoder_flags[1] else 0.0
 
 
 @dataclass(frozen=True)
 class GraphLayout:
-    """The fixed part of one linearisation: layouts, nodes and the keys' order.
+    """The fixed part of one linearisation: the states' meaning, the nodes and the keys' order.
 
-    nominal_mm : (N,) the carriage's prior mean.  delays_s : (A,) at which the nodes are placed.
-    clock_of : (A,) sensors with the same stamps share a clock.
-    first_row : (K + 1,) where each bubble's rows begin.  sizes : dimension of each family of keys.
+    shake, bubble : meaning of the states. nodes : times of the states of carriage and cameras.
+    nominal_mm : (N,) prior mean of the carriage's position. delays_s : (A,) delays of the
+    accelerometers at which the nodes are placed.
+    clock_of : (A,) index of each accelerometer's clock; sensors with the same times share one.
+    first_row : (K + 1,) first row of each bubble. node_of_row, bubble_of_row, frame_of_row : node,
+    bubble and frame of each row. moving_rows : the rows that have a row after them.
+    shake_motion, bubble_motion : the whitened steps of both kinds of states.
     """
 
     problem: SmoothingProblem
@@ -388,46 +411,61 @@ class GraphLayout:
     moving_rows: Ints
 
     def shake_basis(self, node: ArrayLike) -> Array:
-        """(..., D, D) basis of the increments at nodes (...)."""
+        """Return the basis (..., D, D) of the increments of the shake at nodes (...)."""
         return np.asarray(self.shake_motion.basis[self.node_basis[np.asarray(node)]])
 
     @cached_property
     def to_frames(self) -> Array | None:
-        """(F, D, D) from the shake's state at its node to that at the frame; None: the same."""
+        """The matrices (F, D, D) from the shake's state at a frame's node to that at the frame.
+
+        None if the frames are at their nodes.
+        """
         return carry(self.shake.components, self.nodes.frame_late_s)
 
     @cached_property
     def to_encoder(self) -> Array | None:
-        """(E, D, D) from the shake's state at its node to that at each reading."""
+        """The matrices (E, D, D) from the shake's state at a node to that at each encoder reading.
+
+        None if the readings are at their nodes.
+        """
         return carry(self.shake.components, self.nodes.encoder_late_s)
 
     def shake_at_frames(self, shake: Array) -> Array:
-        """(F, D) states at the frames from those at the nodes (N, D)."""
+        """Return the shake's states (F, D) at the frames. shake : (N, D) states at the nodes."""
         states = shake[self.nodes.of_frame]
         if self.to_frames is None:
             return np.asarray(states)
         return np.asarray((self.to_frames @ states[..., None])[..., 0])
 
     def in_shake_basis(self, block: Array, node: Ints) -> Array:
-        """(n, r, D) derivatives by states at nodes (n,) as those by their increments."""
+        """Return derivatives (n, r, D) with respect to increments of the shake at nodes (n,).
+
+        block : (n, r, D) derivatives with respect to the states.
+        """
         return times_chosen(block, self.shake_motion.basis, self.node_basis[node])
 
     def in_bubble_basis(self, block: Array, row: Ints) -> Array:
-        """(n, r, D) derivatives by states of bubble rows (n,) as those by their increments."""
+        """Return derivatives (n, r, D) with respect to increments of bubbles in rows (n,).
+
+        block : (n, r, D) derivatives with respect to the states.
+        """
         return times_chosen(block, self.bubble_motion.basis, self.row_basis[row])
 
     def out_of_bubble_basis(self, block: Array, row: Ints) -> Array:
-        """(n, r, D) covariances of something with increments of bubble rows (n,) as with states."""
+        """Return the covariances (n, r, D) of something with the states of bubbles in rows (n,).
+
+        block : (n, r, D) covariances with the increments of these states.
+        """
         turned = np.swapaxes(self.bubble_motion.basis, -1, -2)
         return times_chosen(block, turned, self.row_basis[row])
 
     def shake_moved(self, increments: Array) -> Array:
-        """(N, D) changes of the shake's states by increments (N, D) at all nodes."""
+        """Return the changes (N, D) of the shake's states for increments (N, D) at all nodes."""
         turned = np.swapaxes(self.shake_motion.basis, -1, -2)
         return times_chosen(increments[:, None], turned, self.node_basis)[:, 0]
 
     def bubbles_moved(self, increments: Array) -> Array:
-        """(rows, D) changes of the bubbles' states by increments (rows, D)."""
+        """Return the changes (rows, D) of the bubbles' states for increments (rows, D)."""
         turned = np.swapaxes(self.bubble_motion.basis, -1, -2)
         return times_chosen(increments[:, None], turned, self.row_basis)[:, 0]
 
@@ -452,7 +490,7 @@ class GraphLayout:
         return out
 
     def bubble_basis(self, row: ArrayLike) -> Array:
-        """(..., D, D) basis of the increments of bubble rows (...)."""
+        """Return the basis (..., D, D) of the increments of bubbles in rows (...)."""
         return np.asarray(self.bubble_motion.basis[self.row_basis[np.asarray(row)]])
 
     @property
@@ -485,7 +523,7 @@ class GraphLayout:
 
     @property
     def share_size(self) -> int:
-        """Directions of the calibration's uncertainty."""
+        """The number of directions of the calibration's uncertainty."""
         share = self.problem.calibration
         return 0 if share is None else int(share.root.shape[1])
 
@@ -508,7 +546,7 @@ class GraphLayout:
 
 
 def graph_layout(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> GraphLayout:
-    """Lay everything out for given delays of the accelerometers."""
+    """Return the layout of a problem's graph for given delays of the accelerometers (A,)."""
     nodes = nodes_of(problem, model, delays_s.tolist())
     stage = problem.stage
     nominal = np.zeros(len(nodes.t_s))
@@ -552,7 +590,10 @@ def _of_bubbles(problem: SmoothingProblem, nodes: Nodes, bubble: BubbleLayout) -
 
 
 def clocks_of(problem: SmoothingProblem) -> Ints:
-    """(A,) number of each sensor's clock: those with the same stamps were sampled together."""
+    """Return the index (A,) of each accelerometer's clock.
+
+    Sensors whose samples have the same times were sampled together and share a clock.
+    """
     known: dict[tuple[bytes, float], int] = {}
     numbers = [
         known.setdefault((a.t_s.tobytes(), a.delay_s), len(known)) for a in problem.accelerometers
@@ -561,7 +602,8 @@ def clocks_of(problem: SmoothingProblem) -> Ints:
 
 
 def first_guess(graph: GraphLayout) -> State:
-    """Bubbles where the cameras first saw them, the carriage where the encoder was, no shake."""
+    """Return a first guess of all variables: bubbles at their triangulated positions, the carriage
+    at the encoder's readings, no shake."""
     problem = graph.problem
     shake, bubbles, means, sensors, constants, marks, clocks = (
         np.zeros(family) for family in graph.counts()
@@ -591,7 +633,7 @@ def _guess_carriage(graph: GraphLayout, shake: Array) -> None:
 
 
 def moved(graph: GraphLayout, state: State, step: Array) -> State:
-    """The state after an increment, keys in their order."""
+    """Return the values of all variables after an increment (D,), in the order of their keys."""
     families = graph.counts()
     parts = np.split(step, np.cumsum([n * d for n, d in families])[:-1])
     shake, bubbles, means, sensors, constants, marks, clocks = (
@@ -611,7 +653,10 @@ def moved(graph: GraphLayout, state: State, step: Array) -> State:
 
 
 def points_in_rig(graph: GraphLayout, state: State) -> Array:
-    """(rows, 3) places of the bubbles in the rig frame, mm, the cameras' offsets at their mean."""
+    """Return the positions (rows, 3) of the bubbles in mm in the rig frame.
+
+    The rig frame is taken to be displaced by the mean of the cameras' offsets.
+    """
     shake = graph.shake_at_frames(state.shake)
     moved = shake @ graph.shake.offset[:-1].mean(0).T
     travel = shake @ graph.shake.position / (1 + state.encoder_scale(graph))
@@ -624,9 +669,10 @@ def times(matrices: Array, vectors: Array) -> Array:
 
 
 def times_chosen(blocks: Array, matrices: Array, which: Ints) -> Array:
-    """(n, r, E) blocks (n, r, D) times ``matrices`` (U, D, E)[which]; ``which`` is (n,).
+    """Return the products (n, r, E) of n blocks with a matrix each.
 
-    Large: the matrices are not copied for each block. Blocks of one row may be given as (1, r, D).
+    blocks : (n, r, D), or (1, r, D) for equal blocks. matrices : (U, D, E). which : (n,) index of
+    each block's matrix. The matrices are not copied for each block.
     """
     out = np.empty((len(which), blocks.shape[-2], matrices.shape[-1]))
     blocks = np.broadcast_to(blocks, (len(which), *blocks.shape[-2:]))

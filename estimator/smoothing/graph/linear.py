@@ -41,7 +41,7 @@ _SLOPE_S = 2e-3
 
 
 def priors_and_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
-    """Everything but the measurements."""
+    """Return the factors of all priors and of the motion, without the measurements."""
     out = _shake_motion(graph, state) + bubble_priors(graph, state)
     return out + constant_priors(graph, state) + _known(graph, state)
 
@@ -72,7 +72,7 @@ def _shake_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
 
 
 def bubble_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
-    """Motion of the bubbles and their mean velocities."""
+    """Return the factors of the bubbles' motion and of the priors of their mean velocities."""
     problem, layout = graph.problem, graph.bubble
     if not problem.bubbles:
         return []
@@ -102,7 +102,10 @@ def bubble_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
 
 
 def constant_values(graph: GraphLayout, state: State) -> dict[str, Array]:
-    """Values (N, n) of all constants by family; clocks are the delays beyond the stated ones."""
+    """Return the values (N, n) of all constants, by their kind.
+
+    Those of clocks are delays beyond the stated ones.
+    """
     clocks = state.clocks
     if graph.sensor_flags[1] and len(clocks):
         given = np.array([a.delay_s for a in graph.problem.accelerometers])
@@ -115,7 +118,7 @@ def constant_values(graph: GraphLayout, state: State) -> dict[str, Array]:
 
 
 def constant_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
-    """Priors of what does not change along a run: sensors, encoder, calibration, marks, clocks."""
+    """Return the factors of the constants' priors: sensors, encoder, calibration, marks, clocks."""
     model, problem, base = graph.model, graph.problem, graph.base()
     scale, delay = graph.sensor_flags
     values, out = constant_values(graph, state), list[LinearFactors]()
@@ -152,14 +155,20 @@ def _priors(base: int, deviation: Array, sigma: ArrayLike) -> LinearFactors:
 
 @dataclass(frozen=True)
 class Seen:
-    """Images as factors, without those where only the whitened residuals (M, 2) are wanted."""
+    """The factors of M pixels, and their whitened residuals (M, 2).
+
+    linear : empty if only the residuals were asked for.
+    """
 
     linear: list[LinearFactors]
     residual: Array
 
 
 def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
-    """Pixels of the bubbles; weight (M,), None for the residuals alone."""
+    """Return the factors of the bubbles' M pixels.
+
+    weight : (M,) weights of a robust fit; None for the residuals alone.
+    """
     problem, layout = graph.problem, graph.bubble
     obs = problem.observations
     rows = graph.row(obs.item, obs.frame)
@@ -180,7 +189,10 @@ def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
 
 
 def references(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
-    """Pixels of the marks fixed to the tank; weight (R,), None for the residuals alone."""
+    """Return the factors of the R pixels of marks that are fixed to the tank.
+
+    weight : (R,) weights of a robust fit; None for the residuals alone.
+    """
     obs = graph.problem.references
 
     def states(mine: Ints) -> _Moving:
@@ -287,7 +299,7 @@ def _by_calibration(
 
 
 def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
-    """Readings of the stage's position: at their own times, or interpolated at the frames.
+    """Return the factors of the encoder's readings, at their own times or interpolated at frames.
 
     The carriage's states are in units of the reading, so that its scale is not a factor of what
     the encoder determines: the joint mode of (states, scale) would shrink the states' noise, by one
@@ -330,9 +342,10 @@ def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
 def accelerometers(
     graph: GraphLayout, state: State, weights: SampleWeights | None = None
 ) -> list[LinearFactors]:
-    """Samples of all sensors, along the directions in which their mount's motion is modelled.
+    """Return the factors of all accelerometers' samples.
 
-    Their information on the encoder's scale, by the carriage's own acceleration, is not used.
+    Only the directions in which the motion of a sensor's mount is modelled are used. The samples'
+    information on the encoder's scale, through the carriage's acceleration, is not used.
 
     weights : of each sensor's samples; None for those of the record.
     """
@@ -341,12 +354,12 @@ def accelerometers(
 
 
 def sample_weights(problem: SmoothingProblem) -> SampleWeights:
-    """Weights (N,) of each sensor's samples: 0 for those that are not used, otherwise 1."""
+    """Return for each sensor the weights (N,) of its samples: 1, or 0 if a sample is not used."""
     return tuple(None if a.kept is None else a.kept.astype(float) for a in problem.accelerometers)
 
 
 def sample_residuals(graph: GraphLayout, state: State) -> tuple[Array, ...]:
-    """Whitened residuals (N, k) of each sensor's samples."""
+    """Return for each sensor the whitened residuals (N, k) of its N samples along k directions."""
     out = []
     for index, sensor in enumerate(graph.problem.accelerometers):
         read = _predicted_reading(graph, state, index).reading_mm_s2
@@ -434,7 +447,11 @@ def _slope(sensor: Accelerometer) -> Array:
 
 
 def sensed_directions(graph: GraphLayout, index: int) -> tuple[Array, float]:
-    """(k, 3) whitened rows that take a reading to the directions of modelled motion; log det."""
+    """Return the matrix (k, 3) from a reading of a sensor to its whitened components along the k
+    directions of modelled motion, and the logarithm of its determinant.
+
+    index : of the sensor.
+    """
     sensor = graph.problem.accelerometers[index]
     directions = np.eye(3) if sensor.camera == CARRIAGE else graph.shake.seen[sensor.camera]
     rows = directions @ np.linalg.inv(sensor.axes)
@@ -450,13 +467,16 @@ def all_factors(
     weights: tuple[Array, Array],
     samples: SampleWeights | None = None,
 ) -> list[LinearFactors]:
-    """Every factor of the graph; weights of the bubbles' and of the marks' pixels, and of the
-    sensors' samples."""
+    """Return all factors of the graph.
+
+    weights : (M,) and (R,) of the bubbles' and of the marks' pixels. samples : weights of each
+    sensor's samples; None for those of the record.
+    """
     out = priors_and_motion(graph, state)
     out += images(graph, state, weights[0]).linear + references(graph, state, weights[1]).linear
     return out + encoder(graph, state) + accelerometers(graph, state, samples)
 
 
 def pixel_residuals(graph: GraphLayout, state: State) -> tuple[Array, Array]:
-    """Whitened residuals of the bubbles' (M, 2) and of the marks' pixels (R, 2)."""
+    """Return the whitened residuals of the bubbles' pixels (M, 2) and of the marks' (R, 2)."""
     return images(graph, state, None).residual, references(graph, state, None).residual

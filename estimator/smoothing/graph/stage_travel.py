@@ -49,10 +49,10 @@ def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
 
 
 def default_scale_sigma(travel: Travel | None) -> float:
-    """Prior of the encoder's scale where it is estimated from marks.
+    """Return the prior standard deviation of the encoder's scale error.
 
-    Not wider for that: marks at unknown depths, seen through a lens that is not quite telecentric,
-    hardly determine the scale. See `wider_scale_sigma`.
+    It is not wider if marks are used to estimate the scale, because marks at unknown depths, seen
+    through a lens that is not exactly telecentric, hardly determine it. See `wider_scale_sigma`.
     """
     return SCALE_SIGMA if travel is None else float(np.sqrt(travel.covariance[2, 2]))
 
@@ -94,13 +94,20 @@ def carriage(solution: Solution) -> tuple[Array, Array]:
 
 
 def carriage_sigma(solution: Solution, states_sigma: Array) -> Array:
-    """(F,) sd of the carriage's position, from that of the readings' states (F,) and the scale."""
+    """Return the standard deviation (F,) in mm of the carriage's position.
+
+    states_sigma : (F,) that of the states, in units of the encoder's reading. The uncertainty of
+    the scale is added.
+    """
     position, _ = carriage(solution)
     return np.asarray(np.hypot(states_sigma, position * scale_sigma(solution)))
 
 
 def scale_sigma(solution: Solution) -> float:
-    """Posterior sd of the encoder's scale: of the variable, or what was known before."""
+    """Return the posterior standard deviation of the encoder's scale error.
+
+    If the scale is no variable of the graph, it is the standard deviation that was known before.
+    """
     graph, found = solution.graph, solution.covariances
     if graph.encoder_flags[0]:
         return 0.0 if found is None else float(np.sqrt(found.encoder[0, 0]))
@@ -119,7 +126,10 @@ def total_scale(solution: Solution) -> float:
 
 
 def considered(travel: Travel, model: ShakeModel) -> Array:
-    """(3, 3) covariance of (tilts, scale), without the scale where it is a variable."""
+    """Return the covariance (3, 3) of the travel axis' two tilts and of the encoder's scale.
+
+    The part of the scale is 0 if the scale is a variable of the graph.
+    """
     keep = np.array([1.0, 1.0, float(model.encoder_scale_sigma == 0)])
     return np.asarray(travel.covariance * np.outer(keep, keep))
 

@@ -29,10 +29,11 @@ _LARGEST_SQUARE = 1.3
 
 @dataclass(frozen=True)
 class OtherWindow:
-    """One window compared with the model learned from another.
+    """The comparison of one part of a run with the model that was learned from another part.
 
-    square : mean squared distance of a sample from the model; 1 if it is right. frequencies : by
-    name of a mode's frequency, its value in the window and the sd of the ratio to the learned one.
+    from_s, to_s : its time. square : mean squared whitened distance of a sample from the model's
+    prediction; 1 if the model is right. frequencies : by the name of a mode's frequency, its value
+    in this part, and the standard deviation of its ratio to the learned value.
     """
 
     from_s: float

@@ -119,9 +119,10 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Return frequency (Hz) and RMS (mm) of the bubbles' swing (Lomb-Scargle), if there are any.
+    """Return frequency (Hz) and RMS (mm) of the bubbles' zigzag; None if they show none.
 
-    Of a track only the frequencies count of which it shows `_LEAST_PERIODS` periods.
+    They are those of the peak of a Lomb-Scargle periodogram. Only frequencies of which a track
+    shows `_LEAST_PERIODS` periods count.
     """
     from scipy.signal import lombscargle
 
@@ -147,7 +148,11 @@ def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
 
 
 def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> CarriageModel:
-    """Return the carriage's model: readings as they are, or with sensors its motion in between."""
+    """Return the default model of the carriage's motion.
+
+    Without accelerometers the encoder's readings are taken as they are; with accelerometers the
+    motion between the readings is modelled, too.
+    """
     stage = problem.stage
     if stage is None:
         return CarriageModel()
@@ -194,7 +199,10 @@ _INDEPENDENT = 0.5
 
 
 def adapted(solution: Solution) -> ShakeModel | None:
-    """Return the model with noise, RMS and encoder's scale as the data show, None if unchanged."""
+    """Return the model with noise, RMS and encoder's scale adapted to a first solution.
+
+    Returns None if nothing has to change.
+    """
     model = solution.graph.model
     inflation = _noise_factor(solution)
     better = model

@@ -54,10 +54,12 @@ _EVERY = 8
 
 @dataclass(frozen=True)
 class Chain:
-    """The factor of a chain: upper (F, D, D) L_t^T, and following (F - 1, D, D) M_t.
+    """The Cholesky factor of a block tridiagonal precision matrix with F blocks of D states.
 
-    sides : (F, S, D) what was joined to each frame, times L_t^-T. steady : the frames between which
-    these no longer change.
+    upper : (F, D, D) L_t^T, the transposed diagonal blocks of the factor. following : (F - 1, D, D)
+    M_t, its blocks below the diagonal.
+    sides : (F, S, D) right-hand sides that were eliminated together with each frame, times L_t^-T.
+    steady : first and last frame between which the blocks no longer change.
     """
 
     upper: Array
@@ -91,7 +93,8 @@ class Chain:
         return np.asarray(out)
 
     def moments(self, sides: Array) -> tuple[Array, Array, Array]:
-        """Return `means`, and covariances (F, D, D) and (F - 1, D, D) with the state before."""
+        """Return what `means` returns, the covariances (F, D, D) of the states, and those
+        (F - 1, D, D) with the state of the frame before."""
         inverse = self.inverses()
         turned = np.swapaxes(inverse, -1, -2)
         size = self.upper.shape[-1]
@@ -206,9 +209,11 @@ _DIFFERENCE = 1e-4
 
 @dataclass(frozen=True)
 class SignalPosterior:
-    """The log evidence of a signal, and posterior means of moving items (B, F) and offsets (J, F).
+    """The log evidence of a line-of-sight signal, and posterior means.
 
-    position_mm : along the direction, less their start. R replicates of an item follow each other.
+    position_mm, velocity_mm_s : (B, F) motion of the moving items along the signal's direction;
+    positions are relative to the items' start. R replicates of an item follow each other.
+    offset_mm : (J, F) offset of each of J cameras.
     """
 
     log_evidence: float
@@ -240,7 +245,7 @@ def signal_evidence(signal: Signal, model: ShakeModel) -> float:
 
 
 def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
-    """Return the evidence and the posterior means."""
+    """Return the log evidence of a signal, and the posterior means of motion and offsets."""
     return Factor(signal, model).posterior()
 
 
@@ -440,7 +445,10 @@ class _Change:
 
 
 def signal_gradient(signal: Signal, model: ShakeModel, names: Sequence[str]) -> tuple[float, Array]:
-    """Return the log evidence and its derivatives (n,) by the log-parameters."""
+    """Return the log evidence of a signal, and its derivatives (n,).
+
+    They are with respect to the logarithms of the n hyper-parameters ``names``.
+    """
     factor = Factor(signal, model)
     moments = _moments(factor)
     slope = np.zeros(len(names))

@@ -219,14 +219,20 @@ def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = Fa
 
 @dataclass(frozen=True)
 class Step:
-    """The state of the search: the model, its fit, and lines of each kind found in this group."""
+    """The state of the search for spectral lines.
+
+    fit : the model and its fit. found : for each line that was added, whose line it is.
+    """
 
     fit: Fit
     found: tuple[Owner, ...] = ()
 
 
 def with_one_more_mode(group: Group, step: Step, options: Learning, first: bool) -> Step | None:
-    """Return the model with the line added that helps most; None if none is worth it."""
+    """Return the model with the spectral line added that improves the fit most.
+
+    Returns None if no line improves it by more than its penalty.
+    """
     tried = []
     for where in group.owners:
         if step.found.count(where) < options.most_modes:
@@ -409,14 +415,16 @@ BUBBLE = "bubble"
 
 @dataclass(frozen=True)
 class Learning:
-    """What may be learned.
+    """What may be learned from a run.
 
-    most_modes : lines of one kind (common, each arm, bubble) at most. hold : patterns of names (see
-    ``parameters``) that keep the start's values, "modes.*" for a rig that is known; the forces'
-    cut-off is held with any mode of which all is held. target : the tracks are those of a target at
-    rest.
-    force_hz : first low-pass cut-off of the modes' force; None: white, with a cut-off only where
-    the information criterion prefers one.
+    most_modes : largest number of spectral lines of one kind (common mode, mode of each arm,
+    bubbles' line).
+    hold : patterns of names of hyper-parameters (see ``parameters``) that keep their start values,
+    for example "modes.*" for a rig that is known. The cut-off of the forces is held if any mode is
+    held completely.
+    target : whether the tracks are those of a target at rest.
+    force_hz : first cut-off frequency of the modes' low-pass filtered force; None for a white
+    force, which is low-pass filtered only if the information criterion prefers that.
     """
 
     most_modes: int = 3
@@ -427,9 +435,11 @@ class Learning:
 
 @dataclass(frozen=True)
 class Group:
-    """Signals that are learned together; ``fast`` as `pooled` has them.
+    """Line-of-sight signals from which hyper-parameters are learned together.
 
-    pattern : (3,) share of a line's RMS along the rig's axes. owners : what a line could be.
+    pattern : (3,) share of a line's RMS along each axis of the rig. owners : to what a spectral
+    line in these signals may belong: to all cameras, to one arm, or to the bubbles. up : (3,) unit
+    vector against gravity.
     """
 
     signals: tuple[Signal, ...]
@@ -443,7 +453,10 @@ class Group:
 
 
 def groups_of(signals: Sequence[Signal], options: Learning, up: Array) -> list[Group]:
-    """Return the shared coordinate, and the coordinates across it, taken together; up : (3,)."""
+    """Return the signals of the shared coordinate, and those of the other coordinates, as groups.
+
+    The signals of a group are learned from together. up : (3,) unit vector against gravity.
+    """
     if not signals:
         return []
     bubble: tuple[Owner, ...] = () if options.target else (BUBBLE,)
@@ -464,7 +477,10 @@ def _pattern(square: Array) -> Triple:
 
 
 def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) -> list[str]:
-    """Return the names of what this group determines and nobody holds."""
+    """Return the names of the hyper-parameters that a group determines and that are not held.
+
+    first : whether it is the group that is learned from first.
+    """
     names = []
     for name in names_of(model):
         if is_held(name, model, options):
@@ -481,7 +497,7 @@ def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) 
 
 
 def is_held(name: str, model: ShakeModel, options: Learning) -> bool:
-    """Whether the user keeps that hyper-parameter as it is."""
+    """Return whether a hyper-parameter is held at its start value."""
     names = [name]
     if name == FORCE:
         names += [f"modes.{i}.force_hz" for i in range(len(model.modes))]

@@ -42,7 +42,11 @@ _IMPOSSIBLE = -1e12
 
 @dataclass(frozen=True)
 class Fit:
-    """log_evidence : at the model.  log_posterior : with the priors of what was fitted."""
+    """A model and how well it fits.
+
+    log_evidence : log density of the data under the model. log_posterior : the same plus the log
+    prior density of the fitted hyper-parameters.
+    """
 
     model: ShakeModel
     log_evidence: float
@@ -50,7 +54,10 @@ class Fit:
 
 
 def evidence(signals: Sequence[Signal], model: ShakeModel) -> float:
-    """Return the sum over the signals; a very low value if a model is numerically unsound."""
+    """Return the log evidence of all signals together.
+
+    It is a very low value if the model cannot be evaluated numerically.
+    """
     try:
         total = sum(signal_evidence(c, model) for c in signals)
     except np.linalg.LinAlgError:

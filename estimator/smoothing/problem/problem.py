@@ -120,9 +120,10 @@ class ShakeModel:
 
 @dataclass(frozen=True)
 class Observations:
-    """The M pixels (M, 2) at which bubbles, or marks, were measured, with covariances (M, 2, 2).
+    """The M measured pixels of bubbles, or of marks.
 
-    item, frame, camera : (M,) indices.
+    item, frame, camera : (M,) indices of the bubble or mark, the frame and the camera.
+    uv_px : (M, 2). covariance_px2 : (M, 2, 2).
     """
 
     item: Ints
@@ -144,11 +145,14 @@ class Observations:
 
     @cached_property
     def in_order(self) -> bool:
-        """Whether frames do not decrease, so that those of some frames are neighbours."""
+        """Whether the observations are sorted by frame."""
         return bool(np.all(self.frame[1:] >= self.frame[:-1]))
 
     def between(self, first: int, end: int) -> Observations:
-        """Return those in the frames from ``first`` to before ``end``, which count from 0 then."""
+        """Return the observations in the frames from ``first`` to before ``end``.
+
+        Their frames are counted from ``first``.
+        """
         keep: Any = (
             (self.frame >= first) & (self.frame < end)
             if not self.in_order
@@ -184,7 +188,11 @@ class Bubble:
 
 @dataclass(frozen=True)
 class Mark:
-    """A feature fixed to the tank: prior mean (3,) of its laboratory position, and its sd."""
+    """A mark that is fixed to the tank.
+
+    guess_mm : (3,) prior mean of its position in the laboratory. sigma_mm : prior standard
+    deviation along each axis.
+    """
 
     name: str
     guess_mm: Array
@@ -193,7 +201,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Stage:
-    """The encoder's E times (E,) and positions (E,), corrected for a calibrated scale."""
+    """The encoder's E readings.
+
+    t_s : (E,) times. position_mm : (E,) positions, corrected for a calibrated scale error.
+    """
 
     t_s: Array
     position_mm: Array
@@ -276,9 +287,11 @@ ConstantFamily = Literal["sensors", "constants", "marks", "clocks"]
 
 @dataclass(frozen=True)
 class Known:
-    """Hold what other parts of a run tell of some constants x_k: |sum_k A_k x_k - b|^2.
+    """Hold the information of other parts of a run about some constants x_k.
 
-    keys : family and number of each.  blocks : A_k (n, d_k).  side : (n,) b.
+    It is the squared residual |sum_k A_k x_k - b|^2.
+
+    keys : kind and number of each constant. blocks : A_k (n, d_k). side : (n,) b.
     """
 
     keys: tuple[tuple[ConstantFamily, int], ...]

@@ -44,7 +44,10 @@ _FELT_PX = 2e-3
 
 
 def stage_of(encoder: Encoder | None, t_s: Array) -> Stage | None:
-    """Return the encoder's readings near the frames at t_s (F,)."""
+    """Return the encoder's readings in the time of the frames, with a margin; None without one.
+
+    t_s : (F,) times of the frames.
+    """
     if encoder is None:
         return None
     near = _near(encoder.t_s, t_s)
@@ -236,13 +239,14 @@ def frames_between(tracks: Any, first: int, end: int) -> Any:
 
 @dataclass(frozen=True)
 class Tracked:
-    """Hold what is read of tracks: all of it, or what does not grow much with a long run.
+    """Hold the tracks of a run as the smoothing needs them.
 
-    tracks : as they were given.  sample : rows of their table, evenly spread; all of a table in
-        memory.  particles : ids, in order.  observations : of the bubbles by their index in
-        ``particles``.
-    places : for each of these its first frame and its positions (n, 3) in mm in the rig frame from
-        there on, NaN where it has none.
+    tracks : the tracks as they were given. sample : some rows of their table, evenly spread; all
+        rows of a table in memory. particles : ids of the bubbles, in order.
+    observations : pixels of the bubbles, by their index in ``particles``. t_s : (F,) times of the
+        frames.
+    places : for each bubble its first frame, and its positions (n, 3) in mm in the rig frame from
+        this frame on, NaN in frames without a position.
     """
 
     tracks: Any
@@ -259,7 +263,7 @@ class Tracked:
 
 
 def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | None) -> Tracked:
-    """Pixels out of a tracks table, and of detections that only one camera made.
+    """Read the pixels of the bubbles from tracks, and from detections that only one camera made.
 
     tracks : `Tracks`, `StoredTracks`, or a table with the columns of tracks.csv.
     Raises InputError for missing columns, cameras that the calibration does not have, NaN.

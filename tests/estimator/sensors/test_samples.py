@@ -87,7 +87,7 @@ def test_a_shifted_stretch_is_masked(length: int) -> None:
     reading[1000 : 1000 + length] += [0.5, -0.3, 0.4]
     found, words = screen(reading)
     assert np.flatnonzero(~found.kept).tolist() == list(range(1000, 1000 + length))
-    assert [f"{length} of 3000 samples are shifted" in one for one in words] == [True]
+    assert [f"{length} of 3000 samples are offset" in one for one in words] == [True]
 
 
 def test_an_impact_and_a_jump_that_stays_are_no_shift() -> None:

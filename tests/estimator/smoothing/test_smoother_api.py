@@ -388,7 +388,7 @@ def test_a_sensor_that_is_touched_for_ten_milliseconds_is_said(sharp: bool) -> N
         assert found.verdict["verdict"] == "CONTRADICTED"
         return
     assert rms_um(found.trajectories, spoilt.truth_mm) < 80
-    said = [w for w in found.summary["warnings"] if "are shifted" in w]
+    said = [w for w in found.summary["warnings"] if "are offset" in w]
     assert len(said) == 1, found.summary["warnings"]
 
 

@@ -1,6 +1,7 @@
 """Sizes, shapes, forces and oscillations of simulated bubbles beside their truth.
 
-    python benchmarks/bubble_physics.py [--seeds 10] [--bubbles 6] [--frames 250] [--images 60]
+    python benchmarks/bubble_physics.py [--seeds 10] [--first 10] [--bubbles 6] [--frames 250]
+        [--images 60]
 
 Bubbles of the preset "forces" obey an equation of motion with a known drag coefficient (Clift et
 al. 1978), added mass and lift, in a shaking rig with an encoder, an accelerometer on each arm and
@@ -29,12 +30,12 @@ import telerig
 from telerig.arrays import Array
 from telerig.estimator.physics.bodies import bodies_table
 from telerig.estimator.physics.frames import frames_table
-from telerig.estimator.physics.oscillation import dominant_oscillation
 from telerig.estimator.physics.summary import summary_table
 from telerig.io.rig_file.fluid import liquid_of
 from telerig.io.simulation.config import RunConfig
 from telerig.io.simulation.images.bodies import surface_modes
 from telerig.io.simulation.presets import run_preset
+from telerig.io.simulation.run.motion import driven_paths
 from telerig.io.simulation.run.scene import RunScene, run_scene
 from telerig.rig.bubble_physics import Liquid
 
@@ -87,12 +88,27 @@ def true_table(config: RunConfig, seed: int) -> pd.DataFrame:
         "drag": 4 / 3 * scene.forces.drag_1_mm[:, None] * d,
         "shape_hz": np.broadcast_to(scene.population.swing_hz[:, [2]], speed.shape),
         "lift_hz": np.broadcast_to(scene.forces.lift_hz[:, None], speed.shape),
+        "calm_mm": np.broadcast_to(_calm_zigzag_mm(scene)[:, None], speed.shape),
     }  # fmt: skip
     for i, x in enumerate("xyz"):
         columns |= {f"{x}_mm": scene.lab_mm[..., i], f"v{x}_mm_s": v[..., i]}
         columns |= {f"a{x}_mm_s2": a[..., i]}
         columns |= {f"pole_{x}": vectors[..., i, 0]}
     return pd.DataFrame({k: np.ravel(c) for k, c in columns.items()})
+
+
+def _calm_zigzag_mm(scene: RunScene) -> Array:
+    """(B,) amplitude of the zigzag that the swinging lift alone drives."""
+    t = scene.t_s
+    calm = replace(scene.forces, noise_mm_s2=0.0)
+    path = driven_paths(float(t[1] - t[0]), len(t), calm, np.random.default_rng(0))
+    out = []
+    for hz, velocity in zip(calm.lift_hz, path.lateral_mm_s, strict=True):
+        phase = 2 * np.pi * hz * t
+        terms = np.stack([np.cos(phase), np.sin(phase), np.ones_like(t), t], -1)
+        swing = np.linalg.lstsq(terms, velocity, rcond=None)[0][:2]
+        out.append(np.linalg.svd(swing)[1][0] / (2 * np.pi * hz))
+    return np.array(out)
 
 
 def _liquid(config: RunConfig) -> Liquid:
@@ -131,7 +147,7 @@ def _second_moments(scene: RunScene, frame: int, chosen: Array) -> Array:
 def true_summary(truth: pd.DataFrame) -> dict[str, float]:
     """What bubble_summary.csv should hold of one bubble, over the frames it was followed.
 
-    The frequency is that of the lift that drives the zigzag; the amplitude that of the true path.
+    Frequency and amplitude are those of the lift that drives the zigzag, without what wanders.
     """
     t = truth["t_s"].to_numpy()
     same = ("d_eq_mm", "aspect", "slip_mm_s", "eotvos", "reynolds", "weber", "drag", "shape_hz")
@@ -139,10 +155,7 @@ def true_summary(truth: pd.DataFrame) -> dict[str, float]:
     # of the means, as the table has it
     out["weber"] *= out["slip_mm_s"] ** 2 / (truth["slip_mm_s"] ** 2).mean()
     out["rise_mm_s"] = -(truth["y_mm"].iloc[-1] - truth["y_mm"].iloc[0]) / (t[-1] - t[0])
-    swing = dominant_oscillation(t, truth[["vx_mm_s", "vz_mm_s"]].to_numpy())
-    out["zigzag_hz"] = truth["lift_hz"].iloc[0]
-    if swing is not None:
-        out["zigzag_mm"] = swing.major / (2 * np.pi * swing.frequency_hz)
+    out["zigzag_hz"], out["zigzag_mm"] = truth[["lift_hz", "calm_mm"]].iloc[0]
     out["strouhal"] = out["zigzag_hz"] * out["d_eq_mm"] / out["slip_mm_s"]
     return out
 
@@ -264,13 +277,14 @@ def pooled(cases: list[dict[str, list[tuple[str, str, Array, Array, Array]]]]) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=10, help="the first seed")
     parser.add_argument("--bubbles", type=int, default=6)
     parser.add_argument("--frames", type=int, default=250)
     parser.add_argument("--images", type=int, default=0)
     arguments = parser.parse_args()
     config = run_preset("forces", bubbles=arguments.bubbles, frames=arguments.frames)
     start, cases = time.process_time(), []
-    for seed in range(arguments.seeds):
+    for seed in range(arguments.first, arguments.first + arguments.seeds):
         cases.append(case(config, seed))
         if arguments.images:
             fewer = replace(config, frames=arguments.images)

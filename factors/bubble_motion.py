@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -111,18 +112,32 @@ most have, where a run does not show how much."""
 FORCES = Prior(0.02, 10.0, 1.0, 1.0, 0.7)
 """Prior of the intensity of the forces on a bubble, over that of the model."""
 
+NOISE = Prior(0.03, 2.0, 1.0, 0.5, 0.3)
+"""Prior of the white noise of a bubble's pixels over the stated one, which contains what changes
+slowly, too: the effect of an unknown shape on the centre."""
+
 
 @dataclass(frozen=True)
 class Inertia:
     """Describes the first-order low-pass filter through which forces move a bubble.
 
-    time_s : time constant of the filter.
-    forces : intensity of the forces along the rig's x, y and z axes, divided by their intensity in
-        the model. The zigzags keep their RMS; their damping is multiplied by this factor instead.
+    time_s : time constant of the filter along the rig's x, y and z axes.
+    forces : intensity of the forces along these axes, divided by their intensity in the model. The
+        zigzags keep their RMS; their damping is multiplied by this factor instead.
+    noise : standard deviation of the pixels' white noise along the rise and across it, divided by
+        the stated one.
     """
 
-    time_s: float
+    time_s: Triple
     forces: Triple = (1.0, 1.0, 1.0)
+    noise: tuple[float, float] = (1.0, 1.0)
+
+
+class LowPasses(NamedTuple):
+    """The most probable low-pass filter, and the shortest one that the run does not exclude."""
+
+    probable: Inertia
+    shortest: Inertia
 
 
 def learned_names(model: BubbleModel) -> list[str]:
@@ -209,12 +224,13 @@ def inertial_bubble_path(model: BubbleModel, direction: Array, inertia: Inertia)
 
     The first states of the process are position, velocity and acceleration.
     """
-    intensity = float(np.square(direction) @ inertia.forces)
+    share = np.square(direction)
+    intensity, time_s = float(share @ inertia.forces), float(share @ inertia.time_s)
     sigma = model.velocity_sigma_mm_s * float(np.sqrt(intensity))
     zigzags = tuple(replace(z, damping=z.damping * intensity) for z in model.zigzags)
     swings = bubble_processes(replace(model, zigzags=zigzags), direction)[1:]
     return inertial_path(
-        sigma, model.velocity_tau_s, inertia.time_s, [p.component for p in swings],
+        sigma, model.velocity_tau_s, time_s, [p.component for p in swings],
         start_sigma_mm=model.start_sigma_mm,
     )  # fmt: skip
 

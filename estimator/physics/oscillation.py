@@ -11,9 +11,9 @@ from telerig.arrays import Array
 LEAST_PERIODS = 1.5
 _LEAST_SAMPLES = 16
 _PADDING = 8
-_SIGNIFICANT = 6.0
+SIGNIFICANT = 6.0
 _ROUNDING = 1e-9
-_NEAR_PERIODS, _OWN_PERIODS = 5.0, 1.5
+_NEAR_PERIODS, _OWN_PERIODS, _FALL = 5.0, 1.0, 2.5
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,16 @@ class Oscillation:
 
 
 def dominant_oscillation(
-    t_s: Array, values: Array, low_hz: float = 0.0, high_hz: float = np.inf
+    t_s: Array,
+    values: Array,
+    low_hz: float = 0.0,
+    high_hz: float = np.inf,
+    significant: float = SIGNIFICANT,
 ) -> Oscillation | None:
     """Return the strongest sinusoid of a series between two frequencies.
 
     t_s : (N,). values : (N, K), K = 1 or 2.
+    significant : least amplitude over its standard deviation.
 
     The series is modelled as a straight line, a sinusoid of frequency f, and coloured noise. The
     one-sided density S of the noise near f is taken from the residuals. A sinusoid of T seconds and
@@ -54,7 +59,7 @@ def dominant_oscillation(
     Cramer-Rao bounds for white noise of this density.
 
     Returns None if the record is shorter than 1.5 periods or 16 samples, or if the amplitude is
-    smaller than 6 of its standard deviations.
+    not significant.
     """
     good = np.isfinite(values).all(-1)
     t, y = np.asarray(t_s, float)[good], np.asarray(values, float)[good]
@@ -84,7 +89,7 @@ def dominant_oscillation(
     _, axes, _ = np.linalg.svd(np.stack([cosine, sine]), full_matrices=False)
     minor = float(axes[1]) if len(axes) > 1 else 0.0
     s_amplitude = float(np.sqrt(density / duration))
-    if axes[0] < _SIGNIFICANT * s_amplitude or not low <= f <= high:
+    if axes[0] < significant * s_amplitude or not low <= f <= high:
         return None
     total = float((axes**2).sum())
     s_f = float(np.sqrt(3 * density / (np.pi**2 * total * duration**3)))
@@ -114,11 +119,13 @@ def _refined(t: Array, y: Array, f: float, around: float) -> float:
 
 
 def _density(t: Array, left: Array, f: float, duration: float) -> float:
-    """One-sided density at f, per component.
+    """One-sided density at f, per component, as it enters a variance.
 
-    From the periodogram within 5 periods of the record, without the 1.5 about f that the fit has
-    emptied. It is taken to fall with the square of the frequency, as that of a velocity that
-    wanders does: few periods of a slow oscillation look like such noise.
+    From the periodogram within 5 periods of the record, without the one about f that the fit has
+    emptied. It is taken to fall with the power 2.5 of the frequency, as a velocity does between the
+    square under a white force and the fourth power under a force that is correlated in time: few
+    periods of a slow oscillation look like such noise. The density is known from k squares alone:
+    the square of an error over it has the mean k / (k - 2).
     """
     step = float(t[1] - t[0])
     frequency = np.fft.rfftfreq(len(t), step)
@@ -126,4 +133,8 @@ def _density(t: Array, left: Array, f: float, duration: float) -> float:
     away = np.abs(frequency - f) * duration
     near = (away < _NEAR_PERIODS) & (away > _OWN_PERIODS)
     near[0] = False
-    return float((periodogram * frequency**2)[near].mean()) / f**2 if near.any() else 0.0
+    if not near.any():
+        return 0.0
+    squares = 2 * left.shape[1] * np.count_nonzero(near)
+    each = (periodogram * (frequency / f) ** _FALL)[near]
+    return float(each.mean() * squares / max(squares - 2, 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,21 +17,36 @@ from telerig.rig.bubble_physics import Liquid
 _ABOVE_ZIGZAG = 2.6
 """Shape oscillations are sought above the zigzag's second harmonic, with which the aspect ratio
 follows the bubble's speed."""
+_ZIGZAG = 4.5
+"""Least amplitude over its standard deviation, lower than for a line anywhere in a spectrum."""
 
 
-def summary_table(frames: pd.DataFrame, up: Array, liquid: Liquid | None = None) -> pd.DataFrame:
+def summary_table(
+    frames: pd.DataFrame,
+    up: Array,
+    liquid: Liquid | None = None,
+    ways: Mapping[tuple[int, int], Array] | None = None,
+) -> pd.DataFrame:
     """Return the content of bubble_summary.csv, one row per bubble.
 
     frames : what `telerig.bubble_table` returns. up : (3,) unit vector against gravity in the rig
     frame. liquid : properties of the liquid; if it is None, the dimensionless numbers are NaN.
+    ways : by particle and number of its rows, standard deviations (3,) in mm of the displacement
+        from the first row to the last one; other bubbles get an upper bound.
     """
     groups = frames.groupby("particle", sort=True)
-    rows = [_row(mine, up, liquid) for _, mine in groups]
+    known = ways or {}
+    rows = [
+        _row(mine, up, liquid, known.get((int(mine["particle"].iloc[0]), len(mine))))
+        for _, mine in groups
+    ]
     table = pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
     return table.astype({name: np.int64 for name in WHOLE if name in table})
 
 
-def _row(mine: pd.DataFrame, up: Array, liquid: Liquid | None) -> dict[str, Any]:
+def _row(
+    mine: pd.DataFrame, up: Array, liquid: Liquid | None, way_sd_mm: Array | None
+) -> dict[str, Any]:
     t = mine["t_s"].to_numpy(float)
     row: dict[str, Any] = {
         "particle": mine["particle"].iloc[0],
@@ -41,7 +57,7 @@ def _row(mine: pd.DataFrame, up: Array, liquid: Liquid | None) -> dict[str, Any]
     }
     for value, sd in (("d_eq_mm", "sd_eq_mm"), ("aspect", "s_aspect"), ("tilt_deg", "s_tilt_deg")):
         row[value], row[sd] = mean_of_body(mine[value].to_numpy(float), mine[sd].to_numpy(float))
-    row["rise_mm_s"], row["s_rise_mm_s"] = _mean_rise(t, mine, up)
+    row["rise_mm_s"], row["s_rise_mm_s"] = _mean_rise(t, mine, up, way_sd_mm)
     row["slip_mm_s"] = _mean(mine["slip_mm_s"])
     # noise across the motion makes a mean speed too large
     noise = (mine[[f"sv{a}_mm_s" for a in AXES]] ** 2).sum(axis=1) / (2 * mine["slip_mm_s"])
@@ -100,21 +116,26 @@ def _along(mine: pd.DataFrame, pattern: str, direction: Array) -> Array:
     )
 
 
-def _mean_rise(t: Array, mine: pd.DataFrame, up: Array) -> tuple[float, float]:
-    """Height gained over the time, and an upper bound of its standard deviation.
+def _mean_rise(
+    t: Array, mine: pd.DataFrame, up: Array, way_sd_mm: Array | None
+) -> tuple[float, float]:
+    """Height gained over the time, and its standard deviation.
 
-    Errors of both ends have a positive correlation, and so have those of the velocities: the
-    smaller of the two bounds is taken.
+    Where that of the way is not known, an upper bound: errors of both ends have a positive
+    correlation, and so have those of the velocities, so that the smaller of the two is taken.
     """
     if len(t) < 2:
         velocity = _along(mine, "v{}_mm_s", up)[0]
         return float(velocity), float(np.sqrt(_along_variance(mine, "sv{}_mm_s", up)[0]))
     height = _along(mine, "{}_mm", up)
     duration = t[-1] - t[0]
+    rise = float((height[-1] - height[0]) / duration)
+    if way_sd_mm is not None:
+        return rise, float(np.linalg.norm(way_sd_mm * up) / duration)
     ends = _along_variance(mine, "s{}_mm", up)[[0, -1]].sum() / duration**2
     steady = np.sqrt(_along_variance(mine, "sv{}_mm_s", up)).mean() ** 2
     bound = np.fmin(ends, steady)
-    return float((height[-1] - height[0]) / duration), float(np.sqrt(bound))
+    return rise, float(np.sqrt(bound))
 
 
 def _along_variance(mine: pd.DataFrame, pattern: str, direction: Array) -> Array:
@@ -130,7 +151,7 @@ def _zigzag(t: Array, mine: pd.DataFrame, up: Array) -> dict[str, float]:
     """
     across = np.linalg.svd(np.atleast_2d(up))[2][1:]
     velocity = np.stack([_along(mine, "v{}_mm_s", direction) for direction in across], -1)
-    found: Oscillation | None = dominant_oscillation(t, velocity)
+    found: Oscillation | None = dominant_oscillation(t, velocity, significant=_ZIGZAG)
     if found is None:
         return {}
     f, s_f = found.frequency_hz, found.s_frequency_hz

@@ -219,8 +219,13 @@ def bubble_summary(
 
     up, gravity, known = _surroundings(smoothing, fluid)
     frames = bubble_table(smoothing, fluid) if bubbles is None else bubbles
-    liquid = liquid_of(known, gravity)
-    return summary_table(frames, up, None if liquid is None else liquid[0])
+    liquid, inflation = liquid_of(known, gravity), smoothing.verdict.get("inflation", (1.0,) * 3)
+    ways = {
+        (int(particle), int(mean["frames"])): np.multiply(mean["way_sd_mm"], inflation)
+        for particle, mean in smoothing.summary.get("bubble_means", {}).items()
+        if "way_sd_mm" in mean
+    }
+    return summary_table(frames, up, None if liquid is None else liquid[0], ways)
 
 
 def _surroundings(smoothing: Smoothing, fluid: Any) -> tuple[Array, float, Any]:
@@ -287,8 +292,10 @@ def _accelerations(solution: Solution) -> dict[str, Any]:
     band = dict(zip(AXES, found.bandwidth_hz.tolist(), strict=True))
     return {
         "acceleration_bandwidth_hz": band,
-        "inertia_s": found.inertia.time_s,
+        "inertia_s": max(found.inertia.time_s),
+        "inertia_by_axis_s": dict(zip(AXES, found.inertia.time_s, strict=True)),
         "force_intensity": dict(zip(AXES, found.inertia.forces, strict=True)),
+        "white_noise": dict(zip(("along", "across"), found.inertia.noise, strict=True)),
     }
 
 
@@ -371,6 +378,8 @@ def _means(evidence: Evidence) -> dict[str, Any]:
         found = dict(zip(names, mean.velocity_mm_s.tolist()))
         if mean.sigma_mm_s is not None:
             found |= {f"s{n}": s for n, s in zip(names, mean.sigma_mm_s.tolist())}
+        if mean.way_sigma_mm is not None:
+            found |= {"frames": mean.frames, "way_sd_mm": mean.way_sigma_mm.tolist()}
         out[str(particle)] = found
     return out
 
@@ -499,13 +508,12 @@ def trajectories(
         "t_s": problem.t_s[graph.frame_of_row],
     }
     columns |= _named(states @ layout.position.T, "{}_mm")
-    columns |= _named(states @ layout.velocity.T, "v{}_mm_s")
+    columns |= _named(solution.velocities_mm_s, "v{}_mm_s")
     if covariances is not None:
         place, speed = considered_variance(solution)
         sigma = _sigma(layout.position, covariances.bubbles)
         columns |= _named(np.sqrt(sigma**2 + place) * inflation, "s{}_mm")
-        sigma = _sigma(layout.velocity, covariances.bubbles)
-        columns |= _named(np.sqrt(sigma**2 + speed) * inflation, "sv{}_mm_s")
+        columns |= _named(np.sqrt(solution.velocity_variances() + speed) * inflation, "sv{}_mm_s")
     columns["observed"] = _observed(solution)
     if tracks is not None:
         columns |= _baselines(solution, tracks, rts=rts)

@@ -17,7 +17,8 @@ from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
-from telerig.estimator.smoothing.graph.accelerations import LEARNED_ROWS, accelerations_of
+from telerig.estimator.smoothing.graph.accelerations import accelerations_of
+from telerig.estimator.smoothing.graph.low_pass import LEARNED_ROWS
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import carriage, travel_of
 from telerig.estimator.smoothing.learning.cross_validation import learning_record
@@ -71,7 +72,7 @@ if TYPE_CHECKING:
     from telerig.estimator.bubbles.shape.spheroid import Deviations
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.rig_drift import DriftPrior
-    from telerig.factors.bubble_motion import Inertia
+    from telerig.factors.bubble_motion import LowPasses
     from telerig.io.dataset.run import RunData
     from telerig.io.rig_file.description import RigDescription
 
@@ -312,7 +313,7 @@ class _Run:
         from telerig.estimator.smoothing.verdict.judge import judge
 
         problem, model, parts = self.problem, self.model, list[Evidence]()
-        deviations = swarm = inertia = moved = None
+        deviations = swarm = low_passes = moved = None
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
             middle = len(pieces) // 2
             if not self.given:
@@ -325,9 +326,9 @@ class _Run:
                     problem, model, pieces, self.options, step, constants
                 ):
                     widened = with_hyperparameter_uncertainty(solution)
-                    widened = _with_accelerations(widened, inertia)
+                    widened = _with_accelerations(widened, low_passes)
                     if widened.accelerations and widened.graph.rows >= LEARNED_ROWS:
-                        inertia = widened.accelerations.inertia
+                        low_passes = widened.accelerations.low_passes
                     span = Span(piece.own, piece.low, problem.t_s)
                     parts.append(Evidence.of(widened, drawn(widened), span))
                     paths, offsets = self._tables(piece, window, widened, span)
@@ -372,14 +373,14 @@ class _Run:
         return paths, offsets
 
 
-def _with_accelerations(solution: Solution, inertia: Inertia | None = None) -> Solution:
+def _with_accelerations(solution: Solution, low_passes: LowPasses | None = None) -> Solution:
     """The solution with accelerations, where there are bubbles and covariances.
 
-    inertia : of the bubbles' forces; None to learn it.
+    low_passes : of the bubbles' forces; None to learn them.
     """
     if not solution.graph.problem.bubbles or solution.covariances is None:
         return solution
-    return replace(solution, accelerations=accelerations_of(solution, drawn(solution), inertia))
+    return replace(solution, accelerations=accelerations_of(solution, drawn(solution), low_passes))
 
 
 def _beside(paths: pd.DataFrame, bodies: pd.DataFrame | None) -> pd.DataFrame | None:

@@ -229,9 +229,11 @@ class SmoothingFile(Record):
     rig_change : movement of the cameras relative to each other; None where it was not tested.
     acceleration_bandwidth_hz : by axis, the frequency up to which accelerations are followed by at
         least half; {} without accelerations.
-    inertia_s, force_intensity : time constant of the low-pass filter through which forces move a
-        bubble, and the intensity of the forces by axis, divided by that in the model; None and {}
-        without accelerations.
+    inertia_s, inertia_by_axis_s, force_intensity : time constant of the low-pass filter through
+        which forces move a bubble, the longest and by axis, and the intensity of the forces by
+        axis, divided by that in the model; None and {} without accelerations.
+    white_noise : standard deviation of the pixels' white noise "along" the rise and "across" it,
+        divided by the stated one.
     """
 
     MISSING: ClassVar[str] = "this run is not smoothed"
@@ -280,7 +282,9 @@ class SmoothingFile(Record):
     bubble_means: dict[str, Any] = Field(default_factory=dict)
     acceleration_bandwidth_hz: dict[str, float] = Field(default_factory=dict)
     inertia_s: float | None = None
+    inertia_by_axis_s: dict[str, float] = Field(default_factory=dict)
     force_intensity: dict[str, float] = Field(default_factory=dict)
+    white_noise: dict[str, float] = Field(default_factory=dict)
     rig_change: RigChange | None = None
     learning: dict[str, Any] = Field(default_factory=dict)
     seconds: dict[str, float] = Field(default_factory=dict)

@@ -1,18 +1,23 @@
-"""The bubbles' acceleration, after a run is solved: each bubble by itself, under a smoother prior.
+"""The bubbles' velocity and acceleration, after a run is solved: each bubble by itself, under a
+smoother prior.
 
 White noise drives the bubbles of the smoothing graph, so that their acceleration has no finite
 variance. Here their forces pass a low-pass (`factors.bubble_motion.inertial_bubble_path`), and the
-acceleration is a state. Positions and velocities of the run stay those of the graph.
+acceleration is a state. Positions stay those of the graph.
 
 Given the rig the bubbles are independent chains (`bubble_chains`). The rig's posterior under the
 graph's prior takes the place of that under the smoother one: the chains are solved for the rig's
-mean, which gives the acceleration, and for draws of its errors, whose covariance is added to that
-of the chains. The time of the low-pass maximises the expectation of the chains' log-likelihood over
-these draws, as a step of expectation maximisation does.
+mean, which gives the motion, and for draws of its errors, whose covariance is added to that of the
+chains.
+
+The stated covariance of a pixel contains what the bubble's unknown shape adds. That part changes
+slowly: it belongs to a position, not to a velocity. So the white noise is learned together with
+the low-pass (`low_pass`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
@@ -22,26 +27,21 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.bubble_chains import bubble_chains
 from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.layout import (
+    GraphLayout,
     bubble_layout,
     with_bubbles,
 )
 from telerig.estimator.smoothing.graph.linear import bubble_priors, images
+from telerig.estimator.smoothing.graph.low_pass import RigErrors, learned_low_passes
 from telerig.estimator.smoothing.graph.solve import Accelerations, Solution
-from telerig.estimator.smoothing.problem.problem import Bubble
-from telerig.factors.bubble_motion import (
-    FORCES,
-    INERTIA_S,
-    Inertia,
-    inertial_bubble_path,
-)
-from telerig.factors.linear_factors import LinearFactors, product, transposed_product
+from telerig.estimator.smoothing.problem.problem import Bubble, Observations
+from telerig.factors.bubble_motion import Inertia, LowPasses, inertial_bubble_path
+from telerig.factors.linear_factors import LinearFactors, transposed_product
 from telerig.factors.state_space import Component
+from telerig.rig.triangulation import stacked_jacobian
 
 _ROWS_AT_ONCE = 20_000
-_PIECE_FRAMES, LEARNED_ROWS, _LEARNED_DRAWS = 150, 2400, 2
-"""The low-pass is learned from pieces of tracks of at most so many frames, so many together, and
-with so many draws of the rig."""
-_MOST_TRIALS = 40
+_LEAST_RISE = 1e-6
 _POOLED_S = 0.1
 """Over so much time on either side the few draws are averaged; the errors' statistics change more
 slowly."""
@@ -50,41 +50,58 @@ _LOWEST_HZ, _FREQUENCIES, _ABOVE = 1e-2, 6000, 1e3
 
 
 def accelerations_of(
-    solution: Solution, draws: Draws, inertia: Inertia | None = None
+    solution: Solution, draws: Draws, low_passes: LowPasses | None = None
 ) -> Accelerations | None:
-    """Return the bubbles' accelerations at a solution.
+    """Return the bubbles' velocities and accelerations at a solution.
 
     They are None if there are no bubbles, or if the covariances were not computed.
 
-    draws : at the solution.  inertia : the low-pass; None to learn it.
+    draws : at the solution.  low_passes : None to learn them.
     """
     graph, found = solution.graph, solution.covariances
     if found is None or not graph.rows:
         return None
     rig = _rig_errors(solution, draws)
-    inertia = inertia or _learned(solution, rig)
-    value, covariance = np.empty((graph.rows, 3)), np.empty((graph.rows, 3, 3))
+    low_passes = low_passes or learned_low_passes(solution, rig)
+    probable, shortest = low_passes
+    velocity, value = np.empty((2, graph.rows, 3))
+    velocity_covariance, covariance = np.empty((2, graph.rows, 3, 3))
+    displacement = list[Array]()
+    for rows, chains in _chains(solution, rig, shortest):
+        velocity[rows], velocity_covariance[rows] = chains.moments(chains.graph.bubble.velocity)
+        displacement.append(chains.displacement_variances())
+    for rows, chains in _chains(solution, rig, probable):
+        value[rows], covariance[rows] = chains.moments(chains.graph.bubble.acceleration)
+    variance = np.diagonal(covariance, axis1=1, axis2=2).mean(0)
+    band = [
+        _bandwidth_hz(
+            inertial_bubble_path(graph.model.bubble, axis, probable),
+            float(one), _ABOVE / (2 * np.pi * time_s),
+        )
+        for axis, one, time_s in zip(np.eye(3), variance, probable.time_s, strict=True)
+    ]  # fmt: skip
+    return Accelerations(
+        velocity, velocity_covariance, np.concatenate(displacement), value, covariance,
+        np.array(band), low_passes,
+    )  # fmt: skip
+
+
+def _chains(
+    solution: Solution, rig: RigErrors, inertia: Inertia
+) -> Iterator[tuple[slice, _Chains]]:
+    """Yield some bubbles after the other, with their rows in the solution's graph."""
+    graph = solution.graph
     ends = graph.first_row[1:]
     portions = np.split(
         np.arange(len(ends)), np.flatnonzero(np.diff((ends - 1) // _ROWS_AT_ONCE)) + 1
     )
     for some in portions:
-        pieces = [np.arange(graph.first_row[i], ends[i]) for i in some]
-        rows = slice(int(pieces[0][0]), int(pieces[-1][-1]) + 1)
-        chains = _Chains(solution, rig, pieces, inertia)
-        value[rows], covariance[rows] = chains.accelerations()
-    processes = [inertial_bubble_path(graph.model.bubble, axis, inertia) for axis in np.eye(3)]
-    variance = np.diagonal(covariance, axis1=1, axis2=2).mean(0)
-    highest = _ABOVE / (2 * np.pi * inertia.time_s)
-    band = [_bandwidth_hz(p, v, highest) for p, v in zip(processes, variance.tolist(), strict=True)]
-    return Accelerations(value, covariance, np.array(band), inertia)
+        bubbles = [np.arange(graph.first_row[i], ends[i]) for i in some]
+        rows = slice(int(bubbles[0][0]), int(bubbles[-1][-1]) + 1)
+        yield rows, _Chains(solution, rig, bubbles, inertia)
 
 
-_RigErrors = tuple[Array, Array]
-"""Draws of the errors of shake (N, D, K) and constants (n, K)."""
-
-
-def _rig_errors(solution: Solution, draws: Draws) -> _RigErrors:
+def _rig_errors(solution: Solution, draws: Draws) -> RigErrors:
     """Widened by what was learned, which the draws do not know."""
     graph, found = solution.graph, solution.covariances
     shake, constants = draws.of_family(graph, 0), draws.of_family(graph, 4)[0]
@@ -101,7 +118,7 @@ class _Chains:
     """Pieces of tracks under the smoother prior, solved for the rig's mean and for its draws."""
 
     def __init__(
-        self, solution: Solution, rig: _RigErrors, pieces: list[Ints], inertia: Inertia
+        self, solution: Solution, rig: RigErrors, pieces: list[Ints], inertia: Inertia
     ) -> None:
         """pieces : of each the rows in the solution's graph."""
         whole, every = solution.graph, np.concatenate(pieces)
@@ -116,6 +133,7 @@ class _Chains:
             for i, (p, end) in enumerate(zip(pieces, ends, strict=True))
         ]
         seen = replace(problem.observations.of(piece >= 0), item=piece[piece >= 0])
+        seen = _of_white_noise(seen, whole, inertia)
         layout = bubble_layout(whole.model.bubble, len(problem.cameras), inertia)
         self.graph = graph = with_bubbles(whole, bubbles, seen, layout)
         states = np.zeros((graph.rows, layout.size))
@@ -125,11 +143,12 @@ class _Chains:
         prior = bubble_priors(graph, state)
         pixels = images(graph, state, solution.weights[0][piece >= 0]).linear
         self.chains = bubble_chains(graph, [*prior, *pixels])
-        self.factors = [*prior, *pixels]
-        self._solve(len(prior), rig)
+        self._solve(prior, pixels, rig)
 
-    def _solve(self, priors: int, rig: _RigErrors) -> None:
-        """found : (D, 1 + K) increments.  own : the chains' factors.  sides : their right sides."""
+    def _solve(
+        self, priors: list[LinearFactors], pixels: list[LinearFactors], rig: RigErrors
+    ) -> None:
+        """found : (D, 1 + K) increments."""
         graph, (shake, constants) = self.graph, rig
         first, size, draws = graph.base().bubbles, graph.bubble.size, shake.shape[-1]
         starts = np.r_[
@@ -137,17 +156,16 @@ class _Chains:
             size * graph.rows + 3 * np.arange(len(graph.problem.bubbles) + 1),
         ]
         own, sides = list[LinearFactors](), list[Array]()
-        for number, linear in enumerate(self.factors):
+        for number, linear in enumerate([*priors, *pixels]):
             pushed = np.zeros((*linear.rhs.shape, draws))
-            chain = [i for i in range(len(linear.keys)) if number < priors or i == 0]
-            if number >= priors:
+            chain = [i for i in range(len(linear.keys)) if number < len(priors) or i == 0]
+            if number >= len(priors):
                 pushed -= linear.blocks[1] @ shake[np.asarray(linear.keys[1])]
                 pushed -= linear.blocks[2] @ constants
             keys = tuple(np.asarray(linear.keys[i]) - first for i in chain)
             own.append(replace(linear, keys=keys, blocks=tuple(linear.blocks[i] for i in chain)))
             sides.append(np.concatenate([linear.rhs[..., None], pushed], -1))
         self.found = self._solved(transposed_product(own, starts, sides))
-        self.own, self.starts, self.sides = own, starts, sides
 
     def _solved(self, side: Array) -> Array:
         graph, places = self.graph, self.chains.places
@@ -161,19 +179,37 @@ class _Chains:
             [rows[places.place_of_row].reshape(cut, count), back.reshape(-1, count)]
         )
 
-    def accelerations(self) -> tuple[Array, Array]:
-        """Return the accelerations (rows, 3) and their covariances (rows, 3, 3)."""
+    def moments(self, wanted: Array) -> tuple[Array, Array]:
+        """Return linear combinations (rows, 3) of the states, and covariances (rows, 3, 3)."""
         graph = self.graph
         every = np.arange(graph.rows)
-        rows = graph.in_bubble_basis(graph.bubble.acceleration[None], every)
+        rows = graph.in_bubble_basis(wanted[None], every)
         found = self.found[: graph.rows * graph.bubble.size]
         moved = rows @ found.reshape(graph.rows, graph.bubble.size, -1)
-        value = self.state.bubbles @ graph.bubble.acceleration.T + moved[..., 0]
+        value = self.state.bubbles @ wanted.T + moved[..., 0]
         own = self.chains.covariances(self.chains.places.place_of_row)
         covariance = rows @ own @ np.swapaxes(rows, -1, -2)
         errors = moved[..., 1:]
         by_rig = errors @ np.swapaxes(errors, -1, -2) / max(errors.shape[-1], 1)
         return value, covariance + self._pooled(by_rig)
+
+    def displacement_variances(self) -> Array:
+        """Return variances (bubbles, 3) of the way from the first frame to the last one.
+
+        The chains' own errors at the two ends count as independent; those of the rig are not.
+        """
+        graph = self.graph
+        ends = np.stack([graph.first_row[:-1], graph.first_row[1:] - 1])
+        own, errors = np.zeros((ends.shape[1], 3)), list[Array]()
+        found = self.found[: graph.rows * graph.bubble.size]
+        for at in ends:
+            rows = graph.in_bubble_basis(graph.bubble.position[None], at)
+            errors.append(rows @ found.reshape(graph.rows, graph.bubble.size, -1)[at, :, 1:])
+            covariance = self.chains.covariances(self.chains.places.place_of_row[at])
+            own += ((rows @ covariance) * rows).sum(-1)
+        first, last = errors
+        draws = max(first.shape[-1], 1)
+        return np.asarray(own + ((last - first) ** 2).sum(-1) / draws)
 
     def _pooled(self, values: Array) -> Array:
         """Means of values (rows, 3, 3) over neighbours in time, each bubble by itself."""
@@ -185,57 +221,18 @@ class _Chains:
         parts = [values[a:b] for a, b in pairwise(first)]
         return np.concatenate([uniform_filter1d(p, width, axis=0, mode="reflect") for p in parts])
 
-    def log_likelihood(self) -> float:
-        """Return its expectation over the draws of the rig, up to a constant."""
-        basis = np.linalg.slogdet(self.graph.bubble_motion.basis)[1]
-        norm = float(basis[self.graph.row_basis].sum()) + sum(f.log_norm() for f in self.factors)
-        fitted = product(self.own, self.starts, self.found)
-        left = [np.subtract(a, b, out=b) for a, b in zip(self.sides, fitted, strict=True)]
-        total = np.sum([(one**2).reshape(-1, one.shape[-1]).sum(0) for one in left], axis=0)
-        spread = float(total[1:].mean()) if len(total) > 1 else 0.0
-        return norm - self.chains.log_det - (float(total[0]) + spread) / 2
 
-
-def _learned(solution: Solution, rig: _RigErrors) -> Inertia:
-    """Return the most probable low-pass, with forces along the rise and across it.
-
-    It decides how much acceleration a bubble has that the images do not show.
-    """
-    from scipy.optimize import minimize
-
-    graph = solution.graph
-    given, rise = graph.model.bubble.inertia_s, np.square(graph.problem.up)
-    cuts = [
-        np.array_split(np.arange(a, b), -(-(b - a) // _PIECE_FRAMES))
-        for a, b in pairwise(graph.first_row.tolist())
-    ]
-    pieces = [piece for cut in cuts for piece in cut]
-    count = min(len(pieces), -(-LEARNED_ROWS * len(pieces) // graph.rows))
-    chosen = np.unique(np.linspace(0, len(pieces) - 1, count).astype(int))
-    some = [pieces[i] for i in chosen]
-    few = (rig[0][..., :_LEARNED_DRAWS], rig[1][..., :_LEARNED_DRAWS])
-    priors = [FORCES, FORCES, INERTIA_S][: 3 if given is None else 2]
-
-    def values_at(place: Array) -> Array:
-        """Intensities along and across the rise, and time, from logarithms over steps."""
-        return np.array([p.median * np.exp(p.step * x) for p, x in zip(priors, place, strict=True)])
-
-    def inertia_at(values: Array) -> Inertia:
-        along, across = values[:2]
-        x, y, z = (across + (along - across) * rise).tolist()
-        return Inertia(float(values[2]) if given is None else given, (x, y, z))
-
-    def score(place: Array) -> float:
-        values = values_at(place)
-        chains = _Chains(solution, few, some, inertia_at(values))
-        return -chains.log_likelihood() - sum(p.log_density(v) for p, v in zip(priors, values))
-
-    bounds = [np.log([p.low / p.median, p.high / p.median]) / p.step for p in priors]
-    start = np.zeros(len(priors))
-    simplex = np.vstack([start, np.eye(len(priors))])
-    options = {"initial_simplex": simplex, "xatol": 0.3, "fatol": 1.0, "maxfev": _MOST_TRIALS}
-    best = minimize(score, start, method="Nelder-Mead", bounds=bounds, options=options)
-    return inertia_at(values_at(best.x))
+def _of_white_noise(seen: Observations, graph: GraphLayout, inertia: Inertia) -> Observations:
+    """Pixels with the covariance of their white noise alone."""
+    along, across = inertia.noise
+    scale = []
+    for camera in graph.problem.cameras:
+        rise = stacked_jacobian((camera,), np.zeros((1, 3)))[1][0] @ graph.problem.up
+        length = np.linalg.norm(rise)
+        rise = rise / length if length > _LEAST_RISE else np.zeros(2)
+        scale.append(across * np.eye(2) + (along - across) * np.outer(rise, rise))
+    each = np.array(scale)[seen.camera]
+    return replace(seen, covariance_px2=each @ seen.covariance_px2 @ each)
 
 
 def _bandwidth_hz(process: Component, variance: float, highest_hz: float) -> float:

@@ -35,7 +35,7 @@ from telerig.estimator.smoothing.graph.linear import (
     sample_weights,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
-from telerig.factors.bubble_motion import Inertia
+from telerig.factors.bubble_motion import Inertia, LowPasses
 from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.robust_loss import truncation_weights
 from telerig.io.machine.parallel import give_back_freed_memory
@@ -45,7 +45,7 @@ from telerig.statistics import robust_sd
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
 
-_CLOCK_PASSES = 6
+_CLOCK_PASSES, _LAST_PASSES = 6, 4
 _OUTLIER_SIGMAS, _SUSPICIOUS_SIGMAS, _FALSE_ALARMS = 4.0, 5.0, 0.05
 _LEAST_KEPT = 0.7
 _SAMPLE_OUTLIER, _SAMPLE_SUSPICIOUS, _BACK = 12.0, 20.0, 0.9
@@ -110,18 +110,28 @@ class Covariances:
 
 @dataclass(frozen=True)
 class Accelerations:
-    """Hold the bubbles' accelerations in the laboratory frame (rig axes).
+    """Hold the bubbles' velocities and accelerations in the laboratory frame (rig axes).
 
-    value_mm_s2 : (rows, 3).  covariance : (rows, 3, 3) in mm^2/s^4, rows as in the graph.
+    velocity_mm_s : (rows, 3).  velocity_covariance : (rows, 3, 3), rows as in the graph.
+    displacement_variance_mm2 : (bubbles, 3) of the way from the first frame to the last one.
+    value_mm_s2 : (rows, 3).  covariance : (rows, 3, 3) in mm^2/s^4.
     bandwidth_hz : (3,) along each axis the frequency up to which accelerations are followed by at
         least half; 0 where the images say no more than the prior.
-    inertia : the low-pass that was used.
+    low_passes : the filters that were used, for the accelerations and for the velocities.
     """
 
+    velocity_mm_s: Array
+    velocity_covariance: Array
+    displacement_variance_mm2: Array
     value_mm_s2: Array
     covariance: Array
     bandwidth_hz: Array
-    inertia: Inertia
+    low_passes: LowPasses
+
+    @property
+    def inertia(self) -> Inertia:
+        """The low-pass filter of the accelerations."""
+        return self.low_passes.probable
 
     @property
     def sd_mm_s2(self) -> Array:
@@ -143,7 +153,8 @@ class Solution:
     sample_weights, sample_residuals : weights (N,) of each accelerometer's samples, None where all
         are 1, and their whitened residuals (N, k) along the k directions of modelled motion.
     draws : None if they were not asked for.
-    accelerations : None where they were not asked for (`accelerations.accelerations_of`).
+    accelerations : with the velocities; None where they were not asked for
+        (`accelerations.accelerations_of`).
     constants : joint covariance of the constants in the order of their keys (sensors, encoder and
         calibration, marks, clocks); None if it was not asked for.
     """
@@ -168,6 +179,23 @@ class Solution:
         if self.graph.sensor_flags[1] and len(delays):
             return np.asarray(delays + self.state.clocks[self.graph.clock_of, 0])
         return delays
+
+    @property
+    def velocities_mm_s(self) -> Array:
+        """Velocities (rows, 3) of the bubbles in the laboratory frame."""
+        if self.accelerations is not None:
+            return self.accelerations.velocity_mm_s
+        return np.asarray(self.state.bubbles @ self.graph.bubble.velocity.T)
+
+    def velocity_variances(self) -> Array:
+        """Return their variances (rows, 3); NaN without covariances."""
+        rows, found = self.graph.bubble.velocity, self.covariances
+        if self.accelerations is not None:
+            covariance = self.accelerations.velocity_covariance
+            return np.diagonal(covariance, axis1=1, axis2=2)
+        if found is None:
+            return np.full((self.graph.rows, 3), np.nan)
+        return np.asarray(((rows @ found.bubbles) * rows).sum(-1).clip(0))
 
 
 def solve(
@@ -233,10 +261,14 @@ def _solve(
         graph, state, again = with_moved_nodes(graph, state)
         last = None if again or changed else last
     if last is None:
-        weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
-        last = _linear_solve(graph, state, weights, samples)
-        state = moved(graph, state, last.done.vector)
-        residuals = pixel_residuals(graph, state)
+        for _ in range(_LAST_PASSES):
+            weights = robust.decided(weights, residuals)
+            last = _linear_solve(graph, state, weights, samples)
+            state = moved(graph, state, last.done.vector)
+            residuals = pixel_residuals(graph, state)
+            if last.largest_px < options.tolerance_px:
+                break
+    assert last is not None
     _check_converged(graph, state, 0.0 if exact else last.largest_px)
     found = _finish(graph, state, (weights, residuals), last, options, done, progress)
     _check_variances(found.covariances)
@@ -490,6 +522,15 @@ class Truncation:
             fresh = tuple(np.ones_like(w) for w in weights)
         change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fresh, weights))
         return (fresh[0], fresh[1]), change > 1e-3
+
+    def decided(
+        self, weights: tuple[Array, Array], residuals: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
+        """Return weights of 0 and 1 where the passes have ended before those of `update` are."""
+        if not self.wanted or self.control == 0:
+            return weights
+        bubbles, marks = ((r**2).sum(-1) < _OUTLIER_SIGMAS**2 for r in residuals)
+        return bubbles.astype(float), marks.astype(float)
 
 
 class SampleRejection:

@@ -17,6 +17,7 @@ from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.linear import encoder
 from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 
 AXES = ("x", "y", "z")
 BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
@@ -157,11 +158,15 @@ class Lost:
 
 @dataclass(frozen=True)
 class Mean:
-    """Hold the mean velocity of a bubble (3,) mm/s, its sd, and in how many frames it was seen."""
+    """Hold the mean velocity of a bubble (3,) mm/s, its sd, and in how many frames it was seen.
+
+    way_sigma_mm : (3,) standard deviation of the way from its first frame to its last one.
+    """
 
     frames: int
     velocity_mm_s: Array
     sigma_mm_s: Array | None
+    way_sigma_mm: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -290,12 +295,19 @@ def _lost(solution: Solution, span: Span) -> dict[str, Lost]:
 
 def _means(solution: Solution, span: Span) -> dict[int, Mean]:
     """Of each bubble that has own frames."""
-    found, out = solution.covariances, {}
-    for i, bubble in enumerate(solution.graph.problem.bubbles):
+    found, moved, out = solution.covariances, solution.accelerations, {}
+    graph = solution.graph
+    speed = considered_variance(solution)[1] if moved is not None else np.zeros((graph.rows, 3))
+    for i, bubble in enumerate(graph.problem.bubbles):
         if bubble.last < span.own.start or bubble.first >= span.own.stop:
             continue
         sigma = None if found is None else np.sqrt(np.diagonal(found.means[i]))
-        out[bubble.particle] = Mean(len(bubble), solution.state.means[i], sigma)
+        way = None
+        if moved is not None:
+            begin, end = graph.problem.t_s[[bubble.first, bubble.last]]
+            stage = speed[graph.first_row[i] : graph.first_row[i + 1]].mean(0)
+            way = np.sqrt(moved.displacement_variance_mm2[i] + stage * (end - begin) ** 2)
+        out[bubble.particle] = Mean(len(bubble), solution.state.means[i], sigma, way)
     return out
 
 

@@ -67,20 +67,15 @@ class _Path:
         states = solution.state.bubbles[rows]
         self.rows, self.widen = rows, widen
         self.t_s = graph.problem.t_s[graph.frame_of_row[rows]]
-        drawn = graph.bubble_basis(rows) @ errors[rows]
-        both = []
-        self.values, self.sd = [], []
-        for row, more in zip(
-            (graph.bubble.position, graph.bubble.velocity), considered_variance(solution)
-        ):
-            error = np.einsum("id,ndk->nik", row, drawn)
-            variance = np.einsum("id,nde,ie->ni", row, found.bubbles[rows], row, optimize=True)
-            scale = np.sqrt(variance.mean(0) / (error**2).mean((0, 2)).clip(1e-300))
-            both.append(error * (scale * widen)[None, :, None])
-            self.values.append(states @ row.T)
-            self.sd.append(np.sqrt(variance + more[rows]) * widen)
-        self.errors = both
         speed = considered_variance(solution)[1][rows]
+        row = graph.bubble.position
+        error = np.einsum("id,ndk->nik", row, graph.bubble_basis(rows) @ errors[rows])
+        variance = np.einsum("id,nde,ie->ni", row, found.bubbles[rows], row, optimize=True)
+        scale = np.sqrt(variance.mean(0) / (error**2).mean((0, 2)).clip(1e-300))
+        self.errors = error * (scale * widen)[None, :, None]
+        self.place = states @ row.T
+        self.speed = solution.velocities_mm_s[rows]
+        self.speed_sd = np.sqrt(solution.velocity_variances()[rows] + speed) * widen
         self.mean_speed_variance = speed.mean(0) * widen**2
 
     @property
@@ -114,7 +109,7 @@ def _of_axis(solution: Solution, paths: Sequence[_Path], axis: int) -> Iterator[
     yield use(Quantity.MEAN_VELOCITY, [_mean_velocity(p, axis) for p in paths], "mm/s")
     yield use(
         Quantity.VELOCITY,
-        [(_rms(p.values[1][:, axis]), _rms(p.sd[1][:, axis])) for p in paths], "mm/s",
+        [(_rms(p.speed[:, axis]), _rms(p.speed_sd[:, axis])) for p in paths], "mm/s",
     )  # fmt: skip
     below = float(np.median([_clear_hz(p, axis) for p in paths]))
     moved = solution.accelerations
@@ -150,7 +145,7 @@ def _rms(values: Array) -> float:
 
 def _mean_velocity(path: _Path, axis: int) -> tuple[float, float]:
     """Return the displacement from the first to the last frame over the time, mm/s."""
-    place, error = path.values[0][:, axis], path.errors[0][:, axis]
+    place, error = path.place[:, axis], path.errors[:, axis]
     variance = np.mean(((error[-1] - error[0]) / path.span_s) ** 2)
     sd = np.sqrt(variance + path.mean_speed_variance[axis])
     return float((place[-1] - place[0]) / path.span_s), float(sd)
@@ -158,8 +153,8 @@ def _mean_velocity(path: _Path, axis: int) -> tuple[float, float]:
 
 def _clear_hz(path: _Path, axis: int) -> float:
     """Return frequency up to which the path's power is above that of its errors; 0 if nowhere."""
-    frequency, power = path.spectrum(path.values[0][:, axis])
-    noise = path.spectrum(path.errors[0][:, axis])[1].mean(-1)
+    frequency, power = path.spectrum(path.place[:, axis])
+    noise = path.spectrum(path.errors[:, axis])[1].mean(-1)
     three = np.ones(3) / 3
     clear = np.convolve(power, three, "same") > _CLEAR_POWER * np.convolve(noise, three, "same")
     first = np.flatnonzero(~clear[1:])
@@ -169,8 +164,8 @@ def _clear_hz(path: _Path, axis: int) -> float:
 
 def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
     """Return the RMS of the path about its line and of its errors up to a frequency, mm."""
-    frequency, power = path.spectrum(path.values[0][:, axis])
-    noise = path.spectrum(path.errors[0][:, axis])[1].mean(-1)
+    frequency, power = path.spectrum(path.place[:, axis])
+    noise = path.spectrum(path.errors[:, axis])[1].mean(-1)
     band = frequency <= (below_hz or np.inf)
     return float(np.sqrt(power[band].sum())), float(np.sqrt(noise[band].sum()))
 
@@ -179,7 +174,7 @@ def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, f
     """Return frequency (Hz) and amplitude (mm) of the swing, each with its sd; None without one."""
     if path.span_s * _ZIGZAG_HZ[0] < _LEAST_PERIODS:
         return None
-    place, error = path.values[0][:, axis], path.errors[0][:, axis]
+    place, error = path.place[:, axis], path.errors[:, axis]
     frequency, power = path.spectrum(place)
     band = (frequency >= _ZIGZAG_HZ[0]) & (frequency <= _ZIGZAG_HZ[1])
     if not band.any() or power[band].sum() < _LEAST_SHARE * power.sum():

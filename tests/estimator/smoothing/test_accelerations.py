@@ -12,7 +12,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from shake_learning_data import CAMERAS, UP, run, true_model
 
 from telerig.estimator.smoothing.graph import accelerations as module
-from telerig.estimator.smoothing.graph import layout
+from telerig.estimator.smoothing.graph import layout, low_pass
 from telerig.estimator.smoothing.graph.accelerations import accelerations_of
 from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.problem.problem import (
@@ -23,7 +23,14 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.estimator.smoothing.result import trajectories
 from telerig.estimator.smoothing.verdict.purposes import uses
-from telerig.factors.bubble_motion import BubbleModel, Inertia, Zigzag
+from telerig.factors.bubble_motion import (
+    BubbleModel,
+    Inertia,
+    LowPasses,
+    Zigzag,
+    inertial_bubble_path,
+)
+from telerig.factors.state_space import distinct_steps
 from telerig.io.results.smoothing import TRAJECTORIES, Quantity
 
 Array = NDArray[np.float64]
@@ -36,6 +43,11 @@ def model_of(inertia_s: float | None) -> ShakeModel:
     """A rig that stands still, and the bubbles of `axis_process`."""
     zigzag = Zigzag(HZ, DAMPING, (RMS,) * 3)
     return ShakeModel(BubbleModel(SIGMA, TAU, zigzags=(zigzag,), inertia_s=inertia_s), modes=())
+
+
+def both_of(inertia_s: float) -> LowPasses:
+    known = Inertia((inertia_s,) * 3)
+    return LowPasses(known, known)
 
 
 def axis_process(inertia_s: float) -> tuple[Array, Array, Array]:
@@ -63,9 +75,13 @@ def stepped(drift: Array, noise: Array, step_s: float) -> tuple[Array, Array]:
 
 
 def drawn_bubbles(
-    rng: np.random.Generator, inertia_s: float, frames: int, bubbles: int, step_s: float
-) -> tuple[SmoothingProblem, Array]:
-    """A problem of a still rig, and the true accelerations (bubbles, F, 3)."""
+    rng: np.random.Generator, inertia_s: float, frames: int, bubbles: int, step_s: float,
+    stated: float = 1.0,
+) -> tuple[SmoothingProblem, Array]:  # fmt: skip
+    """A problem of a still rig, and the true velocities and accelerations (2, bubbles, F, 3).
+
+    stated : standard deviation of the pixels as stated, over the true one.
+    """
     drift, noise, start = axis_process(inertia_s)
     phi, q = stepped(drift, noise, step_s)
     roots = [np.linalg.cholesky(m + 1e-15 * np.eye(len(m))) for m in (start[1:, 1:], q)]
@@ -80,9 +96,11 @@ def drawn_bubbles(
     )
     uv = np.stack([c.project(lab) for c in CAMERAS], 2).reshape(-1, 2)
     uv += PIXEL * rng.standard_normal(uv.shape)
-    seen = Observations(item, frame, camera, uv, np.tile(PIXEL**2 * np.eye(2), (len(uv), 1, 1)))
+    covariance = np.tile((stated * PIXEL) ** 2 * np.eye(2), (len(uv), 1, 1))
+    seen = Observations(item, frame, camera, uv, covariance)
     tracks = tuple(Bubble(k, 0, frames - 1, lab[k, 0], lab[k]) for k in range(bubbles))
-    return SmoothingProblem(CAMERAS, t, UP, UP, tracks, seen), (x @ drift[1]).transpose(1, 0, 2)
+    truth = np.stack([x[..., 1] + 100 * UP, x @ drift[1]]).swapaxes(1, 2)
+    return SmoothingProblem(CAMERAS, t, UP, UP, tracks, seen), truth
 
 
 def solved(problem: SmoothingProblem, model: ShakeModel) -> Solution:
@@ -93,7 +111,7 @@ def solved(problem: SmoothingProblem, model: ShakeModel) -> Solution:
 @pytest.mark.parametrize("inertia_s", [0.002, 0.02])
 def test_dense_algebra_gives_the_same(inertia_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The posterior from the covariance of all frames' states, without states in time."""
-    monkeypatch.setattr(module, "_learned", lambda *_: Inertia(inertia_s))
+    monkeypatch.setattr(module, "learned_low_passes", lambda *_: both_of(inertia_s))
     frames, step = 40, 0.01
     problem, _ = drawn_bubbles(np.random.default_rng(5), inertia_s, frames, 1, step)
     found = solved(problem, model_of(inertia_s)).accelerations
@@ -135,13 +153,13 @@ def test_the_rigs_posterior_is_nearly_that_of_the_joint_graph(
     marks: int, far: float, wide: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Exact where marks tell the shake; with images alone standard deviations are a little wide."""
-    monkeypatch.setattr(module, "_learned", lambda *_: Inertia(0.005))
+    monkeypatch.setattr(module, "learned_low_passes", lambda *_: both_of(0.005))
     problem, _, _ = run(np.random.default_rng(3), seconds=0.6, marks=marks)
     solution = solve(problem, true_model(), PLAIN)
     found = accelerations_of(solution, drawn(solution, 64))
     assert found is not None
     whole = layout.bubble_layout
-    monkeypatch.setattr(layout, "bubble_layout", lambda m, c: whole(m, c, Inertia(0.005)))
+    monkeypatch.setattr(layout, "bubble_layout", lambda m, c: whole(m, c, Inertia((0.005,) * 3)))
     joint = solve(problem, true_model(), PLAIN)
     assert joint.covariances is not None
     rows = joint.graph.bubble.acceleration
@@ -153,25 +171,85 @@ def test_the_rigs_posterior_is_nearly_that_of_the_joint_graph(
     assert (ratio > 0.99).all() and (ratio < wide).all()
 
 
-def test_standard_deviations_are_true_where_the_low_pass_has_to_be_learned() -> None:
-    squares = []
+@pytest.mark.parametrize("stated", [1.0, 4.0])
+def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learned(
+    stated: float,
+) -> None:
+    """Noise that is stated too large, as by what an unknown shape adds, does not widen them."""
+    squares, ways = [], []
     for seed, inertia_s in enumerate((0.004, 0.01, 0.02)):
         rng = np.random.default_rng(seed)
-        problem, truth = drawn_bubbles(rng, inertia_s, 200, 3, 0.005)
-        found = solved(problem, model_of(None)).accelerations
+        problem, truth = drawn_bubbles(rng, inertia_s, 200, 3, 0.005, stated)
+        solution = solved(problem, model_of(None))
+        found = solution.accelerations
         assert found is not None
-        assert 0.5 * inertia_s < found.inertia.time_s < 2 * inertia_s
+        assert all(0.5 * inertia_s < t < 2 * inertia_s for t in found.inertia.time_s)
         assert 0.4 < min(found.inertia.forces) <= max(found.inertia.forces) < 2.5
+        np.testing.assert_allclose(found.inertia.noise, 1 / stated, rtol=0.15)
         assert ((found.bandwidth_hz > HZ) & (found.bandwidth_hz < 100)).all()
-        squares.append(((found.value_mm_s2 - truth.reshape(-1, 3)) / found.sd_mm_s2) ** 2)
+        value = np.stack([solution.velocities_mm_s, found.value_mm_s2])
+        variance = [solution.velocity_variances(), found.sd_mm_s2**2]
+        squares.append((value - truth.reshape(2, -1, 3)) ** 2 / np.array(variance))
+        place = (solution.state.bubbles @ solution.graph.bubble.position.T).reshape(3, -1, 3)
+        known = np.array([b.guess_mm[-1] - b.guess_mm[0] for b in problem.bubbles])
+        ways.append((place[:, -1] - place[:, 0] - known) ** 2 / found.displacement_variance_mm2)
+    mean = np.mean(squares, axis=(0, 2, 3))
+    assert ((mean > 0.8) & (mean < 1.25)).all()
+    assert 0.4 < np.mean(ways) < 1.8  # 27 of them
+
+
+@pytest.mark.parametrize("stated", [1.0, 4.0])
+def test_no_velocity_is_stated_too_well_where_no_low_pass_can_be_seen(stated: float) -> None:
+    """Bubbles that white noise drives, of which the images show no more than the zigzag."""
+    squares = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        problem, truth = drawn_bubbles(rng, 1e-5, 150, 4, 0.01, stated)
+        solution = solved(problem, model_of(None))
+        error = solution.velocities_mm_s - truth[0].reshape(-1, 3)
+        squares.append(error**2 / solution.velocity_variances())
     assert 0.8 < np.mean(squares) < 1.25
+
+
+def test_the_filters_likelihood_is_that_of_dense_algebra() -> None:
+    """Of a series with unequal steps and a gap."""
+    rng, sigma = np.random.default_rng(3), 0.02
+    process = inertial_bubble_path(model_of(None).bubble, UP, Inertia((0.01,) * 3))
+    t = np.cumsum(rng.choice([0.004, 0.01], 12))
+    values, variance = rng.normal(size=(12, 2)), np.full(12, sigma**2)
+    variance[4] = np.inf
+    dt_s, index = distinct_steps(np.diff(t))
+    found = low_pass.log_likelihood(
+        process, 300.0, dt_s, [low_pass.Series(index, values, variance / 4)], 2.0
+    )
+    size = process.size + 1
+    drift, gain = np.zeros((size, size)), np.zeros((size, process.noise.shape[1]))
+    drift[:-1, :-1], drift[:-1, -1:], gain[:-1] = process.drift, process.input, process.noise
+    begin = np.zeros((size, size))
+    begin[:-1, :-1] = process.start_covariance
+    both = np.append(process.start_from_input, 1.0)
+    begin += 300.0**2 * np.outer(both, both)
+    whole, now = np.zeros((12, 12)), begin
+    for i in range(12):
+        ahead = now
+        for j in range(i, 12):
+            whole[i, j] = whole[j, i] = ahead[0, 0]
+            if j < 11:
+                ahead = expm(drift * (t[j + 1] - t[j])) @ ahead
+        if i < 11:
+            phi, q = stepped(drift, gain, t[i + 1] - t[i])
+            now = phi @ now @ phi.T + q
+    kept = np.delete(np.arange(12), 4)
+    whole = whole[np.ix_(kept, kept)] + sigma**2 * np.eye(11)
+    squares = (values[kept] * np.linalg.solve(whole, values[kept])).sum(0)
+    assert found == pytest.approx(-np.linalg.slogdet(whole)[1] / 2 - squares.sum() / 2, rel=1e-6)
 
 
 def test_tables_and_uses_name_accelerations() -> None:
     problem, _ = drawn_bubbles(np.random.default_rng(1), 0.01, 60, 2, 0.005)
     solution = solved(problem, model_of(0.01))
     found = solution.accelerations
-    assert found is not None and found.inertia.time_s == 0.01
+    assert found is not None and found.inertia.time_s == pytest.approx((0.01,) * 3)
     names = [f"{kind}a{axis}_mm_s2" for kind in ("", "s") for axis in "xyz"]
     table = trajectories(solution, None, (1.0, 2.0, 1.0))
     assert list(table.columns[-6:]) == names

@@ -124,6 +124,28 @@ def test_normal_noise_of_many_pixels_has_no_outliers() -> None:
     assert changed and fresh[7] < fresh[:7].min()
 
 
+def test_a_bubble_that_is_lost_at_its_end_is_uncertain_there() -> None:
+    """Its last pixels are gross outliers, for whose weights the passes do not suffice."""
+    problem = marked(6)
+    observed = problem.observations
+    last = (observed.item == 0) & (observed.frame >= len(problem.t_s) - 8)
+    wrong = 80.0 * np.random.default_rng(6).choice([-1.0, 1.0], observed.uv_px.shape)
+    uv = observed.uv_px + last[:, None] * wrong
+    spoilt = replace(problem, observations=replace(observed, uv_px=uv))
+    calm, found = (
+        solve(one, replace(true_model(), accelerometer_scale_sigma=0.01))
+        for one in (problem, spoilt)
+    )
+    assert (found.weights[0][last] == 0).all() and found.weights[0][~last].mean() > 0.99
+    assert calm.covariances is not None and found.covariances is not None
+    rows = found.graph.bubble.position
+    off = (found.state.bubbles - calm.state.bubbles) @ rows.T
+    variance = np.diagonal(rows @ found.covariances.bubbles @ rows.T, axis1=1, axis2=2)
+    end = found.graph.first_row[1] - 1
+    assert (variance[end] > 4 * variance[end - 40]).all()
+    assert (np.abs(off[end]) < 4 * np.sqrt(variance[end])).all()
+
+
 @pytest.mark.parametrize(("rise", "word"), [(-50.0, "sink"), (0.0, "hover"), (50.0, "")])
 def test_bubbles_that_do_not_rise_are_a_warning(rise: float, word: str) -> None:
     from telerig.estimator.smoothing.problem.problem import Stage

@@ -809,7 +809,9 @@ def _encoder(
         sd = float(weights.sum() ** -0.5)
         usual = _USUAL_GAIN[0] < gain < _USUAL_GAIN[1]
         finding = _gain_finding(gain, sd, where)
-        clear = _CLEAR_GAIN if finding.code == Code.ENCODER_SCALE else _CLEAR_UNIT
+        scale = finding.code == Code.ENCODER_SCALE
+        usual |= scale and marked is None and len(problem.t_s) < _LEAST_FRAMES  # arms that flex
+        clear = _CLEAR_GAIN if scale else _CLEAR_UNIT
         if min(abs(gain), abs(gain - 1)) > clear * sd and not usual:
             return [finding]
     judged = clock is not None and clock.clear and len(problem.t_s) >= _LEAST_FRAMES

@@ -166,7 +166,5 @@ def test_a_short_sound_run_is_no_fault(scenario: str, seed: int, around_s: float
     """0.24 s. S6: other axes explain the accelerations better, and all measurements together worse.
     Stick-slip: arms that flex accelerate 2.5 ± 0.2 times as much as the carriage.
     """
-    _, said = placed(
-        seed, "five", frames=120, scenario=scenario, around_s=around_s, clock="frames"
-    )
+    _, said = placed(seed, "five", frames=120, scenario=scenario, around_s=around_s, clock="frames")
     assert all(f.code is None for f in said)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from telerig.io.results.smoothing import Contradiction, Use
+from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, share_words
 from telerig.io.results.verdict_words import to_resolve, uses_words, words_of_contradiction
 
 if TYPE_CHECKING:
@@ -47,6 +48,10 @@ def smoothing_words(found: Smoothing) -> str:
             "  standard deviations (median; x, y, z): position {:.3g}, {:.3g}, {:.3g} µm, velocity "
             "{:.2g}, {:.2g}, {:.2g} mm/s".format(*position, *velocity)
         )
+    common = found.tables.typical([*CALIBRATION_SHARE, EXTRAPOLATED]).dropna()
+    if len(common) and EXTRAPOLATED in common:
+        sd_mm = np.sqrt((common[[*CALIBRATION_SHARE]] ** 2).mean()).to_numpy(float)
+        lines += [f"  {words}" for words in share_words(sd_mm, common[EXTRAPOLATED].mean())]
     lines += _encoder_words(found)
     if "rig_change" in summary:
         lines.append(f"  rig: {summary['rig_change']['words']}")

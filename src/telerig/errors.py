@@ -74,13 +74,20 @@ class TelerigWarning(UserWarning):
     """Something is used although it may not be what the user expects."""
 
 
+_FEW_LETTERS = 5
+
+
 def nearest(word: str, known: list[str]) -> str | None:
     """Return the name in ``known`` that is spelled most like ``word``, or None if no name is
     similar.
 
-    Upper and lower case are treated as equal.
+    Upper and lower case are treated as equal. The only name that begins with a long word comes
+    first.
     """
     lowered = {name.lower(): name for name in known}
+    longer = [name for name in lowered if name.startswith(word.lower())]
+    if len(longer) == 1 and len(word) > _FEW_LETTERS:
+        return lowered[longer[0]]
     near = get_close_matches(word.lower(), lowered, n=1, cutoff=0.55)
     return lowered[near[0]] if near else None
 

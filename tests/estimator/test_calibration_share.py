@@ -18,6 +18,7 @@ from telerig.estimator.smoothing.graph import crowd
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.problem.problem import SmoothingProblem
 from telerig.estimator.smoothing.problem.tables import calibration_share
+from telerig.estimator.smoothing.terminal_summary import smoothing_words
 from telerig.estimator.tracking.tracks import Tracks, load_tracks, tracking_words
 from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, tracks_columns
 from telerig.io.simulation.presets import run_preset
@@ -138,7 +139,10 @@ def test_tracks_have_the_share_at_their_end(swarm: Swarm, tmp_path: Path) -> Non
 def test_trajectories_have_the_share_whatever_the_tracks_have(swarm: Swarm) -> None:
     old = swarm.tracks.table.drop(columns=COLUMNS)
     stage = swarm.dataset.runs["swarm"].load()
-    found = telerig.smooth(old, swarm.calibration, stage=stage, model="default").trajectories
+    smoothing = telerig.smooth(old, swarm.calibration, stage=stage, model="default")
+    found = smoothing.trajectories
+    words = smoothing_words(smoothing)
+    assert f"{100 * found[EXTRAPOLATED].mean():.2g} % of the positions lie beyond the dots" in words
     assert list(found.columns[-4:]) == COLUMNS
     both = found.merge(swarm.tracks.table, on=["frame", "particle"], suffixes=("", "_tracked"))
     for name in CALIBRATION_SHARE:

@@ -137,10 +137,12 @@ class Calibration(ShortText):
         if isinstance(camera, (int, np.integer)) and 0 <= camera < len(self.cameras):
             return self.cameras[camera]
         for candidate in self.cameras:
-            if candidate.name == camera:
+            if isinstance(camera, str) and candidate.name == camera:
                 return candidate
         names = ", ".join(repr(c.name) for c in self.cameras)
-        raise CalibrationError(f"no camera {camera!r} in this calibration", todo=f"it has {names}")
+        raise CalibrationError(
+            f"no camera {camera!r:.40} in this calibration", todo=f"it has {names}"
+        )
 
     def in_air(self) -> Calibration:
         """Return the same rig without its refractive windows, for points in air."""

@@ -89,6 +89,8 @@ def test_the_file_says_what_others_rely_on(calibration: Calibration, saved: Path
     sd = data["cameras"]["left"]["standard_deviations"]["k1"]
     assert sd == pytest.approx(calibration.sd("left.k1"))
     assert calibration.sd("left.wall_x_rad") == 0.0, "held fixed"
+    with pytest.raises(InputError, match=r"did you mean left\.scale_px_per_mm"):
+        calibration.sd("left.scale")
     with pytest.raises(InputError, match=r"did you mean left\.k1"):
         calibration.sd("left.K1_")
 

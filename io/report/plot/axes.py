@@ -31,8 +31,8 @@ def columns_of(table: pd.DataFrame, *names: str, made_by: str) -> list[Array]:
     """Columns of a table as numbers. Raises InputError for one that it does not have."""
     out = []
     for name in names:
-        if name not in table:
-            what = f"the table has no column {name}"
+        if name not in getattr(table, "columns", ()):
+            what = f"the {type(table).__name__} has no column {name}"
             raise InputError(what, where="telerig.plot", todo=f"give {made_by}")
         out.append(table[name].to_numpy(float))
     return out

@@ -87,6 +87,8 @@ def test_drag_of_bubbles_and_of_frames() -> None:
     assert len(cloud.get_lines()[0].get_xdata()) == 200
     with pytest.raises(InputError, match="nothing to draw"):
         telerig.plot.drag(summary().assign(drag=np.nan))
+    with pytest.raises(InputError, match=r"the dict has no column reynolds(.|\n)*bubble_summary"):
+        telerig.plot.drag({})
 
 
 def test_sizes_by_number_and_volume() -> None:

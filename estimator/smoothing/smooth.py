@@ -22,7 +22,11 @@ from telerig.estimator.smoothing.graph.low_pass import LEARNED_ROWS
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import carriage, travel_of
 from telerig.estimator.smoothing.learning.cross_validation import learning_record
-from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
+from telerig.estimator.smoothing.learning.default_priors import (
+    adapted,
+    default_model,
+    guessed_modes,
+)
 from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.learning.likelihood import (
     with_hyperparameter_uncertainty,
@@ -84,6 +88,7 @@ _MOST_COMPARED, _BUBBLES_COMPARED = 1500, 3
 _ENCODER_SIGMA_MM = 0.005
 _LEAST_SAMPLES = 2
 _LEAST_LEARNED_S = 0.2
+_SIZED_FRAMES, _SIZING_PASSES = 600, 3
 """Shortest time of a bubble for which shake is learned. In less time a slow shake shows no period,
 and learning would find no shake.
 """
@@ -597,8 +602,18 @@ def _adapted_solution(
     problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress | None
 ) -> Solution:
     """Return the solution whose noise, RMS and delays have been set from a first solution, which
-    uses few samples of the sensors.
+    uses few samples of the sensors. The RMS of guessed modes is set by the frames in the middle.
     """
+    if guessed_modes(model):
+        begin = max(0, (len(problem.t_s) - _SIZED_FRAMES) // 2)
+        middle, found = all_of(problem, begin, begin + _SIZED_FRAMES).problem, None
+        for _ in range(_SIZING_PASSES):
+            found = solve(middle, model, options, progress, start=found)
+            better = adapted(found)
+            if better is None:
+                break
+            model, found = better, replace(found, covariances=None, draws=None)
+        return solve(problem, model, options, progress)
     sensors = problem.accelerometers
     coarse = replace(problem, accelerometers=thinned(sensors, _COARSE_STEP_S))
     first = solve(coarse, model, options, progress)

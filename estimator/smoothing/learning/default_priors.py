@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,7 +29,9 @@ _ZIGZAG_HZ = (3.0, 12.0)
 _ZIGZAG_GUESS_HZ = 6.5
 _ZIGZAG_RMS_MM = 0.5
 _ZIGZAG_DAMPING = 0.04
-_LEAST_PERIODS = 1.5
+_ZIGZAG_LOG_SIGMA = 0.3
+_LEAST_PERIODS, _LEAST_SAMPLES = 1.5, 12
+_SHORT_TRACKS, _SHORT_SAMPLES = 100, 16
 _HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
 _CLEAR = 0.2
@@ -119,32 +122,64 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Return frequency (Hz) and RMS (mm) of the bubbles' zigzag; None if they show none.
+    """Return frequency (Hz) and RMS (mm) of the bubbles' zigzag; None without usable
+    tracks.
 
-    They are those of the peak of a Lomb-Scargle periodogram. Only frequencies of which a track
-    shows `_LEAST_PERIODS` periods count.
+    They come from the spectrum (Lomb-Scargle) of up to 20 tracks that show `_LEAST_PERIODS` of all
+    frequencies. If there are none, they are the most likely ones of short tracks: the spectrum of
+    what a parabola leaves of a track peaks at its own length.
     """
     from scipy.signal import lombscargle
 
-    trials = np.arange(_ZIGZAG_HZ[0], _ZIGZAG_HZ[1], 0.25)
-    power, total, samples = np.zeros(len(trials)), 0.0, 0
-    for bubble in problem.bubbles[:20]:
+    long, short = [], []
+    for bubble in problem.bubbles:
         t = problem.t_s[bubble.first : bubble.last + 1]
-        shown = trials * (t[-1] - t[0]) >= _LEAST_PERIODS
-        if len(bubble) < 12 or not shown.any():
-            continue
-        across = bubble.guess_mm - (bubble.guess_mm @ problem.up)[:, None] * problem.up
+        if len(bubble) >= _LEAST_SAMPLES:
+            across = bubble.guess_mm - (bubble.guess_mm @ problem.up)[:, None] * problem.up
+            shown = _ZIGZAG_HZ[0] * (t[-1] - t[0]) >= _LEAST_PERIODS
+            (long if shown else short).append((t, across))
+    if not long:
+        return _likely_zigzag(short[:: 1 + len(short) // _SHORT_TRACKS]) if short else None
+    trials = np.arange(*_ZIGZAG_HZ, 0.25)
+    power, total, samples = np.zeros(len(trials)), 0.0, 0
+    for t, across in long[:20]:
         x = (t - t.mean()) / (t[-1] - t[0])
         drift = np.stack([np.ones_like(x), x, x**2], -1)
         rest = across - drift @ np.linalg.lstsq(drift, across, rcond=None)[0]
-        power += shown * sum(2 * lombscargle(t, column, 2 * np.pi * trials) for column in rest.T)
+        power += sum(2 * lombscargle(t, column, 2 * np.pi * trials) for column in rest.T)
         total, samples = total + (rest**2).sum(), samples + 2 * len(t)
-    if not samples:
-        return None
     rms = float(np.sqrt(total / samples))
     clear = power.max() > _CLEAR * total and rms > _ZIGZAG_RMS_MM / 2
     frequency = float(trials[power.argmax()]) if clear else _ZIGZAG_GUESS_HZ
     return frequency, max(rms, _ZIGZAG_RMS_MM)
+
+
+def _likely_zigzag(tracks: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """Return frequency and RMS of an oscillator, by the restricted likelihood of times and places.
+
+    Each track has a position and a velocity of its own, and white noise. The frequency has a prior
+    about `_ZIGZAG_GUESS_HZ`.
+    """
+    trials = np.arange(*_ZIGZAG_HZ, 0.25)
+    noise = np.geomspace(1e-8, 1.0, 17)  # variances over the swing's
+    omega = 2 * np.pi * trials[:, None, None]
+    damped = omega * np.sqrt(1 - _ZIGZAG_DAMPING**2)
+    squares, log_det, count = np.zeros((len(trials), len(noise))), 0.0, 0
+    for t, across in tracks:
+        some = np.linspace(0, len(t) - 1, min(len(t), _SHORT_SAMPLES)).astype(int)
+        free = np.linalg.qr(np.stack([np.ones(len(some)), t[some] - t[0]], -1), "complete")[0][:, 2:]
+        lag = np.abs(t[some][:, None] - t[some])
+        wave = np.cos(damped * lag) + _ZIGZAG_DAMPING * omega / damped * np.sin(damped * lag)
+        values, axes = np.linalg.eigh(free.T @ (np.exp(-_ZIGZAG_DAMPING * omega * lag) * wave) @ free)
+        variance = np.maximum(values, 0.0)[:, None] + noise[:, None]
+        seen = (np.swapaxes(axes, 1, 2) @ (free.T @ across[some])) ** 2
+        squares += (seen.sum(-1)[:, None] / variance).sum(-1)
+        log_det = log_det + 2 * np.log(variance).sum(-1)
+        count += 2 * free.shape[1]
+    prior = (np.log(trials / _ZIGZAG_GUESS_HZ) / _ZIGZAG_LOG_SIGMA) ** 2
+    cost = log_det + count * np.log(squares / count) + prior[:, None]
+    at = np.unravel_index(np.argmin(cost), cost.shape)
+    return float(trials[at[0]]), max(float(np.sqrt(squares[at] / count)), _ZIGZAG_RMS_MM)
 
 
 def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> CarriageModel:
@@ -186,6 +221,7 @@ def acceleration_rms(stage: Stage) -> float:
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
+_LEAST_TOLD, _PRIOR_SAMPLES, _SCALED = 0.05, 1.0, (0.1, 10.0)
 _LEAST_SPARE = 0.2
 _LEAST_PIXELS = 60
 _SD_OF_MEDIAN = 1.16
@@ -202,6 +238,8 @@ def adapted(solution: Solution) -> ShakeModel | None:
     """Return the model with noise, RMS and encoder's scale adapted to a first solution.
 
     Returns None if nothing has to change.
+
+    Learned modes keep their RMS.
     """
     model = solution.graph.model
     inflation = _noise_factor(solution)
@@ -220,7 +258,40 @@ def adapted(solution: Solution) -> ShakeModel | None:
         moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
         if max(np.max(np.abs(np.log(ratio))), moved) > _RESCALE_BEYOND:
             better = _with_floor(fresh, floor)
+    elif guessed_modes(model):
+        factor = _size_of_offsets(solution)
+        if np.max(np.abs(np.log(factor))) > _RESCALE_BEYOND:
+            modes = (replace(m, rms_mm=_triple(m.rms_mm * factor)) for m in model.modes)
+            better = replace(better, modes=tuple(modes))
     return None if better is model else better
+
+
+def guessed_modes(model: ShakeModel) -> bool:
+    """Return whether the modes are those of `default_model`, which no measurement has changed."""
+    return model.name == "default" and bool(model.modes)
+
+
+def _size_of_offsets(solution: Solution) -> Array:
+    """Return by axis (3,) the factor on the RMS of the modes with which they explain the offsets.
+
+    The squares of the estimated offsets are expected to be the prior variance less the posterior
+    one (MacKay, Neural Computation 4:415, 1992). The prior RMS counts as `_PRIOR_SAMPLES`
+    independent offsets; an axis about which the data say nothing keeps 1.
+    """
+    graph, found = solution.graph, solution.covariances
+    rows, t = graph.shake.offset[:-1], graph.problem.t_s
+    prior = np.zeros(rows.shape[:2])
+    for mode in graph.model.modes:
+        prior[slice(None) if mode.camera == CARRIAGE else mode.camera] += np.square(mode.rms_mm)
+    if found is None:
+        return np.ones(3)
+    left = np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True).mean(0)
+    told = np.sum(prior - left, axis=0)
+    known = told > _LEAST_TOLD * prior.sum(0)
+    square = (_offsets(solution) ** 2).mean(0).sum(0) / np.where(known, told, 1.0)
+    samples = 2 * (t[-1] - t[0]) * graph.model.modes[0].frequency_hz
+    square = (samples * square + _PRIOR_SAMPLES) / (samples + _PRIOR_SAMPLES)
+    return np.where(known, np.clip(np.sqrt(square), *_SCALED), 1.0)
 
 
 def _with_floor(model: ShakeModel, floor: float | None) -> ShakeModel:

@@ -4,13 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shake_learning_data import SWING_HZ, run, with_comings_and_goings
 
+from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.learning.default_priors import (
     DEFAULT_FLOOR,
+    adapted,
+    default_model,
     fitted_floor,
     rescaled,
+    zigzag,
 )
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    BroadBand,
+    ShakeModel,
+    SmoothingProblem,
+)
 from telerig.factors.state_space import broad_band, broad_band_density, discretise
 
 RATE_HZ, RMS_MM = 500.0, 0.3
@@ -92,3 +102,44 @@ def test_the_floor_of_strong_shake_is_not_taken_from_what_the_prior_has_shrunk()
     strong = tuple(replace(b, tail=3) for b in _bands())
     assert fitted_floor(*_offsets(0.1, 4.0, 0), _bands()) is not None
     assert fitted_floor(*_offsets(0.1, 4.0, 0), strong) is None
+
+
+def _short_tracks(seed: int, frames_each: int) -> tuple[SmoothingProblem, np.ndarray, np.ndarray]:
+    """Bubbles whose tracks last so many frames of 500 Hz in the mean; true places and offsets."""
+    rng = np.random.default_rng(seed)
+    problem, lab, shake = run(rng, bubbles=16, seconds=0.6, rate_hz=RATE_HZ)
+    cut = with_comings_and_goings(problem, rng, frames_each)
+    owner = np.cumsum([b.first == 0 for b in cut.bubbles]) - 1
+    places = (lab[o, b.first : b.last + 1] for o, b in zip(owner, cut.bubbles, strict=True))
+    return cut, np.concatenate(list(places)), shake
+
+
+@pytest.mark.parametrize("seed", [51, 52, 53])
+@pytest.mark.parametrize(("frames_each", "within_hz"), [(25, 2.0), (50, 0.75), (100, 0.75)])
+def test_tracks_shorter_than_a_swing_tell_its_frequency_and_size(seed, frames_each, within_hz):
+    """The true ones are 6 Hz and 2 mm; so short tracks show above all the acceleration."""
+    problem, _, _ = _short_tracks(seed, frames_each)
+    found = zigzag(problem)
+    assert found is not None
+    assert found[0] == pytest.approx(SWING_HZ, abs=within_hz)
+    assert found[1] * found[0] ** 2 == pytest.approx(2.0 * SWING_HZ**2, rel=0.25)
+
+
+@pytest.mark.parametrize("seed", [54, 55])
+def test_short_tracks_set_the_size_of_the_guessed_modes(seed):
+    """The rig shakes along y and not at all along x and z; tracks last 0.1 s."""
+    problem, places, shake = _short_tracks(seed, 50)
+    solution = solve(problem, default_model(problem), Options(robust=False))
+    for _ in range(2):
+        model = adapted(solution)
+        assert model is not None
+        solution = solve(problem, model, Options(robust=False))
+    x, y, z = np.hypot(model.modes[0].rms_mm, model.modes[1].rms_mm)
+    assert max(x, z) < 0.06
+    assert y == pytest.approx(np.sqrt((shake[..., 1] ** 2).mean()), rel=0.3)
+    rows, found = solution.graph.bubble.position, solution.covariances
+    assert found is not None
+    off = solution.state.bubbles @ rows.T - places
+    nees = off**2 / ((rows @ found.bubbles) * rows).sum(-1)
+    assert nees.mean() < 1.25
+    assert np.sqrt((off[:, [0, 2]] ** 2).mean()) < 0.03

@@ -18,8 +18,10 @@ def _rows(information: Array, pull: Array, rows: Array, values: Array) -> None:
     They have the given information (3, 3) and pull (3,), of any rank (Cholesky's decomposition).
     """
     least = _NOTHING * (information[0, 0] + information[1, 1] + information[2, 2])
-    rows[:], values[:] = 0.0, 0.0
     for i in range(3):
+        values[i] = 0.0
+        for j in range(3):
+            rows[i, j] = 0.0
         pivot, value = information[i, i], pull[i]
         for k in range(i):
             pivot -= rows[k, i] * rows[k, i]
@@ -37,8 +39,9 @@ def _rows(information: Array, pull: Array, rows: Array, values: Array) -> None:
 
 @compiled
 def _product(left: Array, right: Array, out: Array) -> None:
-    out[:] = 0.0
     for i in range(left.shape[0]):
+        for j in range(right.shape[1]):
+            out[i, j] = 0.0
         for k in range(left.shape[1]):
             if left[i, k] != 0.0:  # most entries of a motion's matrix are 0
                 for j in range(right.shape[1]):
@@ -93,16 +96,21 @@ def smooth(
     for t in range(tracks):
         for f in range(frames):
             x, p = states[0, f], spreads[0, f]
-            x[:], p[:] = start[t], spread
             if f > 0:
                 _product(matrices[f], spreads[0, f - 1], moved)
-                _product(matrices[f], moved.T, p)
-                for i in range(n):
-                    x[i] = offsets[f, i]
-                    for j in range(n):
+            for i in range(n):
+                x[i] = start[t, i] if f == 0 else offsets[f, i]
+                for j in range(n):
+                    p[i, j] = spread[i, j] if f == 0 else noises[f, i, j]
+                    if f > 0 and matrices[f, i, j] != 0.0:
                         x[i] += matrices[f, i, j] * states[0, f - 1, j]
-                        p[i, j] += noises[f, i, j]
-            states[1, f], spreads[1, f] = x, p
+                for j in range(n):
+                    if f > 0 and matrices[f, i, j] != 0.0:
+                        for k in range(n):
+                            p[i, k] += moved[k, j] * matrices[f, i, j]
+                states[1, f, i] = x[i]
+                for j in range(n):
+                    spreads[1, f, i, j] = p[i, j]
             _rows(information[f, t], pull[f, t], rows, values)
             for r in range(3):
                 left, variance = values[r], 1.0
@@ -119,7 +127,9 @@ def smooth(
             x, p = states[0, f], spreads[0, f]
             if f < frames - 1:
                 _product(matrices[f + 1], p, moved)
-                apart[:] = spreads[0, f + 1] - spreads[1, f + 1]
+                for i in range(n):
+                    for j in range(n):
+                        apart[i, j] = spreads[0, f + 1, i, j] - spreads[1, f + 1, i, j]
                 _divide(spreads[1, f + 1], moved)
                 _product(apart, moved, work)
                 for i in range(n):
@@ -127,5 +137,8 @@ def smooth(
                         x[i] += moved[k, i] * (states[0, f + 1, k] - states[1, f + 1, k])
                         for j in range(n):
                             p[i, j] += moved[k, i] * work[k, j]
-            points[f, t], covariances[f, t] = x[:3], p[:3, :3]
+            for i in range(3):
+                points[f, t, i] = x[i]
+                for j in range(3):
+                    covariances[f, t, i, j] = p[i, j]
     return points, covariances

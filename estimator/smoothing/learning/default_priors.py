@@ -122,8 +122,7 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Return frequency (Hz) and RMS (mm) of the bubbles' zigzag; None without usable
-    tracks.
+    """Return frequency (Hz) and RMS (mm) of the bubbles' zigzag; None without usable tracks.
 
     They come from the spectrum (Lomb-Scargle) of up to 20 tracks that show `_LEAST_PERIODS` of all
     frequencies. If there are none, they are the most likely ones of short tracks: the spectrum of
@@ -131,7 +130,7 @@ def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
     """
     from scipy.signal import lombscargle
 
-    long, short = [], []
+    long, short = list[tuple[Array, Array]](), list[tuple[Array, Array]]()
     for bubble in problem.bubbles:
         t = problem.t_s[bubble.first : bubble.last + 1]
         if len(bubble) >= _LEAST_SAMPLES:
@@ -164,16 +163,19 @@ def _likely_zigzag(tracks: Sequence[tuple[Array, Array]]) -> tuple[float, float]
     noise = np.geomspace(1e-8, 1.0, 17)  # variances over the swing's
     omega = 2 * np.pi * trials[:, None, None]
     damped = omega * np.sqrt(1 - _ZIGZAG_DAMPING**2)
-    squares, log_det, count = np.zeros((len(trials), len(noise))), 0.0, 0
+    squares = log_det = np.zeros((len(trials), len(noise)))
+    count = 0
     for t, across in tracks:
         some = np.linspace(0, len(t) - 1, min(len(t), _SHORT_SAMPLES)).astype(int)
-        free = np.linalg.qr(np.stack([np.ones(len(some)), t[some] - t[0]], -1), "complete")[0][:, 2:]
+        line = np.stack([np.ones(len(some)), t[some] - t[0]], -1)
+        free = np.linalg.qr(line, "complete")[0][:, 2:]
         lag = np.abs(t[some][:, None] - t[some])
         wave = np.cos(damped * lag) + _ZIGZAG_DAMPING * omega / damped * np.sin(damped * lag)
-        values, axes = np.linalg.eigh(free.T @ (np.exp(-_ZIGZAG_DAMPING * omega * lag) * wave) @ free)
+        wave *= np.exp(-_ZIGZAG_DAMPING * omega * lag)
+        values, axes = np.linalg.eigh(free.T @ wave @ free)
         variance = np.maximum(values, 0.0)[:, None] + noise[:, None]
         seen = (np.swapaxes(axes, 1, 2) @ (free.T @ across[some])) ** 2
-        squares += (seen.sum(-1)[:, None] / variance).sum(-1)
+        squares = squares + (seen.sum(-1)[:, None] / variance).sum(-1)
         log_det = log_det + 2 * np.log(variance).sum(-1)
         count += 2 * free.shape[1]
     prior = (np.log(trials / _ZIGZAG_GUESS_HZ) / _ZIGZAG_LOG_SIGMA) ** 2
@@ -261,7 +263,7 @@ def adapted(solution: Solution) -> ShakeModel | None:
     elif guessed_modes(model):
         factor = _size_of_offsets(solution)
         if np.max(np.abs(np.log(factor))) > _RESCALE_BEYOND:
-            modes = (replace(m, rms_mm=_triple(m.rms_mm * factor)) for m in model.modes)
+            modes = (replace(m, rms_mm=_triple(np.array(m.rms_mm) * factor)) for m in model.modes)
             better = replace(better, modes=tuple(modes))
     return None if better is model else better
 

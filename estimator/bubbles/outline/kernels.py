@@ -33,6 +33,7 @@ HELD = 1e-7
 """Prior standard deviation, as a share of the radius, of harmonics that are not fitted."""
 
 MIN_SIGMA_PX = 0.3
+_SECTORS, _CLEAR_SIGMA, _FEW_CLEAR = 16, 2.2, 2
 _OCTANTS, _LAST_RING = 8, 1000
 _UNLIKE_SHARE, _UNLIKE_SIGMA, _UNLIKE_FROM, _MARGIN_SIGMA = 0.015, 3.0, 1.3, 0.9
 _REACH_SIGMA, _REACH_PX = 3.2, 1.2
@@ -87,6 +88,10 @@ class Fits(NamedTuple):
     coverage : (B,) share of the outline at which pixels of the edge were used.
     near, near_square : (B,) number of the pixels within one sigma of the outline that no other
         bubble hides, outliers included, and the sum of their squared residuals.
+    clustered : (B,) factor by which the errors of the pixels, which sectors of the outline have in
+        common, make the centre's variance larger than that of independent errors.
+    light : (B,) variance along the outline of the grey level just outside the edge, beyond its
+        noise, over the square of the contrast.
     """
 
     shifts: Array
@@ -100,6 +105,8 @@ class Fits(NamedTuple):
     coverage: Array
     near: Ints
     near_square: Array
+    clustered: Array
+    light: Array
 
 
 @compiled
@@ -616,6 +623,66 @@ def _judged(
 
 
 @compiled
+def _sector(cos: float, sin: float) -> int:
+    return int((np.arctan2(sin, cos) / (2.0 * np.pi) + 0.5) * _SECTORS) % _SECTORS
+
+
+@compiled
+def _clustered(foot: Array, used: Ints, rows: Array, covariance: Array) -> float:
+    """Return the variance of the centre with errors that pixels of a sector share, over that with
+    independent errors (the sandwich estimator for clusters, less what the fit absorbs).
+
+    foot : (7, N) of `feet`; used : (M,) the pixels of the fit. rows : (n + 1, M) whitened
+    derivatives and residuals; covariance : (n, n) or larger, of the parameters.
+    """
+    many = rows.shape[0] - 1
+    shared = expected = 0.0
+    for axis in range(2):
+        shift, own = np.zeros(_SECTORS), np.zeros(_SECTORS)
+        gain = np.zeros((_SECTORS, many))
+        for k in range(used.size):
+            pull = 0.0
+            for i in range(many):
+                pull += covariance[axis, i] * rows[i, k]
+            sector = _sector(foot[0, used[k]], foot[1, used[k]])
+            shift[sector] += pull * rows[many, k]
+            own[sector] += pull * pull
+            for i in range(many):
+                gain[sector, i] += pull * rows[i, k]
+        for sector in range(_SECTORS):
+            for i in range(many):
+                for j in range(many):
+                    own[sector] -= gain[sector, i] * covariance[i, j] * gain[sector, j]
+        shared += np.sum(shift**2) / covariance[axis, axis]
+        expected += np.sum(own) / covariance[axis, axis]
+    return float(shared / max(expected, 1e-9))
+
+
+@compiled
+def _light(
+    foot: Array, distance: Array, values: Array, hidden: Bools, sigma: float, noise: float
+) -> float:
+    """Return the variance along an outline of the level (1) just outside its edge, less its noise.
+
+    distance, values, hidden : (N,) distances of the pixels from the outline (px), grey levels, and
+    whether another bubble hides them; sigma : blur (px); noise : standard deviation of a pixel.
+    """
+    count, level = np.zeros(_SECTORS), np.zeros(_SECTORS)
+    for k in range(distance.size):
+        if distance[k] > _CLEAR_SIGMA * sigma and not hidden[k]:
+            sector = _sector(foot[0, k], foot[1, k])
+            count[sector] += 1.0
+            level[sector] += values[k]
+    seen = count > _FEW_CLEAR
+    if np.sum(seen) < _SECTORS // 4:
+        return 0.0
+    count, level = count[seen], level[seen] / count[seen]
+    # Twice the noise: the median has some, too, and the rest is to be no chance.
+    chance = 2.0 * noise * noise * np.mean(1.0 / count)
+    return float(max(np.mean((level - np.median(level)) ** 2) - chance, 0.0))
+
+
+@compiled
 def _no_fits(many: int) -> Fits:
     return Fits(
         np.zeros((many, OUTLINE)),
@@ -628,6 +695,8 @@ def _no_fits(many: int) -> Fits:
         np.zeros(many),
         np.zeros(many),
         np.zeros(many, dtype=np.int64),
+        np.zeros(many),
+        np.zeros(many),
         np.zeros(many),
     )
 
@@ -734,6 +803,11 @@ def fitted(
         if not first_look:
             _distances(shape, foot, shifts, distance)
             _judged(table, pixels, foot, distance, retreat, hidden, weight, levels, b, fits)
+            _distances(bent, start, shifts, away)
+            _derivatives(table, taken, bent, away, levels, rows)
+            fits.clustered[b] = _clustered(foot, used, rows, covariance)
+            light = _light(foot, distance, pixels[2], hidden, levels[0], rims.noise_outer[b])
+            fits.light[b] = light / max(levels[1] - levels[2], 1e-3) ** 2
     return fits
 
 

@@ -15,7 +15,7 @@ part is hidden it does, and the harmonics of the frame's whole outlines serve as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -91,22 +91,17 @@ _WIDENED = 1.5
 _ENOUGH_WHOLE = 4
 
 
-def learnt_spread(outlines: Outlines, partial: Bools) -> Array:
-    """Return the prior standard deviation of each outline's harmonics.
+def learnt_spread(outlines: Outlines) -> float:
+    """Return the prior standard deviation of partly hidden outlines' harmonics, in radii.
 
-    outlines : the fitted outlines of B bubbles.
-    partial : (B,) whether an outline is partly hidden. Such outlines get a standard deviation that
-        is learnt from the frame's whole outlines; the prior of whole outlines has no effect.
-
-    Returns (B,) standard deviations, as shares of the radius.
+    It is learnt from the frame's whole outlines. The prior of these has no effect.
     """
-    whole = outlines.resolved & ~partial
-    share = _UNLEARNT
-    if np.count_nonzero(whole) >= _ENOUGH_WHOLE:
-        radius = np.sqrt(outlines.ellipse[whole, 2] * outlines.ellipse[whole, 3])
-        typical = np.median(np.mean((outlines.harmonics[whole] / radius[:, None]) ** 2, axis=1))
-        share = max(_WIDENED * float(np.sqrt(typical)), _LEAST)
-    return np.where(partial, share, _FREE)
+    whole = outlines.resolved & (outlines.coverage >= _WHOLE)
+    if np.count_nonzero(whole) < _ENOUGH_WHOLE:
+        return _UNLEARNT
+    radius = np.sqrt(outlines.ellipse[whole, 2] * outlines.ellipse[whole, 3])
+    typical = np.median(np.mean((outlines.harmonics[whole] / radius[:, None]) ** 2, axis=1))
+    return max(_WIDENED * float(np.sqrt(typical)), _LEAST)
 
 
 _PIXEL_VARIANCE_PX2 = 1.0 / 12.0
@@ -114,6 +109,8 @@ _RESOLVED_BLURS = 3.0
 _WHOLE = 0.9
 _FIRST_STEPS = 2
 _FAR_SHIFT_PX = 0.25
+_UNEVEN_LIGHT = np.pi / 4.0
+_SHAPE_TO_CENTRE = 8.0
 _MEAN_SLOPE = 0.35
 """RMS of the unit normal density within one sigma."""
 
@@ -250,13 +247,28 @@ def fit_outlines(ratio: Float32, start: Start) -> Outlines:
     for _ in range(2):
         if again.size == 0:
             break
-        prior = learnt_spread(fit, partial)
+        prior = np.where(partial, learnt_spread(fit), _FREE)
         near = _refined(
             ratio, fit.state(again), start[again], fit.state(everyone), again, prior[again]
         )
         fit = fit.updated(again, near)
         again = again[near.shift_px > _FAR_SHIFT_PX]
-    return fit
+    return _misled(fit)
+
+
+def _misled(fit: Outlines) -> Outlines:
+    """Widen the covariances of centres of which the outline's shape is unlike the others'.
+
+    What bends an outline in the orders 3 to 6 shifts its centre, too, unless it is the bubble's
+    own shape. The variance of the coefficients beyond noise and `learnt_spread` is added, times a
+    factor found on rendered swarms: there the variance falls with the order.
+    """
+    radius = np.sqrt(np.abs(fit.ellipse[:, 2] * fit.ellipse[:, 3]))
+    own = learnt_spread(fit) * radius
+    excess = np.mean(fit.harmonics**2, axis=1) - 2.0 * fit.sigma_outline_px**2 - own**2
+    excess = _SHAPE_TO_CENTRE * np.where(fit.resolved, np.maximum(excess, 0.0), 0.0)
+    covariance = fit.centre_covariance_px2 + excess[:, None, None] * np.eye(2)
+    return replace(fit, centre_covariance_px2=covariance)
 
 
 def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
@@ -314,7 +326,10 @@ def _result(
 ) -> Outlines:
     """Make the public result of the fits.
 
-    Covariances are multiplied by chi2_dof if this exceeds 1 by 3 standard deviations.
+    Covariances are multiplied by chi2_dof if this exceeds 1 by 3 standard deviations. That of the
+    centre is multiplied by what `kernels.Fits.clustered` says, too. Uneven light moves a piece of
+    rim by sqrt(pi / 2) sigma times its share of the contrast, and the centre by half of the
+    variance (found on rendered swarms).
     """
     fitted = np.where(resolved, kernels.PARAMETERS, kernels.FIRST_HARMONIC)
     dof = np.maximum(found.used - fitted, 1.0)
@@ -324,6 +339,8 @@ def _result(
     angle = before.ellipse[:, 4]
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+    centre = covariance[:, :2, :2] * np.maximum(found.clustered, 1.0)[:, None, None]
+    centre += (_UNEVEN_LIGHT * found.light * state.sigma**2)[:, None, None] * np.eye(2)
     variances = np.einsum("bii->bi", covariance)[:, kernels.FIRST_HARMONIC :]
     return Outlines(
         state.ellipse,
@@ -332,7 +349,7 @@ def _result(
         state.sigma,
         state.outer,
         state.inner,
-        turn @ covariance[:, :2, :2] @ np.swapaxes(turn, 1, 2),
+        turn @ centre @ np.swapaxes(turn, 1, 2),
         np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0)),
         chi2_dof,
         found.coverage,

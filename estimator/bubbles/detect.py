@@ -53,7 +53,7 @@ __all__ = [
 _MAX_AXIS_RATIO, _LEAST_AXIS_PX = 3.0, 1.0
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
-_SHARP_SHARE = 0.15
+_SHARP_SHARE = 0.2
 """An edge narrower than this against the radius is sharp, in a crowd of bubbles of many sizes."""
 _SMALL_EDGES = 3.0
 _MOSTLY_SEEN, _KNOWN_COVERAGE = 0.6, 0.3

@@ -82,11 +82,12 @@ def resolved_crowd(
     if large:
         rims = rims.and_also(rims_along(ratio, sigma, np.stack(large)))
     every = sure.and_also(rims)
-    order = sole_owners(every, len(sure))
-    heart = typical_heart(every[order], min_diameter_px)
-    every = every[np.sort(order)]
-    kept = are_bubbles(every, heart, min_contrast) | (np.arange(len(every)) < len(sure))
-    every = refitted(every[kept])
+    owners = sole_owners(every, every.agreement, len(sure))
+    heart = typical_heart(every[owners], min_diameter_px)
+    kept, evidence = are_bubbles(every, heart, min_contrast)
+    kept[: len(sure)] = True
+    every = every[kept]
+    every = refitted(every[np.sort(sole_owners(every, evidence[kept], len(sure)))])
     sure, rims = every[: len(sure)], every[len(sure) :]
     clusters, rejected, explained = [], [], _explained(ratio.shape, every.ellipse)
     for index, blob in enumerate(blobs):

@@ -109,6 +109,8 @@ _RESOLVED_BLURS = 3.0
 _WHOLE = 0.9
 _FIRST_STEPS = 2
 _FAR_SHIFT_PX = 0.25
+_CHANCE = 1.75
+"""Three standard deviations above 1 of the mean of 32 squares: two coordinates, 16 sectors."""
 _UNEVEN_LIGHT = np.pi / 4.0
 _SHAPE_TO_CENTRE = 8.0
 _MEAN_SLOPE = 0.35
@@ -327,7 +329,7 @@ def _result(
     """Make the public result of the fits.
 
     Covariances are multiplied by chi2_dof if this exceeds 1 by 3 standard deviations. That of the
-    centre is multiplied by what `kernels.Fits.clustered` says, too. Uneven light moves a piece of
+    centre is multiplied by `kernels.Fits.clustered`, too, if that is no chance. Uneven light moves a piece of
     rim by sqrt(pi / 2) sigma times its share of the contrast, and the centre by half of the
     variance (found on rendered swarms).
     """
@@ -339,7 +341,8 @@ def _result(
     angle = before.ellipse[:, 4]
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
-    centre = covariance[:, :2, :2] * np.maximum(found.clustered, 1.0)[:, None, None]
+    shared = np.where(found.clustered > _CHANCE, found.clustered, 1.0)
+    centre = covariance[:, :2, :2] * shared[:, None, None]
     centre += (_UNEVEN_LIGHT * found.light * state.sigma**2)[:, None, None] * np.eye(2)
     variances = np.einsum("bii->bi", covariance)[:, kernels.FIRST_HARMONIC :]
     return Outlines(

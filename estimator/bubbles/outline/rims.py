@@ -36,7 +36,7 @@ _SEEN_STRENGTH, _LEAST_SEEN = 0.33, 10
 _LONGEST, _LARGEST_CHANGE, _LARGEST_SHIFT = 2.0, 1.8, 0.6
 _STRONG, _LEAST_FALL = 0.6, 0.15
 _OWN_SHARE, _OWN_PX, _OWN_RADII, _LEAST_INSIDE = 0.5, 2.0, 0.15, 0.5
-_WITH_HEARTS, _WITHOUT_HEARTS = 0.68, 0.85
+_WITH_HEARTS, _WITHOUT_HEARTS = 0.67, 0.85
 _HEART_WEIGHT, _UNEVEN_WEIGHT, _FULL_HEART = 0.5, 0.33, 0.6
 _LARGE_SHARE, _SURE, _SURE_SHARE, _HEARTS_SHOW = 0.75, 0.9, 0.8, 0.75
 _SECTORS, _MISLED, _UNSEEN_SHARE = 8, 2.0, 0.5
@@ -234,12 +234,13 @@ def typical_heart(rims: Rims, min_diameter_px: float) -> float:
     return float(np.clip(np.quantile(large.heart[sure], _HEARTS_SHOW), 0.0, _FULL_HEART))
 
 
-def sole_owners(rims: Rims, sure: int = 0) -> Index:
+def sole_owners(rims: Rims, evidence: Array, sure: int = 0) -> Index:
     """Return the positions of candidates no two of which claim the same rim, the surest first.
 
-    sure : number of candidates, the first ones, that are bubbles in any case.
+    evidence : (N,) what speaks for each. sure : number of candidates, the first ones, that are
+        bubbles in any case.
     """
-    rank = rims.agreement + np.where(np.arange(len(rims)) < sure, 2.0, 0.0)
+    rank = evidence + np.where(np.arange(len(rims)) < sure, 2.0, 0.0)
     order = np.argsort(-rank, kind="stable")
     least = _OWN_SHARE * rim_kernels.RAYS * rims.inside
     least[:sure] = 0.0
@@ -247,8 +248,8 @@ def sole_owners(rims: Rims, sure: int = 0) -> Index:
     return np.asarray(order[own[order]])
 
 
-def are_bubbles(rims: Rims, heart: float, min_contrast: float) -> Bools:
-    """Return which candidates look like the bubbles of their image.
+def are_bubbles(rims: Rims, heart: float, min_contrast: float) -> tuple[Bools, Array]:
+    """Return which candidates look like the bubbles of their image, and what speaks for each.
 
     heart : what `typical_heart` said. Where bubbles show bright hearts, a candidate that shows less
         has to show more of its rim; so has every candidate where there are no hearts to tell, and
@@ -258,7 +259,7 @@ def are_bubbles(rims: Rims, heart: float, min_contrast: float) -> Bools:
     evidence -= _UNEVEN_WEIGHT * np.minimum(rims.unevenness, 1.0)
     least = _WITHOUT_HEARTS + (_WITH_HEARTS - _WITHOUT_HEARTS) * heart / _FULL_HEART
     seen = (rims.inside >= _LEAST_INSIDE) & (rims.depth >= min_contrast)
-    return np.asarray(seen & (evidence >= least))
+    return np.asarray(seen & (evidence >= least)), evidence
 
 
 def refitted(rims: Rims) -> Rims:

@@ -39,7 +39,13 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     points_on,
     rough_distance,
 )
-from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, close_pairs, fit_outlines
+from telerig.estimator.bubbles.outline.outline_fit import (
+    Outlines,
+    Start,
+    close_pairs,
+    fit_outlines,
+    widened,
+)
 
 __all__ = [
     "Bubbles",
@@ -186,7 +192,7 @@ def _found(
     known, ellipses = np.zeros(0, np.intp), np.zeros((0, 5))
     if parts:
         start = _start(parts, blobs, sigma, dark_sigma)
-        outlines = fit_outlines(ratio, start)
+        outlines = fit_outlines(ratio, start, crowded=everywhere)
         merged = _merged(outlines, parts)
         known = np.flatnonzero(~merged & _known(outlines))
         ellipses = outlines.ellipse[known]
@@ -207,12 +213,12 @@ def _found(
             nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
             return replace(nothing, clusters=clusters)
         start = _start(parts, whole, sigma, dark_sigma)
-        every = fit_outlines(ratio, start)
+        every = fit_outlines(ratio, start, crowded=True)
         last = np.arange(len(known), len(parts))
         every = every.updated(last, settled(every.taken(last), crowd.rims))
         if outlines is not None:
             every = every.updated(np.arange(len(known)), outlines.taken(known))
-        outlines, merged = every, np.zeros(len(parts), np.bool_)
+        outlines, merged = widened(every), np.zeros(len(parts), np.bool_)
         sharp_share = _SHARP_SHARE
     assert outlines is not None
     defocused = _defocused(outlines, sharp_share)

@@ -185,6 +185,7 @@ def settled(fitted: Outlines, rims: Rims) -> Outlines:
         outer=rims.outer,
         inner=rims.inner,
         centre_covariance_px2=covariance,
+        misled_px2=np.zeros_like(covariance),
         sigma_outline_px=missing,
         chi2_dof=missing,
         coverage=np.mean(rims.used, axis=1),

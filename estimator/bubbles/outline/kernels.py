@@ -679,7 +679,8 @@ def _light(
     count, level = count[seen], level[seen] / count[seen]
     # Twice the noise: the median has some, too, and the rest is to be no chance.
     chance = 2.0 * noise * noise * np.mean(1.0 / count)
-    return float(max(np.mean((level - np.median(level)) ** 2) - chance, 0.0))
+    beyond: float = np.mean((level - np.median(level)) ** 2) - chance
+    return beyond if beyond > 0.0 else 0.0
 
 
 @compiled
@@ -713,6 +714,7 @@ def fitted(
     everyone: Array,
     everyone_sigma: Array,
     steps: int,
+    crowded: bool,
 ) -> Fits:
     """Fit B outlines by Gauss-Newton steps, the nearest points on the ellipses held fixed.
 
@@ -723,6 +725,7 @@ def fitted(
         another bubble are left out.
     steps : largest number of steps. With ``STEPS`` all pixels at the rim are used, except glare,
         dirt and outliers; with less, some in a narrow band.
+    crowded : whether to measure what neighbours and shadows do, `Fits.clustered` and `Fits.light`.
     """
     fits = _no_fits(rims.sigma.size)
     for b in range(rims.sigma.size):
@@ -803,6 +806,8 @@ def fitted(
         if not first_look:
             _distances(shape, foot, shifts, distance)
             _judged(table, pixels, foot, distance, retreat, hidden, weight, levels, b, fits)
+            if not crowded:
+                continue
             _distances(bent, start, shifts, away)
             _derivatives(table, taken, bent, away, levels, rows)
             fits.clustered[b] = _clustered(foot, used, rows, covariance)

@@ -179,6 +179,7 @@ class Outlines:
     sigma_px : (B,) standard deviation of the blur of optics and pixel together (px).
     outer, inner : (B,) grey levels outside and inside, as shares of the background.
     centre_covariance_px2 : (B, 2, 2) covariance of the ellipse's centre (px^2).
+    misled_px2 : (B, 2, 2) what pixels that err together and uneven light add to it (px^2).
     sigma_outline_px : (B,) standard deviation of a harmonic's coefficient (px).
     chi2_dof : (B,) chi-square per degree of freedom.
     coverage : (B,) share of the outline that is visible, 0 to 1.
@@ -194,6 +195,7 @@ class Outlines:
     outer: Array
     inner: Array
     centre_covariance_px2: Array
+    misled_px2: Array
     sigma_outline_px: Array
     chi2_dof: Array
     coverage: Array
@@ -223,11 +225,12 @@ class Outlines:
         return Outlines(**changed)
 
 
-def fit_outlines(ratio: Float32, start: Start) -> Outlines:
+def fit_outlines(ratio: Float32, start: Start, *, crowded: bool = False) -> Outlines:
     """Fit the outlines of B bubbles to an image.
 
     ratio : (rows, columns) grey levels divided by the background.
     start : start values of the B outlines.
+    crowded : whether to measure what misleads fits in a crowd; without it ``misled_px2`` is 0.
 
     Pixels inside or near another bubble of ``start`` are left out, and so are glare, dirt and other
     pixels that do not look like a rim. A first fit to some of the pixels yields blur and levels.
@@ -243,7 +246,7 @@ def fit_outlines(ratio: Float32, start: Start) -> Outlines:
         start.inner,
     )
     state = _first_look(ratio, state, start)
-    fit = _refined(ratio, state, start, state, everyone, np.full(len(start), _FREE))
+    fit = _refined(ratio, state, start, state, everyone, np.full(len(start), _FREE), crowded)
     partial = fit.coverage < _WHOLE
     again = np.flatnonzero(partial | (fit.shift_px > _FAR_SHIFT_PX))
     for _ in range(2):
@@ -251,25 +254,26 @@ def fit_outlines(ratio: Float32, start: Start) -> Outlines:
             break
         prior = np.where(partial, learnt_spread(fit), _FREE)
         near = _refined(
-            ratio, fit.state(again), start[again], fit.state(everyone), again, prior[again]
+            ratio, fit.state(again), start[again], fit.state(everyone), again, prior[again], crowded
         )
         fit = fit.updated(again, near)
         again = again[near.shift_px > _FAR_SHIFT_PX]
-    return _misled(fit)
+    return fit
 
 
-def _misled(fit: Outlines) -> Outlines:
-    """Widen the covariances of centres of which the outline's shape is unlike the others'.
+def widened(fit: Outlines) -> Outlines:
+    """Add to the centres' covariances what misleads fits in a crowd.
 
-    What bends an outline in the orders 3 to 6 shifts its centre, too, unless it is the bubble's
-    own shape. The variance of the coefficients beyond noise and `learnt_spread` is added, times a
-    factor found on rendered swarms: there the variance falls with the order.
+    Besides ``misled_px2``: what bends an outline in the orders 3 to 6 shifts its centre, too,
+    unless it is the bubble's own shape. The variance of the coefficients beyond noise and
+    `learnt_spread` is added, times a factor found on rendered swarms: the variance falls with the
+    order.
     """
     radius = np.sqrt(np.abs(fit.ellipse[:, 2] * fit.ellipse[:, 3]))
     own = learnt_spread(fit) * radius
     excess = np.mean(fit.harmonics**2, axis=1) - 2.0 * fit.sigma_outline_px**2 - own**2
     excess = _SHAPE_TO_CENTRE * np.where(fit.resolved, np.maximum(excess, 0.0), 0.0)
-    covariance = fit.centre_covariance_px2 + excess[:, None, None] * np.eye(2)
+    covariance = fit.centre_covariance_px2 + fit.misled_px2 + excess[:, None, None] * np.eye(2)
     return replace(fit, centre_covariance_px2=covariance)
 
 
@@ -278,7 +282,7 @@ def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
     everyone = np.arange(len(start))
     rims = state.rims(start, np.zeros(len(start)))
     found = kernels.fitted(
-        ratio, profile_table(), rims, everyone, rims.ellipse, rims.sigma, _FIRST_STEPS
+        ratio, profile_table(), rims, everyone, rims.ellipse, rims.sigma, _FIRST_STEPS, False
     )
     return _moved(state, found)
 
@@ -290,6 +294,7 @@ def _refined(
     everyone: RimState,
     own: Index,
     prior: Array,
+    crowded: bool,
 ) -> Outlines:
     """Fit the outlines of some bubbles with one linearisation.
 
@@ -299,8 +304,9 @@ def _refined(
     """
     resolved = state.ellipse[:, 3] > _RESOLVED_BLURS * state.sigma
     rims = state.rims(start, np.where(resolved, prior, 0.0))
+    table = profile_table()
     found = kernels.fitted(
-        ratio, profile_table(), rims, own, everyone.ellipse, everyone.sigma, kernels.STEPS
+        ratio, table, rims, own, everyone.ellipse, everyone.sigma, kernels.STEPS, crowded
     )
     return _result(_moved(state, found), found, state, start, resolved)
 
@@ -328,10 +334,10 @@ def _result(
 ) -> Outlines:
     """Make the public result of the fits.
 
-    Covariances are multiplied by chi2_dof if this exceeds 1 by 3 standard deviations. That of the
-    centre is multiplied by `kernels.Fits.clustered`, too, if that is no chance. Uneven light moves a piece of
-    rim by sqrt(pi / 2) sigma times its share of the contrast, and the centre by half of the
-    variance (found on rendered swarms).
+    Covariances are multiplied by chi2_dof if this exceeds 1 by 3 standard deviations. What
+    misleads multiplies that of the centre by `kernels.Fits.clustered`, if that is no chance, and
+    uneven light moves a piece of rim by sqrt(pi / 2) sigma times its share of the contrast, and the
+    centre by half of the variance (found on rendered swarms).
     """
     fitted = np.where(resolved, kernels.PARAMETERS, kernels.FIRST_HARMONIC)
     dof = np.maximum(found.used - fitted, 1.0)
@@ -342,8 +348,8 @@ def _result(
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
     shared = np.where(found.clustered > _CHANCE, found.clustered, 1.0)
-    centre = covariance[:, :2, :2] * shared[:, None, None]
-    centre += (_UNEVEN_LIGHT * found.light * state.sigma**2)[:, None, None] * np.eye(2)
+    misled = covariance[:, :2, :2] * (shared - 1.0)[:, None, None]
+    misled += (_UNEVEN_LIGHT * found.light * state.sigma**2)[:, None, None] * np.eye(2)
     variances = np.einsum("bii->bi", covariance)[:, kernels.FIRST_HARMONIC :]
     return Outlines(
         state.ellipse,
@@ -352,7 +358,8 @@ def _result(
         state.sigma,
         state.outer,
         state.inner,
-        turn @ centre @ np.swapaxes(turn, 1, 2),
+        turn @ covariance[:, :2, :2] @ np.swapaxes(turn, 1, 2),
+        turn @ misled @ np.swapaxes(turn, 1, 2),
         np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0)),
         chi2_dof,
         found.coverage,

@@ -79,7 +79,7 @@ def test_impossible_starts_end_without_a_covariance() -> None:
     )  # fmt: skip
     image = np.ones((100, 100), np.float32)
     found = kernels.fitted(
-        image, profile_table(), rims, np.arange(4), rims.ellipse, rims.sigma, kernels.STEPS
+        image, profile_table(), rims, np.arange(4), rims.ellipse, rims.sigma, kernels.STEPS, True
     )
     assert not found.covariance[[0, 3]].any() and not found.coverage[[0, 2, 3]].any()
 

@@ -678,9 +678,8 @@ def _light(
         return 0.0
     count, level = count[seen], level[seen] / count[seen]
     # Twice the noise: the median has some, too, and the rest is to be no chance.
-    chance = 2.0 * noise * noise * np.mean(1.0 / count)
-    beyond: float = np.mean((level - np.median(level)) ** 2) - chance
-    return beyond if beyond > 0.0 else 0.0
+    chance = 2.0 * noise * noise * float(np.mean(1.0 / count))
+    return max(float(np.mean((level - np.median(level)) ** 2)) - chance, 0.0)
 
 
 @compiled

@@ -287,13 +287,14 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
         "ylabel": "ray miss / µm",
         "ylim": (-reach, reach),
     }
-    with drawing(2.9, legend="above", **settings) as sheet:
+    with drawing(2.9, legend="above" if steps else "", **settings) as sheet:
         sheet.points = len(miss[::thin])
         sheet.axes.axhline(0, color=MUTED, linewidth=0.8)
         dots = {"alpha": 0.5, "markersize": 2.5 if len(miss) > 1000 else 5, "markeredgewidth": 0}
         sheet.axes.plot(place[::thin], miss[::thin], ".", color=camera_colour(0), **dots)
-        line = {"fmt": "o-", "markersize": 3.5, "linewidth": 1.2, "label": "median of a step"}
-        sheet.axes.errorbar(middles, medians, error, color=MODEL, **line)
+        if steps:
+            line = {"fmt": "o-", "markersize": 3.5, "linewidth": 1.2, "label": "median of a step"}
+            sheet.axes.errorbar(middles, medians, error, color=MODEL, **line)
     words = "There are too few points for it."
     if steps:
         most = int(np.argmax(np.abs(medians)))

@@ -146,6 +146,9 @@ def key_numbers(results: TrackResults) -> list[Figure]:
     size = tracks["d_eq_mm"].to_numpy(float)
     miss = 1e3 * tracks["ray_miss_mm"].to_numpy(float)
     sd = ray_miss_sd_mm(results)
+    of_noise = ""
+    if sd is not None:
+        of_noise = f"{number(_normal_median(sd), 2)} µm from the outlines' noise; "
     frames = frame_count(results)
     ambiguous = word_counts(tracks["flags"])[_AMBIGUOUS]
     each = len(tracks) / frames if frames else None
@@ -159,8 +162,7 @@ def key_numbers(results: TrackResults) -> list[Figure]:
         Figure("Position, 1 sd", f"{number(median(results.sd_um.max(axis=1)), 2)} µm",
                "along each point's worst axis, median over points; calibration's share left out"),
         Figure("Ray miss", f"{number(median(np.abs(miss)), 2)} µm",
-               f"median; {number(None if sd is None else _normal_median(sd), 2)} µm from the "
-               f"outlines' noise; RMS {number(rms(miss), 2)} µm"),
+               f"median; {of_noise}RMS {number(rms(miss), 2)} µm"),
         Figure("Diameter", f"{number(median(size), 3)} mm", "median, sphere of equal volume"),
         Figure("Ambiguous", share(ambiguous, len(tracks)),
                f"{number(ambiguous)} pairs that another pairing explains almost as well"),

@@ -139,7 +139,9 @@ def _encoder(stage: Any, frames: Array, where: str) -> tuple[Encoder | None, lis
     """Return the encoder's usable readings, None if they cover no frame, and findings."""
     if stage is None:
         return None, []
-    t, position = table_columns(stage, ("t_s", "position_mm"), where, what="a table")
+    t, position = table_columns(
+        stage, ("t_s", "position_mm"), where, what="telerig.load_run(folder), or a table"
+    )
     bad = np.flatnonzero(~(np.diff(t) > 0))
     if len(bad) or len(t) < 2:
         raise InputError(

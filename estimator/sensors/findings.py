@@ -95,7 +95,8 @@ def settled(findings: Sequence[Finding], accept: frozenset[Code]) -> list[str]:
         more = f" (and {len(refused) - 1} more faults)" if len(refused) > 1 else ""
         raise SensorError(
             first.words + more, where=first.where, code=str(first.code), findings=refused,
-            todo=f"{first.todo}. To use the data as they are: --accept {first.code}",
+            todo=f'{first.todo}. To use the data as they are: --accept {first.code}, in Python '
+            f'accept=["{first.code}"]',
         )  # fmt: skip
     out = []
     for finding in findings:

@@ -122,15 +122,20 @@ def smooth(
         <camera>_suu_px2, <camera>_suv_px2, <camera>_svv_px2. None to estimate only the shake.
     calibration : calibration of the cameras.
     stage : the encoder: a table or a mapping with t_s (E,) and position_mm (E,), which increases
-        where the stage moves along its axis; or the `RunData` of the run, whose other records are
-        then used as well where nothing else is given; None without an encoder.
-    accelerometers : a mapping of the sensor's name to an `AccelerometerRecord`: {"t_s" (N,), "a"
-        (N, 3) with "unit" ("m/s^2", "g", "mg", ...) or "a_m_s2" (N, 3), "mounted_on" (a camera or
-        "carriage"), "axes" (3, 3)} and optional "noise_density_ug_sqrt_hz", "bias_sigma_m_s2",
-        "range_m_s2", "clock"; or a table with the columns t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2
-        (or ax_g, ...), whose sensors ``rig`` describes; None for none. Readings contain gravity: at
-        rest a sensor reads +9.81 m/s^2 upwards. Times are those of the frames' clock in a table,
-        and of a clock of their own ("unknown") in a mapping.
+        where the stage moves along its axis; or the `RunData` of the run (`telerig.load_run`),
+        whose other records are then used as well where nothing else is given; None without an
+        encoder.
+    accelerometers : a mapping of the sensor's name to a mapping (`AccelerometerRecord`) with
+        "t_s" (N,), which increases; the readings (N, 3) along the sensor's x, y, z, either "a_m_s2"
+        or "a" with "unit" ("m/s^2", "g", "mg", "mm/s^2", "cm/s^2" or "ft/s^2"); "mounted_on", the
+        camera whose arm carries it, or "carriage"; "axes" (3, 3), whose rows are the sensor's x, y,
+        z in rig coordinates; and if known "noise_density_ug_sqrt_hz", "bias_sigma_m_s2" (0.2 if
+        missing) and "range_m_s2". "clock" is "frames" if t_s is the time of the frames, or
+        "unknown" (the default) if its offset is to be found from the images; a sensor whose offset
+        they do not show is left out, with a warning. Keys that are missing are taken from ``rig``.
+        Readings contain gravity: at rest, +9.81 m/s^2 along the axis that points up. Or a table
+        with the columns t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2 (or ax_g, ...), on the clock of the
+        frames, whose sensors ``rig`` describes. None for none.
     references : a table of marks fixed to the tank with the columns frame, camera, mark, u_px, v_px
         and possibly sigma_px (0.1 px if missing); None to take those of ``tracks``, if it has any.
     model : "auto" (default hyper-parameters for the available measurements; modes are learned if
@@ -146,19 +151,21 @@ def smooth(
     refine_rig : whether to estimate also how the cameras have moved relative to each other since
         the calibration (``summary["rig_change"]``); a `DriftPrior` states how far they may have
         moved.
-    accept : codes of faults that are used as they are, where they would be refused (the error
-        names its code): SENSOR_UNIT, SENSOR_GRAVITY, SENSOR_AXES, SENSOR_MOUNT, SENSOR_SCALE,
-        SENSOR_CLOCK, ENCODER_SIGN, ENCODER_UNIT, ENCODER_STUCK, ENCODER_SCALE, ENCODER_JUMP,
-        ENCODER_CLOCK, FRAME_TIMES, RISE_SPEED.
+    accept : codes of faults, like ["SENSOR_AXES"], that are used as they are, where they would be
+        refused (the error names its code): SENSOR_UNIT, SENSOR_GRAVITY, SENSOR_AXES, SENSOR_MOUNT,
+        SENSOR_SCALE, SENSOR_CLOCK, ENCODER_SIGN, ENCODER_UNIT, ENCODER_STUCK, ENCODER_SCALE,
+        ENCODER_JUMP, ENCODER_CLOCK, FRAME_TIMES, RISE_SPEED.
     folder : an existing folder for results.h5 of a run that is too long for memory; None for a
         temporary one, which lasts as long as what is returned.
 
     A run of more than 12,000 frames, or of more than 120,000 of all bubbles together, is smoothed
     in pieces; its tables are read from results.h5 when they are asked for.
 
-    Returns a `Smoothing`: the tables ``trajectories`` and ``shake``, the ``verdict``, and
-    ``summary``, whose "warnings" say what the checks found, what was assumed and which samples are
-    not used, and whose "accelerometers" hold the estimates for each sensor.
+    Returns a `Smoothing`: the table ``trajectories`` (t_s, x_mm, vx_mm_s, their standard deviations
+    sx_mm, svx_mm_s and so on, by frame and particle), the table ``shake`` of the cameras, the
+    ``verdict``, whose "verdict" is RESOLVED, PARTIAL, UNRESOLVED or CONTRADICTED, and ``summary``,
+    whose "warnings" say what the checks found, what was assumed and which samples are not used, and
+    whose "accelerometers" hold the estimates for each sensor.
 
     Raises InputError for arguments that are not as described, and its subclass `SensorError`, with
     ``code`` and ``findings``, for a sensor that contradicts gravity, the images or another sensor.

@@ -444,8 +444,8 @@ def _unaligned(sensor: Accelerometer, t_s: Array) -> tuple[Accelerometer | None,
 def _left_out(where: str, why: str) -> Finding:
     return Finding(
         f"{why}: it is not used", where,
-        "put its times on the clock of the frames, or tap the arm or start the stage within both "
-        "records",
+        'put its times on the clock of the frames and state clock = "frames", or tap the arm or '
+        "start the stage within both records",
     )  # fmt: skip
 
 
@@ -475,8 +475,8 @@ def _placed(
                     f"its clock is {clock.offset_s:+.4f} ± {clock.sd_s:.4f} s off that of the "
                     "frames, as the images show; its times are corrected",
                     where,
-                    f"state [accelerometers.{sensor.name}] clock = \"unknown\" if it has one of "
-                    "its own",
+                    f"state clock = \"unknown\" in rig.toml [accelerometers.{sensor.name}] if it "
+                    "has one of its own",
                 )
             )  # fmt: skip
         return moved, findings
@@ -684,7 +684,7 @@ def _axes_finding(name: str, found: Mounting) -> Finding:
 def _one_of(first: str, second: str, judged: dict[str, Mounting]) -> Finding:
     """Return that two sensors contradict each other, and nothing tells which of them is wrong."""
     return Finding(
-        "they contradict each other: the axes of one of them are wrong, and images and encoder do "
+        "they contradict each other: the axes of one of them are wrong, and the measurements do "
         "not show clearly which",
         f"accelerometers {first} and {second}",
         f"check how both are mounted; either {_axes_line(first, judged[first])} or "

@@ -213,7 +213,7 @@ def calibration_of(
     if len(rig.cameras) < 2:
         raise InputError(
             "a rig with one camera", where=str(dataset / "rig.toml"),
-            todo="describe two cameras: one alone sees no depth",
+            todo="describe two cameras: one camera alone does not show depth",
         )  # fmt: skip
     return expected_calibration(rig, views)
 

@@ -435,7 +435,7 @@ def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
     sine = float(np.linalg.norm(cross))
     if sine < _LEAST_SINE:
         raise CalibrationError(
-            "both cameras look along one line",
+            "both cameras have the same line of sight",
             todo="a movement can be found only between cameras with different lines of sight",
         )
     middle, _ = midpoint(*rays[0], *rays[1])

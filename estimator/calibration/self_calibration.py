@@ -237,7 +237,8 @@ def _nominal(
         raise InputError(
             f"nominal rotations are given for {', '.join(unknown)}, which the rig does not have or "
             "which is its first camera",
-            todo=f"give them for: {', '.join(names[1:]) or 'no camera, because there is only one'}",
+            todo="give nominal rotations for: "
+            f"{', '.join(names[1:]) or 'no camera, because there is only one'}",
         )
     return {names.index(n): np.asarray(r, float) for n, r in given.items()}
 

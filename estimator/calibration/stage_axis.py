@@ -131,7 +131,7 @@ def _measured(dataset: Dataset, folder: Path) -> pd.DataFrame:
         raise InputError(
             f"holds {what}",
             where=str(folder),
-            todo=f"keep one of them: {FOLDER}/<camera>/<view>.tif or {FOLDER}/dots.csv",
+            todo=f"keep only one of the two: {FOLDER}/<camera>/<view>.tif or {FOLDER}/dots.csv",
         )
     if not views:
         return read_dots_csv(table, dataset.rig)

@@ -66,7 +66,7 @@ def check_installation() -> Iterator[Check]:
         extra = purpose.split("(")[1].rstrip(")")
         yield Check(
             name, "ok" if have else "note", have or f"not installed: no {purpose.split(' (')[0]}",
-            "" if have else f"pip install 'telerig[{extra}]' if you want it",
+            "" if have else f"pip install 'telerig[{extra}]' if you need this extra",
         )  # fmt: skip
 
 
@@ -103,7 +103,8 @@ def _opencv() -> Check:
     if rivals:
         both = " ".join([*rivals, "opencv-python-headless"])
         return Check(
-            "one OpenCV", "warning", f"also installed: {', '.join(rivals)}; they share files",
+            "one OpenCV", "warning",
+            f"also installed: {', '.join(rivals)}; these packages overwrite each other's files",
             f"pip uninstall -y {both} && pip install opencv-python-headless",
         )  # fmt: skip
     major = have.split(".")[0]
@@ -192,7 +193,7 @@ def _left_over(data: Dataset) -> Iterator[Check]:
         words = ", ".join(str(p.relative_to(data.path)) for p in found[:4])
         yield Check(
             "left over", "note", f"{len(found)} half-written: {words}",
-            "remove them if no telerig command is working on this dataset",
+            "remove these files if no telerig command is working on this dataset",
         )  # fmt: skip
 
 

@@ -171,8 +171,8 @@ def motion_correlation(
 ) -> Array | None:
     """Return the correlation (3,) of each sensor axis with the carriage's acceleration, or None.
 
-    There is none if the records (N,), (N, 3) and (E,) overlap by less than 0.3 s, or if the
-    carriage does not accelerate.
+    t_s, reading : (N,), (N, 3) of the sensor. stage_t_s, position_mm : (E,) of the encoder. Returns
+    None if the records overlap by less than 0.3 s, or if the carriage does not accelerate.
     """
     t, stage_t = np.asarray(t_s, float), np.asarray(stage_t_s, float)
     low, high = max(t[0], stage_t[0]), min(t[-1], stage_t[-1])

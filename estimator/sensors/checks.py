@@ -237,7 +237,8 @@ def check_tracks(table: Any, calibration: Calibration) -> list[Finding]:
             raise InputError(
                 f"the tracks have no pixels of camera {camera.name!r}",
                 where="tracks",
-                todo=f"they hold pixels of {', '.join(there) or 'no camera'}: track the run again "
+                todo=f"the tracks hold pixels of {', '.join(there) or 'no camera'}: track the "
+                "run again "
                 "with this calibration",
             )
     if len(calibration.cameras) != 2 or not len(table):
@@ -248,11 +249,12 @@ def check_tracks(table: Any, calibration: Calibration) -> list[Finding]:
     what = f"points and pixels of the tracks disagree by {off:.3g} px (median)"
     if off > _FOREIGN_PX:
         raise InputError(
-            f"{what}: they were made with another calibration",
+            f"{what}: the tracks were made with another calibration",
             where="tracks",
-            todo="run `telerig track` with this calibration, or give the one they were made with",
+            todo="run `telerig track` with this calibration, or give the calibration with which "
+            "the tracks were made",
         )
-    words = f"{what}: they were made with another calibration; only the pixels are used"
+    words = f"{what}: the tracks were made with another calibration; only the pixels are used"
     return [Finding(words, "tracks")]
 
 

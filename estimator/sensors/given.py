@@ -233,7 +233,7 @@ def _samples(
         raise InputError(
             f"{given[0]} has the shape {reading.shape}, t_s has {len(t)} times",
             where=where,
-            todo="transpose it: give rows of x, y, z"
+            todo="transpose the readings: give rows of x, y, z"
             if reading.shape == (3, len(t))
             else f"give ({len(t)}, 3): a row of x, y, z for each time",
         )
@@ -276,10 +276,10 @@ def _inferred(reading: Array, name: str, where: str) -> tuple[str, list[Finding]
         return "m/s^2", [
             Finding(
                 f"{words}, which is not gravity in any known unit", where,
-                f'say it with "unit": one of {", ".join(ACCELERATION_UNITS)}', Code.SENSOR_UNIT,
+                f'give "unit": one of {", ".join(ACCELERATION_UNITS)}', Code.SENSOR_UNIT,
             )
         ]  # fmt: skip
-    todo = f'say it with "unit": "{unit}"'
+    todo = f'give "unit": "{unit}"'
     return unit, [Finding(f"{words}, so it is taken to be in {unit}", where, todo)]
 
 
@@ -311,7 +311,7 @@ def _in_order(t: Array, reading: Array, where: str) -> tuple[Array, Array, list[
             where=where,
             todo="its clock is coarser than its rate: give t_s = start + sample / rate"
             if repeated > len(bad) / 2
-            else "sort the samples by time and keep one for each time",
+            else "sort the samples by time and keep one sample for each time",
         )
     words = (
         f"{len(lost)} of {len(t)} samples have a time that is repeated or goes back and are not "

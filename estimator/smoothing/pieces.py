@@ -60,7 +60,7 @@ class Piece:
         return range(self.first - self.low, self.end - self.low)
 
     def without_margin(self) -> Piece:
-        """Return the piece that is solved with its own frames alone."""
+        """Return the same piece without margins, so that it is solved with its own frames only."""
         return Piece(self.first, self.end, self.first, self.end)
 
     def cut(self, problem: SmoothingProblem) -> Window:

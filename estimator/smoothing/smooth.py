@@ -512,7 +512,8 @@ def problem_of(
             raise InputError(
                 "t_s differs from the times of the run",
                 where="smooth",
-                todo="give the run, or its tables (stage=run.stage, ...) with t_s",
+                todo="give the run without t_s, or give its tables (stage=run.stage, ...) "
+                "together with t_s",
             )
         stage, rig, t_s = run.stage, run.rig if rig is None else rig, run.t_s
         accelerometers = run.accelerometers if accelerometers is None else accelerometers

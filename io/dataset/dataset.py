@@ -301,7 +301,8 @@ def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
             raise InputError(
                 f"{stems[file.stem].name} and {file.name} are the same view twice",
                 where=str(folder),
-                todo="the name without its extension is the view: remove or rename one",
+                todo="the name without its extension is the name of the view: remove or rename "
+                "one of the files",
             )
         stems[file.stem] = file
     return stems
@@ -318,7 +319,8 @@ def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
             raise InputError(
                 f"{names} differ only in upper and lower case",
                 where=str(calibration),
-                todo="spell a view's name alike for both cameras, or rename one",
+                todo="write a view's name in the same way for all cameras, or rename one of the "
+                "files",
             )
 
 

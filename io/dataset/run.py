@@ -84,9 +84,9 @@ class RunData:
         name = self.camera_name(camera)
         if name not in self.sources:
             raise InputError(
-                "the run was loaded from detections.csv, it has no images",
+                "the run was loaded from detections.csv, so it has no images",
                 where=str(self.path),
-                todo="load it from its images (--from images)",
+                todo="load the run from its images (--from images)",
             )
         if not 0 <= frame < self.frame_count:
             raise InputError(
@@ -300,7 +300,7 @@ def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str,
             raise InputError(
                 f"camera {name} has no frames",
                 where=str(folder),
-                todo=f"put them at {name}/*.tif, {name}.tif or {name}.avi",
+                todo=f"put the frames at {name}/*.tif, {name}.tif or {name}.avi",
             )
     return {name: source for name, source in sources.items() if source is not None}
 
@@ -358,7 +358,9 @@ def _detections(
             todo="name the cameras that saw bubbles: [tracking] cameras in rig.toml",
         )
     if not all(name in sizes for name in names):
-        notes.append("the images' sizes are not known: detections outside them are not noticed")
+        notes.append(
+            "the images' sizes are not known, so detections outside the images are not found out"
+        )
     absent = [name for name in names if name not in seen]
     notes += [f"detections.csv has nothing of camera {name}" for name in absent]
     return table

@@ -119,7 +119,8 @@ class RawLog:
             raise InputError(
                 "was deleted while it was being recorded, so the recording ends here",
                 where=str(self.path),
-                todo=f"everything until now has been written to it again; `telerig record --replay "
+                todo="everything that was recorded until now has been written to a new log; "
+                "`telerig record --replay "
                 f"{self.path}` makes the tables",
             )
 

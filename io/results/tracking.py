@@ -117,15 +117,15 @@ EXTRAPOLATED = "extrapolated"
 def share_words(sd_mm: Sequence[float] | Array | None, extrapolated: float | None) -> list[str]:
     """Return sentences on the errors that the calibration causes, and on extrapolated positions.
 
-    sd_mm : (3,) as in `TrackingFile.calibration_sd_mm`. extrapolated : share of the positions that
-    lie beyond the dots of the calibration. None if they are not known.
+    sd_mm : (3,) as in `TrackingFile.calibration_sd_mm`; None if it is not known. extrapolated :
+    share of the positions that lie beyond the dots of the calibration; None if it is not known.
     """
     words = []
     if sd_mm is not None:
         x, y, z = (f"{1e3 * sd:.2g}" for sd in sd_mm)
         words.append(
             f"The calibration adds errors of {x}, {y} and {z} µm in x, y and z (1 sd, RMS over the "
-            "positions), which are common to the run: calibration_sx_mm and the two beside it."
+            "positions), which are common to the run: calibration_sx_mm, _sy_mm and _sz_mm."
         )
     if extrapolated:
         words.append(

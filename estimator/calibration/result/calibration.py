@@ -238,13 +238,14 @@ class Calibration(ShortText):
         if isinstance(uv_first_px, Mapping):
             if uv_second_px is not None:
                 raise InputError(
-                    "pixels by camera and a second array of pixels",
+                    "there is a second array of pixels, although the first argument has the "
+                    "pixels of all cameras",
                     todo="give either a mapping of all cameras' pixels, or two arrays",
                 )
             return self._triangulate_views(uv_first_px, sigma, method, include_calibration)
         if uv_second_px is None:
             raise InputError(
-                "pixels of one camera alone",
+                "there are pixels of one camera only",
                 todo="give two arrays (N, 2), or a mapping of arrays by camera",
             )
         if isinstance(sigma, Mapping):
@@ -328,7 +329,7 @@ class Calibration(ShortText):
         given = {self.camera(name).name: np.asarray(uv, float) for name, uv in uv_px.items()}
         if len(given) < 2:
             raise InputError(
-                f"pixels of {len(given)} camera(s)", todo="give those of two cameras or more"
+                f"pixels of {len(given)} camera(s)", todo="give the pixels of two cameras or more"
             )
         shape = next(iter(given.values())).shape
         pixels = [given.get(c.name, np.full(shape, np.nan)) for c in self.cameras]
@@ -516,7 +517,7 @@ def load_calibration(path: str | Path) -> Calibration:
         raise InputError(
             "this covariance belongs to another calibration than the calibration.json beside it",
             where=str(file.parent / "covariance.npz"),
-            todo="copy both files together, or delete this one",
+            todo="copy both files together, or delete covariance.npz",
         )
     return Calibration(
         cameras=record.rig_cameras(windows=True),
@@ -567,7 +568,8 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
             raise InputError(
                 "there is no calibration",
                 where=str(default),
-                todo="run `telerig calibrate` on the dataset, or give one with --calibration",
+                todo="run `telerig calibrate` on the dataset, or give a calibration with "
+                "--calibration",
             )
         return load_calibration(default), [default]
     if len(files) == 1 and files[0].suffix != ".txt":
@@ -608,7 +610,7 @@ def calibration_from_cameras(
     names = [c.name for c in cameras]
     if not names or len(set(names)) != len(names):
         raise CalibrationError(
-            f"cameras named {names}", todo="give at least one camera, no two of one name"
+            f"cameras named {names}", todo="give at least one camera, all with different names"
         )
     first = cameras[0].camera_from_rig
     if not np.allclose(np.c_[first.rotation, first.translation_mm], np.eye(3, 4), atol=1e-12):

@@ -26,7 +26,8 @@ def summary(calibration: CalibrationFile) -> str:
     if s["noise_floor_px"]:
         lines.append(
             f"  the dots scatter by {s['noise_floor_px']:.4f} px beyond their image noise of "
-            f"{s['image_noise_px']:.4f} px (print, compression or lens); it is in every covariance"
+            f"{s['image_noise_px']:.4f} px (print, compression or lens); every covariance "
+            "contains this scatter"
         )
     lines.append(f"  model {calibration.model.words}")
     for camera_name, camera in calibration.cameras.items():

@@ -216,7 +216,7 @@ class _Model:
         return out
 
     def handedness(self, point: Array) -> int:
-        """Return the sign of the homography's determinant at a point (2,)."""
+        """Return +1, or -1 if the map mirrors the neighbourhood of a point (2,) of the target."""
         depth = self.homography[2] @ [*point, 1.0]
         return 1 if np.linalg.det(self.homography) * depth >= 0 else -1
 

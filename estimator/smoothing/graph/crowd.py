@@ -138,7 +138,8 @@ class EliminatedCrowd:
         raise CalibrationError(
             "the bubbles and the rig cannot be solved together",
             where="smooth",
-            todo="smooth fewer bubbles at a time: a table of tracks with some of them",
+            todo="smooth fewer bubbles at a time: give a table of tracks with only some of the "
+            "bubbles",
         )
 
     def _schur(self, way: Array) -> Array:

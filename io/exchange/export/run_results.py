@@ -215,7 +215,7 @@ def cameras_of(
         raise InputError(
             "there is no calibration",
             where=str(trials[0]),
-            todo="run `telerig calibrate` first, or give one with --calibration",
+            todo="run `telerig calibrate` first, or give a calibration with --calibration",
         )
     return CalibratedCameras()
 
@@ -244,5 +244,7 @@ def run_folder(source: Path, run: str | None) -> Path:
     raise InputError(
         f"{len(found)} runs have results",
         where=str(root),
-        todo=f"name one with --run: {names}" if found else "run `telerig track` first",
+        todo=f"name one of these runs with --run: {names}"
+        if found
+        else "run `telerig track` first",
     )

@@ -190,7 +190,7 @@ def _values(recording: Recording, name: str) -> Array:
     values = recording.channels[name]
     if values.ndim != 1 or _is_text(recording, name):
         raise recording.error(
-            f"channel {name!r} is no column of numbers", "name another one with --channels"
+            f"channel {name!r} is no column of numbers", "name another channel with --channels"
         )
     if values.dtype.kind not in "iufb":
         bad = next(i for i, cell in enumerate(values) if not _is_number(str(cell)))
@@ -215,7 +215,7 @@ def _times(recording: Recording, layout: Layout, rows: int) -> tuple[Array, list
         if name not in there:
             raise recording.error(
                 f"has no channel {name!r} for the times",
-                f"name one with --time: {', '.join(there)}",
+                f"name one of these channels with --time: {', '.join(there)}",
             )
         return _times_in(recording, layout, name)
     if layout.rate_hz is None:
@@ -258,7 +258,7 @@ def _times_in(recording: Recording, layout: Layout, name: str) -> tuple[Array, l
         if t_s is None:
             raise recording.error(
                 f"channel {name!r} holds no times that can be read",
-                "name another one with --time, or give the sampling rate with --rate-hz 1600",
+                "name another channel with --time, or give the sampling rate with --rate-hz 1600",
             )
         first = str(recording.channels[name][0])
         return t_s, [f"times are in s since the first time stamp of {name!r}, {first}"]
@@ -305,7 +305,7 @@ def _unit_of_times(recording: Recording, values: Array, name: str) -> str:
                 return found[0]
     raise recording.error(
         f"does not state the unit of the times in {name!r}, which increase by {step:g}",
-        f"give it with --time-unit {'ms' if step >= 1 else 's'} ({', '.join(TIME_UNITS)})",
+        f"give the unit with --time-unit {'ms' if step >= 1 else 's'} ({', '.join(TIME_UNITS)})",
     )
 
 

@@ -379,7 +379,7 @@ def _starts(
             raise InputError(
                 f"{len(lab)} bubbles do not fit the view without touching each other",
                 where=f"simulation {config.name!r}",
-                todo="ask for fewer or smaller bubbles, or more spread",
+                todo="ask for fewer or smaller bubbles, or a larger spread",
             )
         starts[member] = start
     return starts

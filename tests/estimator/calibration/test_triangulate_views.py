@@ -139,7 +139,7 @@ def test_what_cannot_be_triangulated_says_why() -> None:
     uv = np.full((2, 2), 250.0)
     with pytest.raises(InputError, match="pixels of 1 camera"):
         calibration.triangulate({"left": uv})
-    with pytest.raises(InputError, match="pixels of one camera alone"):
+    with pytest.raises(InputError, match="pixels of one camera only"):
         calibration.triangulate(uv)
     with pytest.raises(CalibrationError, match="no camera 'up'"):
         calibration.triangulate({"left": uv, "up": uv})

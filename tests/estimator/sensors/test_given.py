@@ -110,7 +110,7 @@ def unordered(step: int) -> Any:
         ({"a_ms2": 1}, "did you mean a_m_s2"),
         ({"noise_density": 22.5}, "did you mean noise_density_ug_sqrt_hz"),
         ({"mounted": "left"}, "did you mean mounted_on"),
-        ({"a_m_s2": readings().T}, "transpose it"),
+        ({"a_m_s2": readings().T}, "transpose the readings"),
         ({"a_m_s2": readings()[:-1]}, r"give \(200, 3\)"),
         ({"a_m_s2": readings()[:, 0]}, r"has the shape \(200,\)"),
         ({"a_m_s2": None}, "no readings"),

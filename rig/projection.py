@@ -382,6 +382,6 @@ def _check_inverse(target: Array, xy: Array, coefficients: Array) -> None:
         where = np.linalg.norm(target[bad], axis=-1).min()
         raise GeometryError(
             f"the distortion cannot be inverted for {int(np.sum(bad))} of {bad.size} points, "
-            f"the nearest {where:.2f} half-diagonals from the image centre",
+            f"the nearest of which is {where:.2f} half-diagonals of the image from its centre",
             todo="use pixels inside the image only, or fit a simpler distortion model",
         )

@@ -33,14 +33,15 @@ def validate(
     report: Annotated[bool, typer.Option(help="Write validation.html.")] = True,
     quiet: options.Quiet = False,
 ) -> None:
-    """Prove a rig with marks or a target fixed to the tank, while the stage moves and shakes.
+    """Check a rig with marks or a target fixed to the tank, while the stage moves and shakes.
 
-    Marks are withheld in turn, given the known motion of a bubble, and smoothed as bubbles. Less
-    this motion their paths must stand still in the laboratory. Writes validation.json and
+    The marks are withheld from the smoother in turn. A known motion, as of a bubble, is added to
+    each withheld mark, which is then smoothed as a bubble. Once the known motion is subtracted,
+    the path of the mark must stand still in the laboratory. Writes validation.json and
     validation.html.
 
-    Exit code 0: they stand still within the stated standard deviations. 1: they do not. 2: the
-    input cannot be used. 130: interrupted.
+    Exit code 0: the marks stand still within the stated standard deviations. 1: they do not. 2:
+    the input cannot be used. 130: interrupted.
     """
     from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.smoothing.validate import validate_run

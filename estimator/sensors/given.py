@@ -196,10 +196,10 @@ def _sensor(
     missing = [key for key in ("mounted_on", "axes") if key not in fields]
     if missing:
         raise InputError(
-            f"nothing says its {', '.join(missing)}",
+            f"the description of the accelerometer lacks {' and '.join(missing)}",
             where=where,
-            todo=f"give them with the readings, or describe it under [accelerometers.{name}] in "
-            "rig.toml",
+            todo=f"state {' and '.join(missing)} with the readings, or under "
+            f"[accelerometers.{name}] in rig.toml",
         )
     t, reading, unit, found = _samples(name, source, where)
     t, reading, unordered = _in_order(t, reading, where)

@@ -170,8 +170,14 @@ def _gain(axes: Array, parts: Sequence[_Part]) -> tuple[float, float]:
 
 
 def preference(y: Array, known: Bools, stated: Array, other: Array) -> float:
-    """Return the log-likelihood of y (n,) as a multiple of another signal (n,) less that of the
-    stated one, by generalised least squares.
+    """Return by how much the log-likelihood of a measurement rises if it is of another motion.
+
+    The measurement is fitted by generalised least squares as a multiple, not negative, of the
+    prediction for the stated motion and of that for the other one. 0 if there are too few samples.
+
+    y : (n,) samples of the measurement.
+    known : (n,) which samples to use.
+    stated, other : (n,) predictions of the samples from the stated and from the other motion.
     """
     if np.count_nonzero(known) < _LEAST_SAMPLES:
         return 0.0

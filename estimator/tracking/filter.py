@@ -612,8 +612,10 @@ class Common:
         return self.covariance[POSITION, POSITION]
 
     def predicted(self, step: Transition) -> Common:
-        """Return the common error in the next frame: the shift is 0, and the covariance has
-        grown.
+        """Return the common error that is expected in the next frame, before its measurements.
+
+        The shift is 0: the tracks have taken over the last one. The covariance has grown by the
+        noise of the transition.
         """
         grown = step.matrix @ self.covariance @ step.matrix.T + step.common_noise
         return Common(np.zeros(STATES), grown)

@@ -43,7 +43,10 @@ class Draws:
     encoder: Array
 
     def of_family(self, graph: GraphLayout, family: int) -> Array:
-        """Return the errors (n, d, K) of a family of keys."""
+        """Return the errors (n, d, K) of the n keys of one family, each of d numbers, in K draws.
+
+        family : its index in `graph.counts()`.
+        """
         counts = graph.counts()
         first = sum(n * d for n, d in counts[:family])
         number, size = counts[family]

@@ -47,7 +47,12 @@ class Strip:
     def silhouettes(
         self, rig_from_lab_mm: Array, travel_mm: Array, blur_px: float
     ) -> list[Silhouette]:
-        """Return what the renderer draws. travel_mm : (3,) of the tank in the rig at exposure."""
+        """Return the outline, look and smear of each dot that the camera sees, for the renderer.
+
+        rig_from_lab_mm : (3,) added to positions in the laboratory to give those in the rig.
+        travel_mm : (3,) motion of the tank relative to the rig during the exposure.
+        blur_px : blur of the image.
+        """
         chosen, uv = self.seen(rig_from_lab_mm)
         rig = self.lab_mm[chosen] + rig_from_lab_mm
         after = self.camera.project(rig + travel_mm / 2)

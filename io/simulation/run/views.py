@@ -42,7 +42,7 @@ class CameraView:
     overlap: Bools
 
     def silhouettes(self, scene: RunScene) -> list[Silhouette]:
-        """Return what the renderer draws."""
+        """Return the outline, look, blur and smear of each bubble, for the renderer."""
         return [
             Silhouette(
                 outline, scene.population.looks[k], float(blur), (float(smear[0]), float(smear[1]))

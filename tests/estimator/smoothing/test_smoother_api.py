@@ -555,7 +555,7 @@ def test_bad_input(run: Run) -> None:
     nameless = pd.DataFrame(
         {"t_s": [0.0, 0.1], "sensor": "x", "ax_m_s2": 0.0, "ay_m_s2": 0.0, "az_m_s2": 0.0}
     )
-    with pytest.raises(InputError, match="nothing says its mounted_on"):
+    with pytest.raises(InputError, match="lacks mounted_on"):
         smooth(run.tracks, run.calibration, accelerometers=nameless, **good)
     for wrong, words in (
         ({"stage": run.stage.to_numpy()}, "not a table"),

@@ -442,14 +442,16 @@ class Weights:
 
 @dataclass(frozen=True)
 class StageEquations:
-    """The normal equations of the 9 unknowns (pose 6, slope 3).
+    """The normal equations of the 9 unknowns (6 of the pose, 3 of the slope).
 
-    The errors of the carriage's position in each view have been eliminated.
+    The errors of the carriage's position in each of the V views have been eliminated.
 
-    normal, right : (9, 9), (9,) matrix and right-hand side. by_rig : (9, P) coupling with the
-    cameras' P parameters. shift_mm, shift_covariance : (V, 3), (V, 3, 3) deviation of each view
-    from the straight line in mm, and its covariance.
-    dot_score : (M,) squared residuals of the dots in variances, if each view may deviate freely.
+    normal, right : (9, 9) matrix and (9,) right-hand side.
+    by_rig : (9, P) coupling with the P parameters of the cameras.
+    shift_mm, shift_covariance : (V, 3) deviation of each view from the straight line in mm, and
+        (V, 3, 3) its covariance in mm^2.
+    dot_score : (M,) squared residual of each of the M dots, divided by its variance, if each
+        view may deviate freely.
     """
 
     normal: Array

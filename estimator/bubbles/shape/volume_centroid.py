@@ -69,11 +69,14 @@ class Views:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimate under one model of the shape.
+    """The centres of volume of the M bubbles in `Views`, estimated under one model of the shape.
 
-    step_mm : (M, 3) from the point to the centre of volume; covariance_mm2 : (M, 3, 3);
-    shift_px : (M, 4) expected displacement of the outlines' centres from the projected centre of
-    volume; log_evidence : (M,), comparable between estimates from the same `Views`.
+    step_mm : (M, 3) from the point near each bubble to its centre of volume.
+    covariance_mm2 : (M, 3, 3) covariance of the step.
+    shift_px : (M, 4) expected displacement of the outline's centre from the projected centre of
+        volume: (u, v) in the first view, then in the second.
+    log_evidence : (M,) logarithm of the model's probability density for the data, comparable
+        between estimates from the same `Views`.
     """
 
     step_mm: Array

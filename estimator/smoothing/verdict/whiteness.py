@@ -197,9 +197,15 @@ def stretch_of(graph: GraphLayout, middle: int) -> Stretch | None:
 def drawn_residuals(
     solution: Solution, stretch: Stretch, draws: int, rng: Generator
 ) -> list[tuple[Ints, Array]]:
-    """Return by camera which bubbles' pixels (m,), and residuals (m, 2, draws) in sigmas.
+    """Return for each camera random residuals of its pixels, as they are if the model is right.
 
-    Raises numpy.linalg.LinAlgError where digits run out.
+    draws : the number of random draws.
+
+    Returns for each camera the indices (m,) of its pixels of bubbles among the observations of
+    the problem, and their residuals (m, 2, draws) in standard deviations. They are the pixels in
+    the inner part of the stretch that the fit has not rejected.
+
+    Raises numpy.linalg.LinAlgError if a matrix is singular in floating point.
     """
     graph, observed = solution.graph, solution.graph.problem.observations
     factors = all_factors(graph, solution.state, solution.weights, solution.sample_weights)

@@ -220,7 +220,7 @@ def _visible_pose(
             return pose
     raise InputError(
         f"no pose out of {_TRIES} shows {100 * config.visible_fraction:g} % of the dots",
-        todo="make the target smaller, or shift_mm, visible_fraction or border_px",
+        todo="choose a smaller target, or lower shift_mm, visible_fraction or border_px",
     )
 
 

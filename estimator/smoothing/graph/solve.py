@@ -262,7 +262,7 @@ def _solve(
         last = None if again or changed else last
     if last is None:
         for _ in range(_LAST_PASSES):
-            weights = robust.decided(weights, residuals)
+            weights, last = robust.decided(weights, residuals), None
             last = _linear_solve(graph, state, weights, samples)
             state = moved(graph, state, last.done.vector)
             residuals = pixel_residuals(graph, state)

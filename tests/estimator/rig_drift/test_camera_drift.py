@@ -364,7 +364,7 @@ def test_refused() -> None:
     with pytest.raises(InputError, match="prior standard deviations of a movement"):
         DriftPrior(rotation_rad=0.0)
     first, _ = rig()
-    with pytest.raises(CalibrationError, match="one line"):
+    with pytest.raises(CalibrationError, match="same line of sight"):
         drift_covariance((first, first), DriftPrior())
     cameras = rig()
     few = Run(frames=8).tracks(cameras, cameras, np.random.default_rng(0))

@@ -270,7 +270,7 @@ def test_frames_that_are_no_first_frames_are_refused(rise: Path, frames: str) ->
     command = ["track", str(rise / "runs" / "rise"), "--frames", frames, "--no-report"]
     answer = CliRunner().invoke(app, command)
     assert answer.exit_code == 2 and "->" in answer.stderr
-    assert frames in answer.stderr or "first 0 frames" in answer.stderr
+    assert frames in answer.stderr or "number of frames is 0" in answer.stderr
 
 
 def test_bubbles_are_looked_for_where_rig_toml_says(
@@ -336,7 +336,7 @@ def test_where_bubbles_are_looked_for_is_read_and_written(rise: Path, tmp_path: 
     for wrong, words in (
         ("[bubbles]\nregoin = [[1, 2]]", "region"),
         ("[bubbles.lefd]\nmask = 'm.png'", "no camera 'lefd'"),
-        ("[bubbles]\nregion = [[1], [2, 3]]", "corners in px"),
+        ("[bubbles]\nregion = [[1], [2, 3]]", "corners (u, v) in px"),
         ("[bubbles]\nmask = 3", 'a file, like "mask.png"'),
     ):
         file.write_text(f"{text}\n{wrong}\n")

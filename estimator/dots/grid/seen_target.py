@@ -20,6 +20,8 @@ _RATIOS = (1.0, 1.5, 2.0)
 """Ratios of the pitches of a grid that is looked for; one that is 30 % off is found, too."""
 _ENOUGH = 0.8
 """Share of the dots on a grid above which no other ratio of the pitches is tried."""
+_OBLIQUE = 0.25
+"""Cosine of the angle between rows and columns above which a grid is no rectangular one."""
 _LARGER = 1.12
 _LARGER_SD = 6.0
 _MOST_MARKS = 12
@@ -99,6 +101,7 @@ def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
     points = dots[["u_px", "v_px"]].to_numpy(float)
     shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
     lattice = _best_lattice(points, shapes)
+    _refuse_oblique(lattice)
     places = lattice.places
     occupied = np.zeros(places.max(axis=0) + 3, bool)
     occupied[tuple((places + 1).T)] = True
@@ -141,6 +144,17 @@ def _best_lattice(points: Array, shapes: Array) -> Lattice:
         assert failure is not None
         raise failure
     return max(found, key=lambda lattice: len(lattice.index))
+
+
+def _refuse_oblique(lattice: Lattice) -> None:
+    """Raise DetectionError if round dots show that rows and columns do not cross at 90 degrees."""
+    shape = np.median(lattice.shape, axis=0)
+    cosine = abs(float(shape[0, 1])) / np.sqrt(shape[0, 0] * shape[1, 1])
+    if cosine > _OBLIQUE:
+        raise DetectionError(
+            f"the rows of dots cross at {np.rad2deg(np.arccos(cosine)):.0f} degrees, not at 90; "
+            'describe such a plate by the places of its dots: layout = "points", points_mm = ...'
+        )
 
 
 def _is_whole(

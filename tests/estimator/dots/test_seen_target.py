@@ -116,3 +116,16 @@ def test_folders_without_a_target(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "noise.png"), noise)
     with pytest.raises(DetectionError, match="no image shows a grid of dots"):
         target_from_images(tmp_path, pitch_mm=None, scale_px_per_mm=1.0)
+
+
+def test_a_hexagonal_grid_is_not_proposed_as_a_square_one(tmp_path: Path) -> None:
+    """It was, with the corners of the hexagon as missing dots."""
+    image = np.full((520, 520), 30, np.uint8)
+    for row in range(-3, 4):
+        for column in range(-3, 4):
+            place = np.array([column + row / 2.0, row * np.sqrt(0.75)]) * 56.0 + 260.0
+            if abs(row + column) <= 3:
+                cv2.circle(image, tuple(np.round(16 * place).astype(int)), 160, 210, -1, 16, 4)
+    cv2.imwrite(str(tmp_path / "plate.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
+    with pytest.raises(DetectionError, match=r"cross at 60 degrees.*points_mm"):
+        target_from_images(tmp_path, pitch_mm=7.0, scale_px_per_mm=1.0)

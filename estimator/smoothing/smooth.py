@@ -429,7 +429,8 @@ def _log_evidence(problem: SmoothingProblem) -> float:
     part = cut_out(problem, first, first + _MOST_COMPARED, most_bubbles=_BUBBLES_COMPARED).problem
     sensors = tuple(near_frames(s, part.t_s) for s in part.accelerometers)
     part = replace(part, accelerometers=thinned(sensors, _COARSE_STEP_S))
-    return solve(part, default_model(part), Options(covariances=False)).log_evidence
+    options = Options(covariances=False, robust=False)
+    return solve(part, default_model(part), options).log_evidence
 
 
 def _smoothing_words(problem: SmoothingProblem) -> str:

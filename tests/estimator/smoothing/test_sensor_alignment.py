@@ -151,8 +151,9 @@ def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
 def test_an_arm_is_blamed_only_where_all_measurements_tell_it_from_the_other(
     scenario: str, seed: int, information: str, blamed: str
 ) -> None:
-    """In S1 one bubble tells too little of the left arm's motion along x: both arms are named. Marks
-    that contradict the arm are no outliers.
+    """In S1 one bubble tells too little of the left arm's motion along x: both arms are named.
+
+    Marks that contradict the arm are no outliers.
     """
 
     def turned(name: str, t: Any, reading: Any) -> Any:

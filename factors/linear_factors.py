@@ -131,9 +131,11 @@ def product(factors: Sequence[LinearFactors], starts: Ints, values: Array) -> li
 def transposed_product(
     factors: Sequence[LinearFactors], starts: Ints, values: Sequence[Array]
 ) -> Array:
-    """Return the product (D, K) of the factors' transposed Jacobians and K vectors.
+    """Return the product A^T y (D, K) of the factors' transposed Jacobians and K vectors.
 
-    starts : as in `product`. values : for each element of ``factors`` the vectors (M, rows, K).
+    starts : for each key, counted from 0, the row of the result at which its variable begins.
+    values : for each element of ``factors`` the vectors y (M, rows, K), for its M factors of
+        ``rows`` residuals each.
     """
     out = np.zeros((int(starts[-1]), values[0].shape[-1]))
     for linear, given in zip(factors, values):

@@ -51,7 +51,7 @@ class Wall:
 
     @property
     def ratios(self) -> tuple[float, float]:
-        """Refractive index on the camera's side over that of the glass, and over that behind it."""
+        """Ratios of refractive indices: camera's side to glass, camera's side to tank's side."""
         return self.indices[0] / self.indices[1], self.indices[0] / self.indices[2]
 
     @property

@@ -94,7 +94,8 @@ def accelerometer(
     ],
     sensor: Annotated[str, typer.Option(help="Name of the sensor in rig.toml.")],
     channels: Annotated[
-        str | None, typer.Option(help="Names or numbers (from 0) of x, y and z: 'ch1,ch2,ch3'.")
+        str | None,
+        typer.Option(help="Channels of x, y and z, by name or by number from 0: ch1,ch2,ch3."),
     ] = None,
     time: Annotated[
         str | None, typer.Option(help="Name or number (from 0) of the channel of times.")

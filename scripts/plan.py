@@ -29,7 +29,7 @@ def plan(
     zigzag_mm: Annotated[float, typer.Option(help="RMS of the zigzag in mm.")] = 1.4,
     shake_hz: Annotated[float, typer.Option(help="Frequency of the rig's shake in Hz.")] = 20.0,
     shake_mm: Annotated[
-        float, typer.Option(help="RMS of the shake along the vertical in mm; half as much across.")
+        float, typer.Option(help="RMS of the shake in mm, vertical; each horizontal axis has half.")
     ] = 0.15,
     marks: Annotated[
         int, typer.Option(help="Number of marks in each view that are fixed to the tank.")

@@ -602,9 +602,9 @@ def derivatives(
 def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
     """Return a state in closed form from which `fit` can start.
 
-    The dots are triangulated. The slope is a median over pairs of views, and the target is fitted
-    to the median position of each dot. Raises CalibrationError if no dot is seen by two cameras at
-    two positions.
+    The dots are triangulated. The travel (mm along the rig's axes for each mm of the encoder) is a
+    median over pairs of views, and the target is fitted to the median position of each dot. Raises
+    CalibrationError if no dot is seen by two cameras at once at two positions of the stage.
     """
     ids = np.unique(dots.place_mm, axis=0, return_inverse=True)[1].reshape(-1)
     keys = dots.view * (ids.max() + 1) + ids
@@ -632,7 +632,7 @@ def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
     every = np.concatenate(slopes)
     if not len(every):
         raise CalibrationError(
-            "no dot is seen by two cameras at two positions",
+            "no dot is seen by two cameras at once at two or more positions of the stage",
             where="stage_axis",
             todo="keep the target in the images of two cameras while the stage travels",
         )

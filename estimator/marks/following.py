@@ -127,13 +127,15 @@ _TOO_MANY_LOST = 2
 
 @dataclass
 class Mark:
-    """A dot of the strip that is fixed to the tank.
+    """A dot, fixed to the tank, that one camera follows.
 
-    number : a name of its own. place_mm : (2,) on the tank, see `TankView`.
-    epoch : index of the part of the run in which it is followed without a break.
-    last_frame : the last frame in which it was measured. sightings : number of such frames.
-    low_px, high_px : (2,) smallest and largest pixel coordinates at which it was measured.
-    left_out : number of frames in which it was not measured, by reason.
+    number : identifies the mark within the camera.
+    place_mm : (2,) on the tank, see `TankView`.
+    epoch : index of the part of the run in which the mark is followed without a break.
+    last_frame : the last frame in which it was measured.
+    low_px, high_px : (2,) smallest and largest u and v at which it was measured.
+    sightings : number of frames in which it was measured.
+    left_out : number of frames in which it was not measured, for each reason.
     """
 
     number: int

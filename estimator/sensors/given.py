@@ -365,7 +365,7 @@ def _axes(axes: Any, where: str) -> Array:
         raise InputError("axes has a row that is no direction", where=where, todo=todo)
     rows = rows / length
     if abs(np.linalg.det(rows)) < _PLANE:
-        raise InputError("axes has rows that lie (nearly) in one plane", where=where, todo=todo)
+        raise InputError("the three rows of axes lie (nearly) in one plane", where=where, todo=todo)
     return np.asarray(rows)
 
 

@@ -239,7 +239,7 @@ def longest(every: Sequence[Seen], count: int) -> list[Seen]:
     if not order:
         most = max(mark.frames for mark in every)
         raise InputError(
-            f"no mark is seen in {FEWEST_FRAMES} frames, the longest in {most}",
+            f"no mark is seen in {FEWEST_FRAMES} frames or more, the most frequent one in {most}",
             where="references.csv",
             todo="let the stage travel more slowly, or follow the marks longer",
         )
@@ -344,10 +344,13 @@ def _solution(found: Smoothing) -> Solution:
 def judged(
     mark: Seen, rest: Rest, found: Smoothing, motion: Motion, cameras: Sequence[Camera]
 ) -> WithheldMark:
-    """Compare the smoothed path of a mark with the motion that it was given.
+    """Return errors and NEES of the smoothed path of a withheld mark.
 
-    The mean of the path is subtracted, because the mark's place is not known; this makes NEES of
-    the position a little too small.
+    The true path is ``motion``, which was added to the mark's pixels. The mean of the path is
+    subtracted, because the mark's place is not known; this makes NEES of the position a little too
+    small.
+
+    rest : which measurements the smoothing used besides. found : the result of the smoothing.
     """
     solution = _solution(found)
     graph, covariances = solution.graph, solution.covariances

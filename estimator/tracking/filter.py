@@ -612,10 +612,10 @@ class Common:
         return self.covariance[POSITION, POSITION]
 
     def predicted(self, step: Transition) -> Common:
-        """Return the common error that is expected in the next frame, before its measurements.
+        """Return the error that all tracks share in the next frame, before its measurements.
 
-        The shift is 0: the tracks have taken over the last one. The covariance has grown by the
-        noise of the transition.
+        Its mean is 0, because the last estimate has been added to the tracks' states. Its
+        covariance has grown by the noise of the transition.
         """
         grown = step.matrix @ self.covariance @ step.matrix.T + step.common_noise
         return Common(np.zeros(STATES), grown)

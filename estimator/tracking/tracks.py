@@ -155,7 +155,8 @@ def open_tracks(folder: str | Path) -> Tracks | StoredTracks:
 
 
 def open_track_table(file: Path) -> pd.DataFrame | StoredTracks:
-    """Read a table as `read_track_table` does; a large one stays on disk."""
+    """Read a table as `read_track_table` does; of a large file return a `StoredTracks`, which reads
+    the rows of single frames when they are needed."""
     table = FrameTable.of(file, partial(_read_part, file, TRACK_COLUMNS), _unseen)
     return read_track_table(file) if table is None else StoredTracks("", table, None)
 

@@ -162,9 +162,10 @@ def _left(
 def settled(fitted: Outlines, rims: Rims) -> Outlines:
     """Return the fitted outlines of N rims, corrected where neighbours have misled the fits.
 
-    A fit that ended far from its rim, misses it or saw little of it gives way to the ellipse along
-    the rim, with its covariance. Where both are sound but disagree by more than that allows, the
-    disagreement is added to the fit's covariance.
+    A rim is the closed path along which the image gets brighter outwards. A fit whose centre or
+    size is far from those of its rim, or that rests on a small part of the outline, is replaced by
+    the ellipse through the rim, with its covariance. Where both are sound but differ by more than
+    that covariance allows, the difference is added to the covariance of the fit.
     """
     radius = np.sqrt(rims.ellipse[:, 2] * rims.ellipse[:, 3])
     away = fitted.ellipse[:, :2] - rims.ellipse[:, :2]

@@ -81,7 +81,8 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
 
     dots_mm : (N, 3) positions of the target's N dots in its frame. unknown_dots : whether these are
     only estimates; then more views are needed.
-    Returns tilts and notes about what will be poorly determined. Raises CalibrationError for too
+    Returns the target's tilt against each camera in degrees, by (view, camera), and notes about
+    what will be poorly determined. Raises CalibrationError for too
     few views, too few dots or parallel views, and DetectionError for mirrored images of a target
     that is visible from one side only.
     """
@@ -348,8 +349,8 @@ def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:
             share = sd[i] / prior[INDEX[name]]
             if share > 0.5:
                 out.append(
-                    f"{_parameter_words(name)} of camera {camera.name!r} is not determined by "
-                    f"these views (its standard deviation is {share:.0%} of the prior's)"
+                    f"{_parameter_words(name)} of camera {camera.name!r} is hardly determined by "
+                    f"these views: its standard deviation is {share:.0%} of that before the fit"
                 )
     return out + _correlated(names, covariance)
 

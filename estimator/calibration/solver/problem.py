@@ -148,7 +148,7 @@ class Problem:
         return self._rows(keep, whitener)
 
     def unweighted(self) -> Observations:
-        """Return all measurements; their whitening matrices do not contain the weights."""
+        """Return all measurements, whitened by their noise alone, without the robust weights."""
         whitener = whitening(self.covariance_px2)
         return self._rows(np.ones(len(self.view), bool), whitener)
 

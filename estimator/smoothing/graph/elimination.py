@@ -149,7 +149,7 @@ def eliminate(
     except RuntimeError as error:
         raise CalibrationError(
             f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
-            todo="check the priors: every component needs a positive intensity",
+            todo="check the shake model: the noise of every process has to be above 0",
         ) from error
 
 

@@ -55,7 +55,10 @@ def prior_of(name: str) -> Prior:
 
 
 def value_of(model: ShakeModel, name: str) -> float:
-    """Return the number with that name. Raises InputError for an unknown name."""
+    """Return the hyper-parameter with a name of `names_of`, in the unit that the name ends in.
+
+    Raises InputError for an unknown name.
+    """
     found: Any = model
     if name == FORCE and model.force_hz is not None:
         return model.force_hz

@@ -258,7 +258,11 @@ def worst_rows(results: CalibrationResults) -> list[Row]:
 
 
 def change_rows(results: CalibrationResults) -> list[Row]:
-    """Return from comparison.json each quantity, its change with sd, and the change in sd."""
+    """Return a row for each quantity that comparison.json compares with an earlier calibration.
+
+    Its cells: the quantity, its change with standard deviation and unit, and the change divided by
+    that standard deviation.
+    """
     rows = []
     for change in results.comparison.changes:
         cells = (

@@ -152,7 +152,7 @@ def test_a_run_without_marks_is_refused(run: RunData, calibration: Calibration) 
         validate(replace(run, references=None), calibration)
     assert run.references is not None
     few = run.references[run.references["frame"] < 20]
-    with pytest.raises(InputError, match="no mark is seen in 30 frames, the longest in 20"):
+    with pytest.raises(InputError, match="in 30 frames or more, the most frequent one in 20"):
         validate(replace(run, references=few), calibration)
 
 

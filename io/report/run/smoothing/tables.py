@@ -154,9 +154,9 @@ def smoothing_figures(results: SmoothingResults) -> list[Figure]:
         Figure("Position, 1 sd", f"{_largest(place, 1e3)} µm", "smoothed, median, worst axis"),
         Figure("Velocity, 1 sd", f"{_largest(speed)} mm/s", "smoothed, median, worst axis"),
         Figure("Taken from positions", f"{_largest(away, 1e3)} µm",
-               "RMS of naive (triangulated, encoder added) minus smoothed, worst axis"),
+               "RMS of unsmoothed (triangulated plus encoder) less smoothed, worst axis"),
         Figure("Taken from velocities", f"{_largest(away_speed)} mm/s",
-               "RMS of naive (difference over two frames) minus smoothed, worst axis"),
+               "RMS of unsmoothed (difference over two frames) less smoothed, worst axis"),
         Figure("Shake", f"{number(None if worst is None else shake[worst], 3)} µm",
                f"RMS, largest: {where}"),
     ]  # fmt: skip

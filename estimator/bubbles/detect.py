@@ -23,10 +23,12 @@ from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
     Rejected,
+    confirmed_halves,
     dark_noise_share,
     find_blobs,
     implausible_parts,
     noise_share,
+    split_at_necks,
     split_blobs,
 )
 from telerig.estimator.bubbles.outline.crowds import resolved_crowd, settled
@@ -193,6 +195,16 @@ def _found(
     if parts:
         start = _start(parts, blobs, sigma, dark_sigma)
         outlines = fit_outlines(ratio, start, crowded=everywhere)
+        halves = split_at_necks(outlines, parts, blobs, image.shape, min_diameter_px)
+        while halves:
+            split = [new for k, part in enumerate(parts) for new in halves.get(k, [part])]
+            trial = _start(split, blobs, sigma, dark_sigma)
+            fitted = fit_outlines(ratio, trial, crowded=everywhere)
+            confirmed = confirmed_halves(halves, outlines, split, fitted)
+            if len(confirmed) == len(halves):
+                parts, start, outlines = split, trial, fitted
+                break
+            halves = confirmed
         merged = _merged(outlines, parts)
         known = np.flatnonzero(~merged & _known(outlines))
         ellipses = outlines.ellipse[known]

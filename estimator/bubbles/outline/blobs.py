@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     deepest_concavity,
+    outline_curvature,
     rough_distance,
 )
 from telerig.estimator.bubbles.outline.kernels import disc_counts, fitted_arcs
@@ -348,6 +349,15 @@ def _cut_closed(contour: Array, sense: float) -> list[Array]:
     return _trimmed(points, bounds)
 
 
+def _arcs_between(contour: Array, cuts: Array) -> list[Array]:
+    """Return the arcs of a closed outline (n, 2) between its points nearest to ``cuts`` (m, 2)."""
+    points = _spaced(contour, closed=True)
+    gap = np.hypot(*(points[:, None] - cuts[None]).transpose(2, 0, 1))
+    bounds = np.sort(np.argmin(gap, axis=0)).tolist()
+    points = np.roll(points, -bounds[0], axis=0)
+    return _trimmed(points, [k - bounds[0] for k in bounds] + [len(points)])
+
+
 def _cut_open(contour: Array, sense: float) -> list[Array]:
     if len(contour) < _SHORTEST_ARC:
         return []
@@ -392,6 +402,9 @@ concavities too, but then the outline's harmonics describe them."""
 _MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
 _LARGEST_GROWTH, _LONG = 1.6, 2.3
 _SHARPEST_ORDER, _WHOLE = 35.0, 0.9
+_FLAT, _BETTER = 0.35, 0.6
+"""Curvature (times the radius) of a neck's narrowest places, and the share of the whole's chi2_dof
+below which both halves have to be."""
 
 
 @dataclass(frozen=True)
@@ -450,7 +463,15 @@ def _split(
     """Ellipses (5,) that explain the outline ``contour`` and its arcs; [] if none do."""
     if not arcs or len(arcs) > _MAX_ARCS:
         return []
-    groups = _grouped(arcs, contour)
+    return _explained(_grouped(arcs, contour), contour, shape, min_diameter_px)
+
+
+def _explained(
+    groups: list[Array], contour: Array, shape: tuple[int, ...], min_diameter_px: float
+) -> list[Array]:
+    """Ellipses (5,) along groups of arcs that explain the outline; [] if they do not explain it."""
+    if not groups:
+        return []
     fitted, rms = fit_ellipses(groups)
     good = [
         ellipse
@@ -584,3 +605,49 @@ def implausible_parts(outlines: Outlines, parts: list[Part]) -> Bools:
     moved |= (jump > 0.3 * began[:, 3] + 1.0) | (ended[:, 2] > _LONG * ended[:, 3])
     moved &= np.array([part.shared for part in parts])
     return implausible_outlines(outlines) | moved
+
+
+def split_at_necks(
+    outlines: Outlines,
+    parts: list[Part],
+    blobs: list[Blob],
+    shape: tuple[int, ...],
+    min_diameter_px: float,
+) -> dict[int, list[Part]]:
+    """Return, by index of the part, the two halves of parts that are a whole region with a neck.
+
+    The fitted outline shows a neck where blur hides the notch in the region's raw outline.
+    """
+    alone = np.bincount([part.blob for part in parts]) == 1
+    necked = implausible_outlines(outlines) & (outlines.coverage > _WHOLE)
+    points, curvature = outline_curvature(outlines.ellipse, outlines.harmonics)
+    turn = curvature * np.sqrt(outlines.ellipse[:, 2:3] * outlines.ellipse[:, 3:4])
+    low = (turn < _FLAT) & (turn <= np.roll(turn, 1, axis=1)) & (turn < np.roll(turn, -1, axis=1))
+    halves = {}
+    for index in np.flatnonzero(necked & (np.count_nonzero(low, axis=1) == 2)).tolist():
+        blob = blobs[parts[index].blob]
+        if not alone[parts[index].blob] or blob.touches_border:
+            continue
+        arcs = _arcs_between(blob.contour_px, points[index][low[index]])
+        found = _explained(arcs, _in_image(blob), shape, min_diameter_px)
+        if len(found) == 2:
+            halves[index] = [Part(e, parts[index].blob, shared=True) for e in found]
+    return halves
+
+
+def confirmed_halves(
+    halves: dict[int, list[Part]], before: Outlines, parts: list[Part], after: Outlines
+) -> dict[int, list[Part]]:
+    """Return those halves of `split_at_necks` that both fit far better than the whole did.
+
+    before : outlines of the parts before they were split.
+    parts, after : all parts after that, and their outlines.
+    """
+    sound = ~implausible_parts(after, parts)
+    better = {}
+    for index, found in halves.items():
+        own = [k for k, part in enumerate(parts) if part.blob == found[0].blob]
+        limit = _BETTER * before.chi2_dof[index]
+        if all(sound[k] and after.chi2_dof[k] < limit for k in own):
+            better[index] = found
+    return better

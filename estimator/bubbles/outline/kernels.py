@@ -64,6 +64,8 @@ class Rims(NamedTuple):
     noise_outer, noise_inner : (B,) standard deviation of a pixel's noise outside and inside.
     spread : (B,) prior standard deviation of the harmonics, as a share of the radius; at most
         ``HELD`` if they are not to be fitted.
+    flattening : (B, 2) prior mean of (a - b) / (a + b) times cosine and sine of twice the angle.
+    flattening_spread : (B,) its prior standard deviation; infinite for none.
     """
 
     ellipse: Array
@@ -75,6 +77,8 @@ class Rims(NamedTuple):
     noise_outer: Array
     noise_inner: Array
     spread: Array
+    flattening: Array
+    flattening_spread: Array
 
 
 class Fits(NamedTuple):
@@ -537,6 +541,20 @@ def _with_prior(total: Array, rims: Rims, b: int, levels: Array, shifts: Array) 
         for i in range(FIRST_HARMONIC, last):
             total[i, i] += weight
             total[last, i] -= weight * shifts[i + ELLIPSE - FIRST_HARMONIC]
+    radius = np.sqrt(rims.ellipse[b, 2] * rims.ellipse[b, 3])
+    weight = 1.0 / (rims.flattening_spread[b] * radius) ** 2
+    cos, sin = np.cos(2.0 * rims.ellipse[b, 4]), np.sin(2.0 * rims.ellipse[b, 4])
+    along = rims.flattening[b, 0] * cos + rims.flattening[b, 1] * sin
+    across = rims.flattening[b, 1] * cos - rims.flattening[b, 0] * sin
+    half = (rims.ellipse[b, 2] + shifts[2] - rims.ellipse[b, 3] - shifts[3]) / 2.0
+    miss = weight * (half - radius * along) / 2.0
+    total[2, 2] += weight / 4.0
+    total[3, 3] += weight / 4.0
+    total[3, 2] -= weight / 4.0
+    total[4, 4] += weight
+    total[last, 2] -= miss
+    total[last, 3] += miss
+    total[last, 4] -= weight * (shifts[4] - radius * across)
 
 
 @compiled

@@ -23,6 +23,7 @@ import numpy as np
 from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.bubbles.outline import kernels
 from telerig.estimator.bubbles.outline.ellipse_geometry import Index, moved, turned_harmonics
+from telerig.statistics import robust_sd
 
 _NODES = 96
 
@@ -91,6 +92,52 @@ _WIDENED = 1.5
 _ENOUGH_WHOLE = 4
 
 
+_UNLEARNT_FLATTENING, _LEAST_FLATTENING = 0.08, 0.01
+"""The same two for the flattening (a - b) / (a + b)."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Hold what is known of B outlines before the fit.
+
+    harmonics : (B,) standard deviation of the harmonics' coefficients, as a share of the radius.
+    flattening : (B, 2) mean of (a - b) / (a + b) times cosine and sine of twice the angle.
+    flattening_spread : (B,) standard deviation of both; infinite for none.
+    """
+
+    harmonics: Array
+    flattening: Array
+    flattening_spread: Array
+
+    @staticmethod
+    def weak(harmonics: Array) -> Prior:
+        """Return the prior that says nothing of the flattening."""
+        count = len(harmonics)
+        return Prior(harmonics, np.zeros((count, 2)), np.full(count, np.inf))
+
+    def taken(self, index: Index) -> Prior:
+        """Return that of the outlines at the positions ``index``."""
+        return Prior(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+def learnt_prior(outlines: Outlines, partial: Bools, *, flattening: bool) -> Prior:
+    """Return for partly hidden outlines the shapes of the frame's whole ones, else a weak prior.
+
+    partial : (B,) which outlines are partly hidden. flattening : whether it is learnt, too.
+    """
+    prior = Prior.weak(np.where(partial, learnt_spread(outlines), _FREE))
+    if flattening:
+        middle, spread = np.zeros(2), _UNLEARNT_FLATTENING
+        a, b, angle = outlines.ellipse[outlines.resolved & ~partial, 2:].T
+        if len(a) >= _ENOUGH_WHOLE:
+            share = ((a - b) / (a + b))[:, None]
+            own = share * np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], axis=1)
+            middle = np.median(own, axis=0)
+            spread = max(_WIDENED * float(robust_sd(own - middle)), _LEAST_FLATTENING)
+        prior.flattening[partial], prior.flattening_spread[partial] = middle, spread
+    return prior
+
+
 def learnt_spread(outlines: Outlines) -> float:
     """Return the prior standard deviation of partly hidden outlines' harmonics, in radii.
 
@@ -157,14 +204,12 @@ class RimState:
     outer: Array
     inner: Array
 
-    def rims(self, start: Start, spread: Array) -> kernels.Rims:
-        """Return the outlines as the fit takes them.
-
-        spread : (B,) prior standard deviation of the harmonics, as a share of the radius.
-        """
+    def rims(self, start: Start, prior: Prior) -> kernels.Rims:
+        """Return the outlines as the fit takes them."""
         every = (
             *(getattr(self, field.name) for field in fields(self)),
-            *(start.inner, start.sigma_outer, start.sigma_inner, spread),
+            *(start.inner, start.sigma_outer, start.sigma_inner),
+            *(prior.harmonics, prior.flattening, prior.flattening_spread),
         )
         return kernels.Rims(*(np.ascontiguousarray(values, np.float64) for values in every))
 
@@ -246,15 +291,16 @@ def fit_outlines(ratio: Float32, start: Start, *, crowded: bool = False) -> Outl
         start.inner,
     )
     state = _first_look(ratio, state, start)
-    fit = _refined(ratio, state, start, state, everyone, np.full(len(start), _FREE), crowded)
+    prior = Prior.weak(np.full(len(start), _FREE))
+    fit = _refined(ratio, state, start, state, everyone, prior, crowded)
     partial = fit.coverage < _WHOLE
     again = np.flatnonzero(partial | (fit.shift_px > _FAR_SHIFT_PX))
     for _ in range(2):
         if again.size == 0:
             break
-        prior = np.where(partial, learnt_spread(fit), _FREE)
+        prior = learnt_prior(fit, partial, flattening=not crowded).taken(again)
         near = _refined(
-            ratio, fit.state(again), start[again], fit.state(everyone), again, prior[again], crowded
+            ratio, fit.state(again), start[again], fit.state(everyone), again, prior, crowded
         )
         fit = fit.updated(again, near)
         again = again[near.shift_px > _FAR_SHIFT_PX]
@@ -280,7 +326,7 @@ def widened(fit: Outlines) -> Outlines:
 def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
     """Fit ellipse, blur and levels to some of the pixels in a narrow band at the rim."""
     everyone = np.arange(len(start))
-    rims = state.rims(start, np.zeros(len(start)))
+    rims = state.rims(start, Prior.weak(np.zeros(len(start))))
     found = kernels.fitted(
         ratio, profile_table(), rims, everyone, rims.ellipse, rims.sigma, _FIRST_STEPS, False
     )
@@ -293,17 +339,16 @@ def _refined(
     start: Start,
     everyone: RimState,
     own: Index,
-    prior: Array,
+    prior: Prior,
     crowded: bool,
 ) -> Outlines:
     """Fit the outlines of some bubbles with one linearisation.
 
     state, start : the bubbles to fit; own : their positions in ``everyone``.
     everyone : the outlines of all bubbles in the image.
-    prior : (B,) prior standard deviation of the harmonics, as a share of the radius.
     """
     resolved = state.ellipse[:, 3] > _RESOLVED_BLURS * state.sigma
-    rims = state.rims(start, np.where(resolved, prior, 0.0))
+    rims = state.rims(start, replace(prior, harmonics=np.where(resolved, prior.harmonics, 0.0)))
     table = profile_table()
     found = kernels.fitted(
         ratio, table, rims, own, everyone.ellipse, everyone.sigma, kernels.STEPS, crowded

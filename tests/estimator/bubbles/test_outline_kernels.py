@@ -75,7 +75,7 @@ def test_impossible_starts_end_without_a_covariance() -> None:
     ones = np.ones(4)
     rims = kernels.Rims(
         starts, np.zeros((4, 8)), np.array([1.0, 1, 1, np.nan]), ones, ones, ones, ones, ones,
-        np.full(4, 0.2),
+        np.full(4, 0.2), np.zeros((4, 2)), np.full(4, np.inf),
     )  # fmt: skip
     image = np.ones((100, 100), np.float32)
     found = kernels.fitted(

@@ -85,7 +85,7 @@ def test_models_by_camera(model: Any, names: tuple[str, ...]) -> None:
 @pytest.mark.parametrize(
     ("model", "words"),
     [
-        ("fisheye", r"unknown model 'fisheye'(.|\n)*auto, none, radial"),
+        ("fisheye", r"unknown model 'fisheye'(.|\n)*use auto, or one or more of none, radial"),
         ("left=brown,right=fisheye", "unknown model 'fisheye'"),
         ("top=brown", "camera 'top', which the rig does not have"),
         ("affine+tilt", "aspect and skew do the same as a tilted sensor"),

@@ -34,8 +34,8 @@ def test_images_under_the_names_of_other_views_are_refused(first: int, by: int, 
     with pytest.raises(CalibrationError) as caught:
         made.calibrate("radial")
     text = str(caught.value)
-    assert "images of camera 'right' are named wrongly" in text
-    assert f"{abs(by)} {'later' if by > 0 else 'earlier'} in the order" in text
+    assert "images of camera 'right' do not belong to the views whose names they have" in text
+    assert f"those {abs(by)} {'later' if by > 0 else 'earlier'} fit" in text
     assert "same file name" in text
 
 

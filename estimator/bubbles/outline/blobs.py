@@ -394,7 +394,8 @@ _MIN_EXPLAINED, _MIN_COVERED = 0.75, 0.88
 _MAX_ARCS = 24
 _LEAST_IN_IMAGE = 0.08
 _CANVAS_MARGIN_PX = 2
-"""Outline points on the image's edge are left out, which narrows the blob by this much."""
+"""Outline points on the image's edge are left out, which narrows the blob by this much: its rows
+and columns are continued so far beyond its bounding box."""
 
 _NECKS = ((0.03, 2.5), (0.3, 1.3), (1.5, 0.0))
 """Depth of a concavity and the chi2_dof above which it counts as a neck: strong shape modes have
@@ -563,8 +564,18 @@ def _dark(ellipse: Array, contour: Array, shape: tuple[int, ...]) -> bool:
     high = np.minimum(np.ceil(ellipse[:2] + ellipse[2]) + 1, shape[::-1]).astype(np.int64)
     if np.any(high <= low):
         return False
-    blob = cv2.dilate(_filled(contour, low, high), np.ones((2 * _CANVAS_MARGIN_PX + 1,) * 2))
-    disc, dark = disc_counts(ellipse, low, blob)
+    first = np.floor(np.min(contour, axis=0)).astype(np.int64)
+    last = np.ceil(np.max(contour, axis=0)).astype(np.int64) + 1
+    blob = np.pad(_filled(contour, first, last), _CANVAS_MARGIN_PX, mode="edge")
+    first, last = first - _CANVAS_MARGIN_PX, last + _CANVAS_MARGIN_PX
+    begin, end = np.maximum(low, first), np.minimum(high, last)
+    if np.any(end <= begin):
+        return False
+    seen_blob = np.zeros((high - low)[::-1], np.uint8)
+    (left, top), (right, bottom) = begin - low, end - low
+    source = blob[begin[1] - first[1] : end[1] - first[1], begin[0] - first[0] : end[0] - first[0]]
+    seen_blob[top:bottom, left:right] = source
+    disc, dark = disc_counts(ellipse, low, seen_blob)
     seen = disc / (np.pi * ellipse[2] * ellipse[3])
     return bool(seen > _LEAST_IN_IMAGE and dark > _MIN_COVERED * disc)
 

@@ -184,7 +184,7 @@ def motion_correlation(
     known = there & carriage.known
     if not known.any():
         return None
-    acceleration, felt = carriage.values[known, 0], sensed[known]
-    acceleration, felt = acceleration - acceleration.mean(), felt - felt.mean(0)
-    size = np.sqrt((acceleration**2).sum() * (felt**2).sum(0))
-    return np.asarray(felt.T @ acceleration / size) if np.all(size > 0) else None
+    acceleration, sensed = carriage.values[known, 0], sensed[known]
+    acceleration, sensed = acceleration - acceleration.mean(), sensed - sensed.mean(0)
+    size = np.sqrt((acceleration**2).sum() * (sensed**2).sum(0))
+    return np.asarray(sensed.T @ acceleration / size) if np.all(size > 0) else None

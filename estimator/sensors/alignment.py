@@ -1,9 +1,9 @@
-"""Finds the offset of a clock: accelerometers against images and encoder, at every possible lag.
+"""Finds the offset of a sensor's clock by comparison with images and encoder at every possible lag.
 
-Each channel (the acceleration of a camera's images along one direction, or of the carriage) is
+Each channel (an acceleration of a camera's images along one direction, or of the carriage) is
 regressed on the readings of the sensors that explain it, at every lag at which the records overlap.
-The sum of the log-likelihood ratios over the channels has its peak at the offset. The regression
-has free coefficients, so a wrong unit or a wrong axis does not hide the peak.
+The offset is the lag with the largest sum of log-likelihood ratios over the channels. Because the
+regression coefficients are free, a wrong unit or axis does no harm.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.accelerations import Accelerations, Grid
 
-_CLEAR_NATS = 60.0
-_LEAST_NATS = 20.0
+_CLEAR_LOG_RATIO = 60.0
+_LEAST_LOG_RATIO = 20.0
 _MOST_OF_PEAK, _LESS_OF_PEAK = 0.7, 0.5
 """Largest share of the peak that other lags, or the reversed record, may reach. In the simulated
 runs without a connection 0.7 was never reached by both; see docs/decisions/025."""
@@ -28,7 +28,7 @@ _LONG_RECORD, _MOST_SENSORS = 200_000, 1
 _LEAST_OVERLAP = 0.3
 _LEAST_SAMPLES = 60
 _END_S = 0.005
-_RIPPLE_NATS = 0.5
+_RIPPLE_LOG_RATIO = 0.5
 _MOST_LAG_SHARE = 0.25
 _ORDER = 16
 _RIDGE = 1e-5
@@ -36,9 +36,11 @@ _RIDGE = 1e-5
 
 @dataclass(frozen=True)
 class Channel:
-    """An acceleration that images show, and that some sensors have to explain.
+    """An acceleration that some sensors have to explain.
 
-    values, known : (n,) acceleration in mm/s^2 on the grid of the images, and whether it is known.
+    name : for messages.
+    values : (n,) acceleration in mm/s^2 on the grid of the images.
+    known : (n,) whether it is known.
     sensors : indices of the sensors whose readings explain it.
     """
 
@@ -53,7 +55,10 @@ class Channel:
         at: int,
         whitening: Array | None = None,
     ) -> tuple[Array, Array]:
-        """Return known values (m,) and their fit at a lag, means removed, whitened if wanted."""
+        """Return the known values (m,) and their fit at a lag, both without means.
+
+        whitening : filter that is applied to both first, or None.
+        """
         x = np.concatenate([readings[s].values for s in self.sensors], axis=1)
         index = np.arange(len(self.values)) + at - (len(self.values) - 1)
         inside = (index >= 0) & (index < len(x)) & self.known
@@ -67,54 +72,61 @@ class Channel:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The offset of a clock: a sample with the time stamp t was measured at t - offset_s.
+    """The offset of a clock: a sample with time stamp t was measured at t - offset_s.
 
-    The offset is the lag at which the readings explain the images best.
-
-    sd_s : standard deviation of the offset; it includes how far the channels disagree.
-    nats : log-likelihood ratio at the best lag, relative to no connection between the records.
-    runner_up_nats, runner_up_s : the same at the second-best lag, and this lag.
-    reversed_nats : the largest value with the record reversed in time, where chance alone acts.
-    at_zero_nats : the largest value at lags that are possible if the clock is that of the frames.
-    at_end : whether the best lag is at the end of the lags that were tried.
-    explained : by channel, the share of its variance that the sensors explain at the best lag.
-    lags_s, lag_nats : all lags, and the log-likelihood ratio at each; -inf if it was not tried.
+    offset_s : the lag at which the readings explain the images best.
+    sd_s : its standard deviation, which includes the disagreement of the channels.
+    log_ratio : log-likelihood ratio at this lag to the hypothesis of unrelated records.
+    runner_up_log_ratio, runner_up_s : the same at the second-best lag, and this lag.
+    reversed_log_ratio : the largest value with the record reversed in time, which is due to chance.
+    at_zero_log_ratio : the largest value at lags that are possible for the clock of the frames.
+    at_end : whether the best lag is the first or the last one that was tried.
+    explained : {channel: share of its variance that the sensors explain at the best lag}.
+    lags_s, lag_log_ratio : all lags, and the log-likelihood ratio at each; -inf if not tried.
     """
 
     offset_s: float
     sd_s: float
-    nats: float
-    runner_up_nats: float
+    log_ratio: float
+    runner_up_log_ratio: float
     runner_up_s: float
-    reversed_nats: float
-    at_zero_nats: float
+    reversed_log_ratio: float
+    at_zero_log_ratio: float
     at_end: bool
     explained: dict[str, float]
     lags_s: Array
-    lag_nats: Array
+    lag_log_ratio: Array
 
     @property
     def connected(self) -> bool:
         """Whether the record explains the images clearly better than the reversed record does."""
-        return self.nats > _LEAST_NATS and self.reversed_nats < _MOST_OF_PEAK * self.nats
+        return (
+            self.log_ratio > _LEAST_LOG_RATIO
+            and self.reversed_log_ratio < _MOST_OF_PEAK * self.log_ratio
+        )
 
     @property
     def unique(self) -> bool:
-        """Whether there is only one lag at which the record explains the images."""
-        alone = self.runner_up_nats < _MOST_OF_PEAK * self.nats
+        """Whether the images can be explained at one lag only."""
+        alone = self.runner_up_log_ratio < _MOST_OF_PEAK * self.log_ratio
         return self.connected and alone and not self.at_end
 
     @property
     def clear(self) -> bool:
-        """Whether the connection is so clear that the clock of an encoder, which is expected to be
-        that of the frames, is said to be wrong."""
-        others = max(self.runner_up_nats, self.reversed_nats)
-        return self.unique and self.nats > _CLEAR_NATS and others < _LESS_OF_PEAK * self.nats
+        """Whether the alignment is significant enough to reject the stated clock of an encoder."""
+        others = max(self.runner_up_log_ratio, self.reversed_log_ratio)
+        return (
+            self.unique
+            and self.log_ratio > _CLEAR_LOG_RATIO
+            and others < _LESS_OF_PEAK * self.log_ratio
+        )
 
     @property
     def at_zero(self) -> bool:
-        """Whether the data connect at the clock of the frames, and nowhere clearly better."""
-        return self.connected and self.at_zero_nats > _MOST_OF_PEAK * self.nats
+        """Whether the record explains the images at the clock of the frames, and at no lag clearly
+        better.
+        """
+        return self.connected and self.at_zero_log_ratio > _MOST_OF_PEAK * self.log_ratio
 
 
 def align(
@@ -122,10 +134,12 @@ def align(
 ) -> Alignment | None:
     """Return the offset of the clock of one or more sensors from the clock of the frames.
 
-    frames : the grid of the channels. channels : accelerations that the images show. readings : of
-    the sensors, on one grid with the same steps. near_s : largest offset that still counts as the
-    clock of the frames.
-    Returns None if the records do not overlap enough to try any lag.
+    frames : time grid of the channels.
+    channels : accelerations that the sensors have to explain.
+    readings : smoothed readings of each sensor, on one grid with the same steps.
+    near_s : largest offset that still counts as the clock of the frames.
+
+    Returns None if the records do not overlap enough for any lag.
     """
     own = readings[0].grid
     shift = round((frames.start_s - own.start_s) / frames.step_s)
@@ -170,7 +184,7 @@ def align(
 
 @dataclass(frozen=True)
 class _Profile:
-    """A channel's explained share of variance, and the overlap, for each lag (lags,)."""
+    """Explained share of a channel's variance, and overlap, at each lag (lags,)."""
 
     channel: Channel
     explained: Array
@@ -220,13 +234,13 @@ class _Profile:
         return cls(channel, np.clip(share, 0.0, 1 - 1e-6), overlap, whitening)
 
     def effective_size(self, readings: Sequence[Accelerations], at: int) -> float:
-        """Return the number of independent samples that the regression at a lag has."""
+        """Return the effective number of independent samples of the regression at a lag."""
         y, fit = self.channel.fitted(readings, at, self.whitening)
         return effective_size(y - fit, fit)
 
 
 def filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bools]:
-    """Return filtered columns (n, D), and where all samples under the filter are known (n,)."""
+    """Filter columns (n, D); also return where all samples under the filter are known (n,)."""
     reach = len(whitening) - 1
     out = np.stack([np.convolve(c, whitening)[: len(c)] for c in values.T], -1)
     unknown = np.convolve(~known, np.ones(reach + 1))[: len(known)] > 0.5
@@ -235,7 +249,7 @@ def filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bool
 
 
 def effective_size(residual: Array, fit: Array) -> float:
-    """Return the number of independent samples that a regression of n samples has.
+    """Return the effective number of independent samples of a regression with n samples.
 
     It is n over the sum of the products of the autocorrelations of residual and fit (Bartlett, J.
     R. Stat. Soc. Suppl. 8:27, 1946).
@@ -248,8 +262,10 @@ def effective_size(residual: Array, fit: Array) -> float:
 
 
 def whitening_filter(residual: Array) -> Array:
-    """Return the filter that makes a residual white: of an autoregression (Yule, Phil. Trans. R.
-    Soc. A 226:267, 1927). Regression of what it returns is generalised least squares.
+    """Return the prediction-error filter of a residual, by an autoregression (Yule-Walker).
+
+    Least squares on filtered data are generalised least squares (Yule, Phil. Trans. R. Soc. A
+    226:267, 1927).
     """
     from scipy.linalg import solve_toeplitz
 
@@ -295,7 +311,7 @@ def _lobe(total: Array, peak: int) -> slice:
             at += step
             if total[at] < total[lowest]:
                 lowest = at
-            elif total[at] > total[lowest] + _RIPPLE_NATS:
+            elif total[at] > total[lowest] + _RIPPLE_LOG_RATIO:
                 break
         ends.append(lowest)
     return slice(ends[0], ends[1] + 1)
@@ -304,16 +320,16 @@ def _lobe(total: Array, peak: int) -> slice:
 def _disagreement(
     profiles: Sequence[_Profile], sizes: Sequence[float], tried: Bools, place: float, reach: int
 ) -> float:
-    """Return by how much the channels' own peaks scatter more than their sds say, at least 1.
+    """Return the Birge ratio of the channels' own offsets, at least 1 (Phys. Rev. 40:207, 1932).
 
-    Birge, Phys. Rev. 40:207, 1932. Different low-pass filters of a sensor's axes do that.
+    Different low-pass filters of a sensor's axes make it larger than 1.
     """
     squares = []
     for profile, size in zip(profiles, sizes):
         own = _total([profile], [size], tried)
         low = max(round(place) - reach, 0)
         peak = low + int(np.argmax(own[low : round(place) + reach + 1]))
-        if own[peak] > _LEAST_NATS and abs(peak - round(place)) < reach:
+        if own[peak] > _LEAST_LOG_RATIO and abs(peak - round(place)) < reach:
             shift, sd = refined(own, peak)
             squares.append(((peak + shift - place) / sd) ** 2)
     if len(squares) < 2:
@@ -322,7 +338,7 @@ def _disagreement(
 
 
 def refined(total: Array, peak: int) -> tuple[float, float]:
-    """Return place and sd of the peak in steps, from a parabola through three values."""
+    """Return position and sd of a peak in steps, by a parabola through three values."""
     if not 0 < peak < len(total) - 1 or not np.isfinite(total[[peak - 1, peak + 1]]).all():
         return 0.0, float("inf")
     before, at, after = total[peak - 1 : peak + 2]

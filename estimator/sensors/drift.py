@@ -1,8 +1,7 @@
-"""Finds how much a clock gains on that of the frames: one straight line through the offsets of all
-parts of a run.
+"""Finds the drift of a clock: a straight line through its offsets in parts of a run.
 
-A part alone may fit the images best a period off. All parts lie on one line, so the sum of their
-log-likelihoods along every line decides, and not the best offset of each part.
+A single part may fit best at a lag that is wrong by one period of the shake. The line is therefore
+the one with the largest sum of the parts' log-likelihood ratios.
 """
 
 from __future__ import annotations
@@ -22,13 +21,14 @@ _REACH = 2
 def drift_of(
     middle_s: Array, parts: Sequence[Alignment], step_s: float, most: float
 ) -> tuple[float, float, float] | None:
-    """Return the offset and the drift of a clock from alignments of K parts of the record.
+    """Return offset and drift of a clock from alignments of K parts of a run.
 
-    Returns the offset in s at the mean of middle_s, the drift, and the standard deviation of the
-    drift; None if no drift fits all parts.
     middle_s : (K,) middle time of each part.
+    parts : K alignments, whose lags are multiples of ``step_s``.
+    most : largest absolute drift.
 
-    parts : K alignments, whose lags are multiples of step_s.  most : the largest absolute drift.
+    Returns the offset (s) at the mean of ``middle_s``, the drift, and the standard deviation of the
+    drift; None if no line fits all parts.
     """
     if len(parts) < LEAST_PARTS:
         return None
@@ -39,16 +39,16 @@ def drift_of(
     first = np.array([round(p.lags_s[0] / step_s) for p in parts])
     pad = count + _REACH
     start = int(first.min()) - pad
-    nats = np.zeros(
+    log_ratio = np.zeros(
         (len(parts), max(f + len(p.lags_s) for f, p in zip(first, parts)) + pad - start)
     )
-    for row, part, begin in zip(nats, parts, first - start):
-        row[begin : begin + len(part.lags_s)] = np.maximum(part.lag_nats, 0.0)
-    rows, inner = np.arange(len(parts))[:, None], np.arange(pad, nats.shape[1] - pad)
-    totals = [nats[rows, inner + s[:, None]].sum(0) for s in shifts]
+    for row, part, begin in zip(log_ratio, parts, first - start):
+        row[begin : begin + len(part.lags_s)] = np.maximum(part.lag_log_ratio, 0.0)
+    rows, inner = np.arange(len(parts))[:, None], np.arange(pad, log_ratio.shape[1] - pad)
+    totals = [log_ratio[rows, inner + s[:, None]].sum(0) for s in shifts]
     best, lag = np.unravel_index(int(np.argmax(totals)), (len(drifts), len(inner)))
     places, offsets, sds = [], [], []
-    for place, row, at in zip(tau, nats, inner[lag] + shifts[best]):
+    for place, row, at in zip(tau, log_ratio, inner[lag] + shifts[best]):
         peak = at - _REACH + int(np.argmax(row[at - _REACH : at + _REACH + 1]))
         shift, sd = refined(row, peak)
         if np.isfinite(sd):

@@ -29,15 +29,16 @@ def directions(camera: Camera) -> Array:
     return np.asarray(camera.camera_from_rig.rotation[:2])
 
 
-def frame_grid(t_s: Array, noise_mm: float, felt: Callable[[Grid], float] | None) -> Grid:
+def frame_grid(t_s: Array, noise_mm: float, sensed_rms: Callable[[Grid], float] | None) -> Grid:
     """Return the grid on which images and sensors are compared.
 
     Its smoothing kernel is the narrowest one with which the images' noise is below half the
     acceleration that the sensors measure.
 
-    t_s : (F,) times of the frames. noise_mm : standard deviation of the mean position in a frame.
-    felt : function from a grid to the RMS (mm/s^2) of the sensors' readings, smoothed with the
-    grid's kernel; None if there is no sensor, for a kernel of medium width.
+    t_s : (F,) times of the frames.
+    noise_mm : standard deviation of the mean position in a frame.
+    sensed_rms : function from a grid to the RMS (mm/s^2) of the sensors' readings, smoothed with
+        the grid's kernel; None without sensors, for a kernel of medium width.
     """
     pace = float(np.median(np.diff(t_s)))
     step = pace / np.ceil(pace / _COARSEST_STEP_S - 1e-9)
@@ -45,10 +46,10 @@ def frame_grid(t_s: Array, noise_mm: float, felt: Callable[[Grid], float] | None
     least = max(2, round(_LEAST_FRAMES * pace / step))
     knots = sorted({max(round(width / step), least) for width in _WIDTHS_S})
     grids = [Grid(float(t_s[0]), step, count, k) for k in knots]
-    if felt is None:
+    if sensed_rms is None:
         return grids[len(grids) // 2]
     for grid in grids:
-        if noise_mm * grid.noise_gain(pace) < _NOISE_SHARE * felt(grid):
+        if noise_mm * grid.noise_gain(pace) < _NOISE_SHARE * sensed_rms(grid):
             return grid
     return grids[-1]
 

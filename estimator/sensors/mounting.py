@@ -1,7 +1,7 @@
-"""Checks how sensors are mounted, in which unit they read, and what the encoder counts.
+"""Tests how sensors are mounted and in which unit they and the encoder read.
 
-All by the same regression as the clocks' (see ``alignment``), with the coefficients that the
-description states, against those that another mounting or another unit would give.
+The regression is that of the clocks (see ``alignment``). The coefficients that follow from the
+stated mounting and unit are compared with those of all other mountings.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.alignment import effective_size, filtered, whitening_filter
 
-CLEAR_NATS = 8.0
+CLEAR_LOG_RATIO = 8.0
 _SHIFTS = 24
 _CHANCE = 1.5
 _UPRIGHT_DEG = 30.0
@@ -25,13 +25,14 @@ _LEAST_SAMPLES = 60
 
 
 @dataclass(frozen=True)
-class Felt:
-    """An acceleration that the images show, and that a sensor should measure.
+class Expected:
+    """An acceleration that a sensor should measure, by images, encoder or other sensors.
 
-    direction : (3,) unit vector in the rig frame. values, known : (n,) acceleration in mm/s^2 along
-    it, and whether it is known.
-    whole : whether this is all of the sensor's acceleration along the direction, so that the gain
-    of the sensor follows from it; an arm also moves in ways that the images do not show.
+    direction : (3,) unit vector in the rig frame.
+    values : (n,) acceleration in mm/s^2 along it.
+    known : (n,) whether it is known.
+    whole : whether it is the sensor's complete acceleration along the direction, which then gives
+        the sensor's gain. That of the stage is not: an arm also moves relative to the stage.
     """
 
     direction: Array
@@ -42,33 +43,31 @@ class Felt:
 
 @dataclass(frozen=True)
 class Mounting:
-    """The axes of a sensor that fit best.
+    """The orientation of a sensor that fits best.
 
-    axes : (3, 3) whose rows are unit vectors in rig axes. clear : whether they fit clearly better
-    than the stated axes. lead_nats : log-likelihood ratio of these axes to the stated ones.
+    axes : (3, 3) whose rows are unit vectors in the rig frame.
+    clear : whether they fit clearly better than the stated axes.
+    lead : log-likelihood ratio of these axes to the stated ones.
     gain, gain_sd : reading divided by true acceleration, and its standard deviation; NaN and
-    infinity if the images show no acceleration.
+        infinity if the images show no acceleration.
     """
 
     axes: Array
     clear: bool
-    lead_nats: float
+    lead: float
     gain: float
     gain_sd: float
 
     @property
     def wrong_gain(self) -> bool:
-        """Whether the readings are clearly too large or too small for any usual scale error.
-
-        The regression's errors are those of 1 / gain; what images do not show has no gain.
-        """
+        """Whether the gain differs from 1 by clearly more than any usual scale error."""
         inverse, sd = 1 / self.gain, self.gain_sd / self.gain**2
         clear = inverse > _SDS * sd and abs(inverse - 1) > _SDS * sd
         return bool(clear and not _USUAL_GAIN[0] < self.gain < _USUAL_GAIN[1])
 
 
 def signed_permutations() -> Array:
-    """Return all exchanges and reversals of three axes, (48, 3, 3), the identity first."""
+    """Return all signed permutations of three axes (48, 3, 3), the identity first."""
     out = [
         np.eye(3)[list(order)] * np.array(signs)[:, None]
         for order in permutations(range(3))
@@ -78,15 +77,17 @@ def signed_permutations() -> Array:
 
 
 def mounting(
-    axes: Array, at_rest: Array, up: Array, x: Array, known: Bools, felt: Sequence[Felt]
+    axes: Array, at_rest: Array, up: Array, x: Array, known: Bools, expected: Sequence[Expected]
 ) -> Mounting:
-    """Return the sensor's axes and gain that agree best with gravity and with the images' motion.
+    """Return the axes and the gain of a sensor that agree best with gravity and expected motion.
 
-    The axes are sought among all exchanges and reversals of the stated ones.
+    All signed permutations of the stated axes are compared.
+
     axes : (3, 3) stated direction of each of the sensor's axes.
     at_rest : (3,) median reading, which has to point along up (3,).
-    x, known : (n, 3) readings at the times of the images, and (n,) whether there is one.
-    felt : the accelerations that the images show, each along one direction.
+    x : (n, 3) readings on the time grid of the expected accelerations.
+    known : (n,) whether there is a reading.
+    expected : the accelerations that the sensor should measure.
     """
     turned = np.swapaxes(signed_permutations(), -1, -2) @ axes
     forces = np.einsum("pij,i->pj", turned, at_rest)
@@ -96,7 +97,7 @@ def mounting(
         upright[:] = True
     candidates = turned[upright]
     stated = np.flatnonzero(np.abs(candidates - axes).max((1, 2)) < 1e-9)
-    parts = [p for f in felt if (p := _Part.of(f, x, known)) is not None]
+    parts = [p for f in expected if (p := _Part.of(f, x, known)) is not None]
     if not parts:
         found = axes if len(stated) else candidates[0]
         return Mounting(found, not len(stated), 0.0, float("nan"), float("inf"))
@@ -112,7 +113,7 @@ def mounting(
     both = candidates[[best, own]]
     chance = [float(np.ptp(_scores(both, parts, int(s)))) for s in shifts]
     lead = float(score[best] - score[own])
-    clear = best != own and lead > max(CLEAR_NATS, _CHANCE * max(chance))
+    clear = best != own and lead > max(CLEAR_LOG_RATIO, _CHANCE * max(chance))
     return Mounting(candidates[best], bool(clear), lead, gain, gain_sd)
 
 
@@ -125,18 +126,18 @@ class _Part:
     whole: bool
 
     @classmethod
-    def of(cls, felt: Felt, x: Array, known: Bools) -> _Part | None:
-        both = felt.known & known
+    def of(cls, expected: Expected, x: Array, known: Bools) -> _Part | None:
+        both = expected.known & known
         if np.count_nonzero(both) < _LEAST_SAMPLES:
             return None
-        y, x = felt.values - felt.values[both].mean(), x - x[both].mean(0)
+        y, x = expected.values - expected.values[both].mean(), x - x[both].mean(0)
         rest = y[both] - x[both] @ np.linalg.lstsq(x[both], y[both], rcond=None)[0]
         whole, used = filtered(np.column_stack([y, x]), both, whitening_filter(rest))
         if np.count_nonzero(used) < _LEAST_SAMPLES:
             return None
         y, x = whole[used, 0], whole[used, 1:]
         fit = x @ np.linalg.lstsq(x, y, rcond=None)[0]
-        return cls(felt.direction, y, x, effective_size(y - fit, fit), felt.whole)
+        return cls(expected.direction, y, x, effective_size(y - fit, fit), expected.whole)
 
 
 def _scores(candidates: Array, parts: Sequence[_Part], shift: int) -> Array:

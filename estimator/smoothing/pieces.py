@@ -221,10 +221,10 @@ class Constants:
         if len(shared[1]):
             at = shared[1]
             information = np.linalg.inv(covariance[np.ix_(at, at)]) - np.diag(self.prior[at])
-            told = np.linalg.solve(covariance[np.ix_(at, at)], mean[at])
-            told -= self.prior[at] * self.prior_mean[at]
+            right = np.linalg.solve(covariance[np.ix_(at, at)], mean[at])
+            right -= self.prior[at] * self.prior_mean[at]
             root = _root(information)
-            place = np.linalg.lstsq(information, told, rcond=1e-12)[0]
+            place = np.linalg.lstsq(information, right, rcond=1e-12)[0]
             known.append(Known((shared[0],), (root,), root @ place))
         for family, index, at in _in_turn(here, problem):
             given = [one for one in (shared, before) if one is not None and len(one[1])]

@@ -1,5 +1,5 @@
-"""The body of a bubble from its two outlines.
+"""Estimates the body of a bubble from its outlines in two views.
 
-In: the outlines of one bubble in two cameras. Out: the centre of its volume with covariance. Read
-``volume_centroid`` first.
+In: both outlines of each bubble. Out: its centre of volume and its spheroid, with covariances.
+Read ``volume_centroid`` first, then ``spheroid``.
 """

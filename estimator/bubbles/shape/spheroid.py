@@ -1,19 +1,19 @@
-"""Size, aspect ratio and axis of a bubble from its two outlines.
+"""Size, aspect ratio and pole of a bubble from its two outlines.
 
-An ellipsoid has six numbers. Each outline gives three, of which the extent along the shared
-coordinate is measured twice: two views determine five numbers. Bubbles are nearly spheroids, which
-have four. The body is therefore a spheroid times exp(t), where t, two numbers, is how unequal the
-two equatorial semi-axes are; its prior N(0, triaxial^2) is learned from all bubbles of a run
-(`learn_deviations`). The covariance then states what two views leave open, and 2 degrees of freedom
-test the spheroid.
+Two outlines determine five of an ellipsoid's six parameters: each gives three, and both measure the
+extent along the shared coordinate. A bubble is nearly a spheroid, which has four. The model is a
+spheroid with two additional numbers t, the logarithmic deviations of the equatorial semi-axes from
+each other. Their prior N(0, triaxial^2) is learned from all bubbles of a run (`learn_deviations`).
+The covariance then contains what two views do not determine, and a chi-square with 2 degrees of
+freedom tests the spheroid.
 
-In the unit circle of an outline, a deviation of the ellipse is a radial displacement
-g0 + g1 cos 2 phi + g2 sin 2 phi. White noise along the outline gives cos and sin of every order the
-same variance v, and g0 half of it; modes of degree 4 of the body do nearly the same (81/64 and
-45/16 of their variance), but these are correlated between the views. v is taken from the stated
-covariance of the centre, which is of order 1.
+An outline that is mapped to the unit circle by the axes of its ellipse deviates from another
+ellipse by a radial displacement g0 + g1 cos 2 phi + g2 sin 2 phi. White noise along the outline
+gives all coefficients of cos and sin the same variance v, and g0 half of it. Modes of degree 4 of
+the body do nearly the same (81/64 and 45/16 of their variance), but are correlated between the
+views. v follows from the stated covariance of the centre, which is of order 1.
 
-Two effects of second order make outlines larger than the volume: they are corrected, see `_best`
+Two effects of second order make outlines larger than the volume. They are corrected in `_best`
 (docs/decisions/037-bubbles-from-two-outlines.md).
 """
 
@@ -80,10 +80,11 @@ _LOOSE = np.array([0.0, 0.25, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class Deviations:
-    """How far the bubbles of a run are from spheroids, and their outlines from ellipses.
+    """Standard deviations of a run's bubbles from spheroids, and of their outlines from ellipses.
 
-    triaxial : standard deviation of both numbers t. excess : standard deviation of cos 2 phi and
-    sin 2 phi of an outline, relative to its radius, beyond its stated noise.
+    triaxial : of both numbers t.
+    excess : of the coefficients of cos 2 phi and sin 2 phi beyond the stated noise, relative to the
+        radius.
     pairs : number of pairs of outlines that were used.
     """
 
@@ -94,13 +95,15 @@ class Deviations:
 
 @dataclass(frozen=True)
 class Spheroids:
-    """M bodies, rig axes; NaN where an outline is missing, cut or covered.
+    """Fitted spheroids of M bubbles in the rig frame; NaN if an outline is missing or incomplete.
 
-    d_eq_mm, aspect : (M,) diameter of the sphere of equal volume; equatorial over polar semi-axis.
-    pole : (M, 3) unit vector of the polar axis; its sign means nothing.
-    frame : (M, 3, 3) columns: two equatorial axes, about whose turns `covariance` speaks, and pole.
+    d_eq_mm : (M,) diameter of the sphere of equal volume.
+    aspect : (M,) equatorial over polar semi-axis.
+    pole : (M, 3) unit vector along the polar axis, of arbitrary sign.
+    frame : (M, 3, 3) columns: two equatorial axes and the pole; ``lean_1`` and ``lean_2`` of
+        `PARAMETERS` are rotations of the pole about the equatorial axes.
     covariance : (M, 6, 6) of `PARAMETERS`.
-    chi2 : (M,) misfit of the spheroid itself, without t: 2 degrees of freedom.
+    chi2 : (M,) misfit of a spheroid with t = 0, with 2 degrees of freedom.
     """
 
     d_eq_mm: Array
@@ -112,19 +115,19 @@ class Spheroids:
 
     @property
     def equator_mm(self) -> Array:
-        """(M,) geometric mean of the two equatorial semi-axes."""
+        """Geometric mean of the two equatorial semi-axes (M,)."""
         return np.asarray(self.d_eq_mm / 2 * np.cbrt(self.aspect))
 
     @property
     def polar_mm(self) -> Array:
-        """(M,) polar semi-axis."""
+        """Polar semi-axis (M,)."""
         return np.asarray(self.equator_mm / self.aspect)
 
 
 def paired_outlines(
     first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
 ) -> tuple[Outlines, Outlines]:
-    """Return two detection tables as outlines; row i of both is one bubble."""
+    """Return the outlines of two detection tables, in which equal rows belong to one bubble."""
     left, right = (
         outlines_from_table(table, camera.image_size_px)
         for table, camera in zip((first, second), cameras)
@@ -139,12 +142,17 @@ def fit_spheroids(
     up: Array,
     deviations: Deviations | None = None,
 ) -> tuple[Spheroids, Deviations]:
-    """Bodies of M bubbles from their outlines in two cameras, and what was learned from them.
+    """Fit a spheroid to both outlines of each of M bubbles.
 
-    points_mm : (M, 3) where the bubbles are, in the rig frame. up : (3,) against gravity there. An
-    oblate body lying flat has the same two outlines as a prolate one on its side, between the
-    views; the one that is expected of a rising bubble is taken.
+    An oblate spheroid with vertical pole can have the same two outlines as a prolate one with
+    horizontal pole midway between the views; the one that is more probable for a rising bubble is
+    returned.
+
+    points_mm : (M, 3) positions of the bubbles in the rig frame.
+    up : (3,) unit vector against gravity in the rig frame.
     deviations : None to learn them from these outlines.
+
+    Returns the spheroids, and the deviations that were used.
     """
     good = np.flatnonzero(outlines[0].entire & outlines[1].entire & np.isfinite(points_mm).all(-1))
     sigma = learned_sigma(outlines)
@@ -166,9 +174,11 @@ def fit_spheroids(
 class _Views:
     """M pairs of outlines.
 
-    measure : (M, 6, 9) linear map from the nine moments A A^T of a body to g0, g1, g2 of its first
-    outline and of its second, in the unit circles of the measured ones. noise : two (M,), variance
-    of g1. ellipses : the pair in mm. rim_excess : (M,) of `rim_excess`.
+    measure : (M, 6, 9) linear map from the moments A A^T of a body to g0, g1, g2 of both outlines,
+        in the unit circles of the measured ones.
+    noise : two (M,) variances of g1.
+    ellipses : the pairs in mm.
+    rim_excess : (M,) see `rim_excess`.
     """
 
     measure: Array
@@ -192,16 +202,20 @@ class _Views:
         return _Views(measure, (noise[0], noise[1]), ellipses, rim_excess(pair, sigma))
 
     def extents(self) -> tuple[Array, Array]:
-        """(M,) log ratio of the extents along the shared coordinate, the variance that noise gives
-        it: along one direction a displacement is g0 plus a unit combination of g1 and g2, 3/2 v."""
+        """Return the log ratio (M,) of the extents along the shared coordinate, and its noise
+        variance.
+
+        A displacement along one direction is g0 plus a unit combination of g1 and g2, with variance
+        3/2 v.
+        """
         first, second = (np.log(m[..., 0, 0]) / 2 for m in self.ellipses.moments_mm2)
         return first - second, 1.5 * (self.noise[0] + self.noise[1])
 
     def precision(self, deviations: Deviations) -> Array:
-        """(M, 6, 6) inverse covariance of the deviations g of both outlines.
+        """Return the inverse covariance (M, 6, 6) of g of both outlines.
 
-        Extents that contradict each other show errors that were not stated, as of an outline that
-        is partly another bubble's.
+        If the two extents contradict each other, for example because part of an outline belongs to
+        another bubble, the noise is enlarged accordingly.
         """
         ratio, variance = self.extents()
         contradicted = ratio**2 > _CONTRADICTION**2 * (variance + 3 * deviations.excess**2)
@@ -211,8 +225,10 @@ class _Views:
         return np.asarray(np.linalg.inv(covariance))
 
     def deviation(self, moments: Array) -> Array:
-        """(M, 6) g of both outlines for bodies of these moments A A^T (M, 3, 3), or (M, 6, k) for k
-        changes of them (M, k, 3, 3)."""
+        """Return g of both outlines (M, 6) for bodies with moments A A^T (M, 3, 3).
+
+        For k changes of the moments (M, k, 3, 3) it returns (M, 6, k).
+        """
         if moments.ndim == 3:
             return np.asarray((self.measure @ moments.reshape(-1, 9, 1))[..., 0])
         return np.asarray(self.measure @ moments.reshape(*moments.shape[:2], 9).mT)
@@ -223,7 +239,10 @@ _ROUND = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0])
 
 
 def _moments(frame: Array, value: Array) -> Array:
-    """(M, 3, 3) A A^T of bodies: frame (M, 3, 3), value (M, 4) log size, log aspect, t."""
+    """Return the moments A A^T (M, 3, 3) of bodies.
+
+    frame : (M, 3, 3).  value : (M, 4) log size, log aspect ratio, t.
+    """
     size, aspect, t1, t2 = value.T
     t = np.hypot(t1, t2) + 1e-300
     even, odd = np.cosh(2 * t), np.sinh(2 * t) / t
@@ -236,7 +255,7 @@ def _moments(frame: Array, value: Array) -> Array:
 
 
 def _tangents(frame: Array, moments: Array) -> Array:
-    """(M, 6, 3, 3) derivative of the moments by the `PARAMETERS`; by t to first order."""
+    """Return derivatives (M, 6, 3, 3) of the moments by the `PARAMETERS`, for small t."""
     e1, e2, n = (frame[:, :, i] for i in range(3))
 
     def outer(a: Array, b: Array) -> Array:
@@ -255,7 +274,7 @@ def _tangents(frame: Array, moments: Array) -> Array:
 
 
 def _frame(pole: Array) -> Array:
-    """(M, 3, 3) right-handed frames whose third column is the pole (M, 3)."""
+    """Return right-handed frames (M, 3, 3) whose third column is the pole (M, 3)."""
     start = np.where(np.abs(pole[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
     first = start - pole * (start * pole).sum(-1, keepdims=True)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -264,7 +283,9 @@ def _frame(pole: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Fit:
-    """frame (M, 3, 3), value (M, 4) as `_moments` takes them; covariance (M, 6, 6); cost (M,)."""
+    """A fit of M bodies: frame (M, 3, 3), value (M, 4) of `_moments`, covariance (M, 6, 6), cost
+    (M,).
+    """
 
     frame: Array
     value: Array
@@ -273,7 +294,10 @@ class _Fit:
 
 
 def _fit(views: _Views, start: tuple[Array, Array, Array], deviations: Deviations) -> _Fit:
-    """Maximum a posteriori by Gauss-Newton steps. start : pole (M, 3), log size, log aspect."""
+    """Maximise the posterior by Gauss-Newton steps.
+
+    start : pole (M, 3), log size (M,), log aspect ratio (M,).
+    """
     pole, size, aspect = start
     frame = _frame(pole)
     value = np.stack([size, aspect, 0 * size, 0 * size], -1)
@@ -306,15 +330,18 @@ def _fit(views: _Views, start: tuple[Array, Array, Array], deviations: Deviation
 
 
 def _carried(frame: Array, pole: Array) -> Array:
-    """The frames turned the shortest way so that their third column is the pole."""
+    """Rotate frames by the smallest angle that makes their third column the pole."""
     first = frame[:, :, 0] - pole * (frame[:, :, 0] * pole).sum(-1, keepdims=True)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(pole, first), pole], -1)
 
 
 def _starts(ellipses: silhouette.EllipsePair) -> list[tuple[Array, Array, Array]]:
-    """(pole, log size, log aspect) of an oblate spheroid, of its mirror image about the shared
-    coordinate in the second view, and of a prolate one."""
+    """Return start values (pole, log size, log aspect ratio) of three local optima.
+
+    They are an oblate spheroid, its mirror image about the shared coordinate in the second view,
+    and a prolate spheroid.
+    """
     pole, moments = silhouette.oblate_spheroid(ellipses)
     pole = pole / np.linalg.norm(pole, axis=-1, keepdims=True)
     basis = np.stack([ellipses.shared, *ellipses.sides], -2)
@@ -330,8 +357,7 @@ def _starts(ellipses: silhouette.EllipsePair) -> list[tuple[Array, Array, Array]
 
 
 def _best(views: _Views, deviations: Deviations, up: Array) -> Spheroids:
-    """The most probable of the local optima; how far the others are from it is in its covariance,
-    by their probability."""
+    """Return the most probable local optimum; the covariance includes the others by probability."""
     fits = [_fit(views, start, deviations) for start in _starts(views.ellipses)]
     cost = np.stack([f.cost + _unusual(f, up) for f in fits])
     best = np.argmin(cost, 0)
@@ -366,7 +392,7 @@ def _best(views: _Views, deviations: Deviations, up: Array) -> Spheroids:
 
 
 def _unusual(fit: _Fit, up: Array) -> Array:
-    """(M,) what is expected of a bubble before it is seen, as a chi-square."""
+    """Return minus twice the log prior (M,) of aspect ratio and tilt, up to a constant."""
     aspect, upright = fit.value[:, 1], np.abs(fit.frame[:, :, 2] @ up)
     tilt = np.arccos(np.clip(upright, 0, 1))
     prolate = np.where(aspect < 0, _PROLATE_COST, 0.0)
@@ -374,8 +400,8 @@ def _unusual(fit: _Fit, up: Array) -> Array:
 
 
 def _spheroid_misfit(views: _Views, fit: _Fit, deviations: Deviations) -> tuple[Array, Array]:
-    """Chi-square (M,) of a spheroid with t = 0 near this fit, and how much it grows per unit of
-    the variance of t, (M,)."""
+    """Return the chi-square (M,) of a spheroid with t = 0, and its slope (M,) by the
+    variance of t."""
     weight = views.precision(deviations)
     value = fit.value * [1.0, 1.0, 0.0, 0.0]
     moments = _moments(fit.frame, value)
@@ -394,10 +420,13 @@ def _spheroid_misfit(views: _Views, fit: _Fit, deviations: Deviations) -> tuple[
 
 
 def learn_deviations(views: _Views, up: Array) -> Deviations:
-    """How far outlines are from those of ellipsoids, and bodies from spheroids: by moments.
+    """Learn from M pairs how far outlines deviate from ellipses, and bodies from spheroids.
 
-    The extents of an ellipsoid along the shared coordinate are the same in both views, so their
-    difference shows the outlines' errors alone. What spheroids then leave of the outlines shows t.
+    An ellipsoid has the same extent along the shared coordinate in both views, so that the
+    difference shows the errors of the outlines alone. The remaining misfit of spheroids then gives
+    the variance of t (method of moments).
+
+    up : (3,) unit vector against gravity in the rig frame.
     """
     count = len(views.noise[0])
     if count < _LEAST_FOR_LEARNING:
@@ -418,10 +447,10 @@ def learn_deviations(views: _Views, up: Array) -> Deviations:
 
 
 def _excess_variance(squares: Array, expected: Array, gain: Array) -> float:
-    """The variance s that explains squares (M,) of mean expected + gain s; 0 or more.
+    """Return the s >= 0 for which squares (M,) have the means expected + gain s.
 
-    Squares are weighted by their own variance; the largest are left out, as wrong pairs and
-    covered outlines make them.
+    Squares are weighted by the inverse of their variance. The largest 2 % are left out, because
+    wrong pairs and covered outlines cause them.
     """
     excess = 0.0
     for _ in range(20):
@@ -434,7 +463,7 @@ def _excess_variance(squares: Array, expected: Array, gain: Array) -> float:
 
 
 def _scattered(found: list[Spheroids], rows: NDArray[Any], count: int) -> Spheroids:
-    """Bodies in their rows among all, NaN in the others."""
+    """Return the spheroids in their rows of a longer array, NaN in the other rows."""
     parts = []
     for name in Spheroids.__annotations__:
         values = np.concatenate([getattr(piece, name) for piece in found])

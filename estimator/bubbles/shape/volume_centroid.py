@@ -1,13 +1,13 @@
-"""The centre of a bubble's volume from its two outlines.
+"""Centre of volume of a bubble from its two outlines.
 
-An outline's centre is not the volume's: a third-degree shape mode of 5 % moves it by up to 4 % of
-the radius. The outline's own third harmonics give part of that shift, see
-docs/decisions/007-volume-centroid.md.
+The centre of an outline is not the projected centre of volume: a third-degree shape mode of 5 % of
+the radius moves it by up to 4 % of the radius. The third harmonics of the outlines determine part
+of this displacement (docs/decisions/007-volume-centroid.md).
 
-Two models take the third-degree part of the body (even degrees leave the outlines' centres where
-the volume's is). `isotropic`: seven independent Gaussian coefficients; two views then determine the
-shift along the coordinate they share and leave the others open. `zonal`: one mode, axisymmetric
-about the axis of a spheroid; its one amplitude determines the whole shift.
+There are two models of the third-degree part of the shape; even degrees cause no displacement.
+`isotropic` has seven independent Gaussian coefficients, and two views determine the displacement
+along the shared coordinate only. `zonal` has one mode that is axisymmetric about the axis of a
+spheroid, and its amplitude determines the whole displacement.
 """
 
 from __future__ import annotations
@@ -38,14 +38,18 @@ from telerig.rig.triangulation import stacked_jacobian, triangulate
 
 @dataclass(frozen=True)
 class Views:
-    """What M pairs of outlines measure, relative to a point near the body.
+    """Measurements of M pairs of outlines, relative to a point near each body.
 
-    measured : (M, 8): pixel residuals of the first and the second view (2 + 2) and the coefficients
-    of cos 3 phi, sin 3 phi in both (2 + 2); noise : (M, 8, 8).  jacobian : (M, 8, 3) by the point
-    (zero for the coefficients).  axes_px : two (M, 2, 2) semi-axes.  sigma : (M,) prior standard
-    deviation of each coefficient of degree 3 (of unit mean square).  conversion_px : (M, 4) what
-    the pixel residuals hold beside the ellipses' centres; across_px : two (M, 2), the images of
-    motions across the shared coordinate, shared_px : two (M, 2), along it.
+    measured : (M, 8) pixel residuals (u, v) of the first and of the second view, then the
+        coefficients of cos 3 phi and sin 3 phi of both.
+    noise : (M, 8, 8) covariance.
+    jacobian : (M, 8, 3) derivative by the point (0 for the coefficients).
+    axes_px : two (M, 2, 2) semi-axes.
+    sigma : (M,) prior standard deviation of each coefficient of degree 3 (harmonics of unit mean
+        square).
+    conversion_px : (M, 4) the part of the pixel residuals that was added to the ellipses' centres.
+    across_px : two (M, 2) images of a motion across the shared coordinate.
+    shared_px : two (M, 2) images of a motion along it.
     """
 
     measured: Array
@@ -58,7 +62,7 @@ class Views:
     shared_px: tuple[Array, Array]
 
     def blind_px(self) -> Array:
-        """(M, 4): the conversion's part that leaves the shared coordinate as it is."""
+        """Return the component (M, 4) of the conversion across the shared coordinate."""
         parts = []
         for c, (across, shared) in enumerate(zip(self.across_px, self.shared_px)):
             basis = np.stack([across, shared], -1)
@@ -69,7 +73,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The centres of volume of the M bubbles in `Views`, estimated under one model of the shape.
+    """Estimated centres of volume of the M bubbles of `Views` under one model of the shape.
 
     step_mm : (M, 3) from the point near each bubble to its centre of volume.
     covariance_mm2 : (M, 3, 3) covariance of the step.
@@ -86,10 +90,12 @@ class Estimate:
 
 
 def isotropic(views: Views, frames: tuple[Array, Array]) -> Estimate:
-    """frames : two (M, 3, 2), `EllipsePair.frames` of an ellipsoid that fits the outlines.
+    """Estimate the centres of volume with independent coefficients of degree 3.
 
-    Across the shared coordinate, where this model has no information, the ellipses' centres are
-    kept as they are: to re-express them gains 1 % on average and loses 40 % for some modes.
+    Across the shared coordinate, about which this model has no information, the ellipses' centres
+    are kept: to correct them gains 1 % on average and loses 40 % for some modes.
+
+    frames : two (M, 3, 2), `EllipsePair.frames` of an ellipsoid with these outlines.
     """
     effect = third_degree_effect(views.axes_px, frames)
     answer = _estimate(views, views.sigma[:, None, None] ** 2 * effect @ _t(effect))
@@ -99,10 +105,12 @@ def isotropic(views: Views, frames: tuple[Array, Array]) -> Estimate:
 
 
 def zonal(views: Views, projections: tuple[Array, Array], axis_sigma: Array) -> Estimate:
-    """The amplitude has the prior of `isotropic`'s root mean square: 7 sigma.
+    """Estimate the centres of volume with one axisymmetric mode of degree 3.
 
-    projections : two (M, 2), where the pole appears in the outlines' unit circles.
-    axis_sigma : (M,) their uncertainty.
+    Its prior standard deviation is 7 sigma, with the same expected square as in `isotropic`.
+
+    projections : two (M, 2) positions of the pole in the outlines' unit circles.
+    axis_sigma : (M,) their standard deviation.
     """
     effect = _zonal_effect(views.axes_px, projections)[..., None]
     prior = effect @ _t(effect)
@@ -122,9 +130,10 @@ def uncorrected_covariance(
     frames: tuple[Array, Array],
     sigma: float,
 ) -> Array:
-    """(M, 3, 3) of the outlines' centres taken for the volume's, the shape's share included.
+    """Return the covariance (M, 3, 3) of uncorrected centres, displacement by the shape included.
 
-    noise : (M, 4, 4) and jacobian : (M, 4, 3) of the pixels.
+    noise, jacobian : (M, 4, 4) and (M, 4, 3) of the pixels.
+    axes_px, frames, sigma : as in `Views` and `isotropic`.
     """
     weighted = _t(jacobian) @ np.linalg.inv(noise)
     gain = np.asarray(np.linalg.solve(weighted @ jacobian, weighted))
@@ -133,7 +142,10 @@ def uncorrected_covariance(
 
 
 def combine(estimates: list[Estimate], prior: Array) -> tuple[Estimate, Array]:
-    """Mean of K estimates by their posterior probabilities, and these (K, M); prior (K, M)."""
+    """Return the mean of K estimates, weighted by posterior probability, and the weights (K, M).
+
+    prior : (K, M) prior probabilities of the models.
+    """
     log_weight = np.stack([a.log_evidence for a in estimates]) + np.log(prior)
     top = log_weight.max(0)
     weight = np.exp(log_weight - top)
@@ -151,21 +163,24 @@ def combine(estimates: list[Estimate], prior: Array) -> tuple[Estimate, Array]:
 
 
 def third_degree_effect(axes_px: tuple[Array, Array], frames: tuple[Array, Array]) -> Array:
-    """(M, 8, 7): what is measured, by the coefficients of degree 3."""
+    """Return the derivative (M, 8, 7) of `Views.measured` by the coefficients of degree 3."""
     traces = [silhouette.third_degree_traces(f) for f in frames]
     pixels = [axes @ first for axes, (first, _) in zip(axes_px, traces)]
     return np.concatenate([*pixels, traces[0][1], traces[1][1]], -2)
 
 
 def _zonal_effect(axes_px: tuple[Array, Array], projections: tuple[Array, Array]) -> Array:
-    """(M, 8): what is measured, by the zonal amplitude."""
+    """Return the derivative (M, 8) of `Views.measured` by the zonal amplitude."""
     traces = [silhouette.zonal_traces(q) for q in projections]
     pixels = [(axes @ first[..., None])[..., 0] for axes, (first, _) in zip(axes_px, traces)]
     return np.concatenate([*pixels, traces[0][1], traces[1][1]], -1)
 
 
 def _estimate(views: Views, prior: Array) -> Estimate:
-    """Generalised least squares for the point, the shape being noise of covariance prior."""
+    """Estimate points by generalised least squares.
+
+    prior : (M, 8, 8) covariance that the shape adds to the noise.
+    """
     total = views.noise + prior
     inverse = np.linalg.inv(total)
     weighted = _t(views.jacobian) @ inverse
@@ -197,12 +212,16 @@ _TRACE_ORDERS = (1, 3, 4)
 class Outlines:
     """M outlines of one camera.
 
-    uv_px : (M, 2), covariance_px2 : (M, 2, 2), of the ellipses' centres.  axes_px : (M, 2, 2),
-    columns are the semi-axes.  trace : (M, 6) coefficients of cos and sin of 1, 3 and 4 phi of the
-    radial displacement of the unit circle (semi-axes are 1), trace_covariance : (M, 6, 6); NaN
-    where no harmonics are known.  located : (M,) centre and covariance are usable; shaped : axes
-    are too; entire : and no flag says that part of the outline is missing; whole : and harmonics
-    are usable.
+    uv_px : (M, 2) centres of the ellipses.
+    covariance_px2 : (M, 2, 2) of the centres.
+    axes_px : (M, 2, 2) whose columns are the semi-axes.
+    trace : (M, 6) coefficients of cos and sin of 1, 3 and 4 phi of the radial displacement of the
+        unit circle (relative to the semi-axes); NaN if unknown.
+    trace_covariance : (M, 6, 6).
+    located : (M,) whether centre and covariance are usable.
+    shaped : (M,) and the axes, too.
+    entire : (M,) and no flag says that part of the outline is missing.
+    whole : (M,) and the harmonics are usable.
     """
 
     uv_px: Array
@@ -216,15 +235,17 @@ class Outlines:
     whole: Bools
 
     def rows(self, keep: Bools) -> Outlines:
-        """Some of the rows."""
+        """Return some of the outlines; keep : (M,) booleans or indices."""
         return Outlines(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
 
 def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> Outlines:
-    """A detection table's rows; missing columns and words that are no numbers count as unknown.
+    """Return the outlines of a detection table.
 
-    So do centres farther out than the image is large, axes of a ratio above 20, and harmonics
-    above 30 % of the smaller axis.
+    Values that are missing or not numbers count as unknown. So do centres far outside the image,
+    axes with a ratio above 20, and harmonics above 30 % of the smaller axis.
+
+    image_size_px : width and height.
     """
     uv, covariance = columns(table, CENTRE_COLUMNS), centre_covariances(table)
     suu, suv, svv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
@@ -256,10 +277,11 @@ def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> 
 
 
 def _trace_from_displacement(a_px: Array, b_px: Array) -> Array:
-    """(M, 6, 8): radial harmonics on the unit circle from normal displacements in px.
+    """Return the matrix (M, 6, 8) from normal displacements (px) to radial harmonics of the unit
+    circle.
 
-    A displacement d along the ellipse's normal is d sqrt(b^2 cos^2 + a^2 sin^2) / (a b) along the
-    radius of the circle, to first order.
+    To first order, a displacement d along the ellipse's normal is d sqrt(b^2 cos^2 + a^2 sin^2) /
+    (a b) along the radius of the circle.
     """
     phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     inward = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)])
@@ -282,22 +304,22 @@ _LEAST_COUPLING, _LARGEST_COUPLING = 0.01, 0.9
 
 @dataclass(frozen=True)
 class Bodies:
-    """M bubbles, rig frame.
+    """Centres of volume and sizes of M bubbles in the rig frame.
 
-    points_mm, covariance_mm2 : (M, 3), (M, 3, 3) centre of volume, with the share of the shape that
-        two outlines leave open.
-    silhouette_points_mm, silhouette_covariance_mm2 : maximum-likelihood point of the two outlines'
-        centres, with the covariance of the outlines' noise alone.
-    used : (M,) "volume": points_mm is corrected for the shape; "silhouettes": points_mm is
-        silhouette_points_mm (harmonics unknown in a view, an outline that is hidden in part or
-        leaves the image, or rays that pass farther apart than a bubble is large), covariance_mm2
-        with the shape's share; "none": a centre or its covariance is missing, the row is NaN.
-    du_px, dv_px : (M, 2) first and second camera: added to the outlines' centres they make them
-        measurements of the projected centre of volume; 0 unless used is "volume".
-    d_eq_mm, d_eq_sd_mm : (M,) diameter of the sphere of equal volume; semi_axes_mm : (M, 3),
-        descending, of the most spherical ellipsoid with these outlines.  ray_miss_mm : (M,) of the
-        outlines' centres.
-    zonal_probability : (M,) that the third degree is axisymmetric about an oblate body's axis.
+    points_mm, covariance_mm2 : (M, 3), (M, 3, 3) centre of volume; the covariance includes the part
+        of the shape that two outlines do not determine.
+    silhouette_points_mm, silhouette_covariance_mm2 : (M, 3), (M, 3, 3) triangulated centres of the
+        outlines, with the covariance of the outlines' noise alone.
+    used : (M,) "volume": points_mm is corrected for the shape. "silhouettes": points_mm is
+        silhouette_points_mm, because harmonics are unknown, an outline is incomplete, or the rays
+        pass farther apart than the bubble is large. "none": a centre or its covariance is missing,
+        and the row is NaN.
+    du_px, dv_px : (M, 2) in the first and the second camera: the projected centre of volume minus
+        the outline's centre; 0 unless used is "volume".
+    d_eq_mm, d_eq_sd_mm : (M,) diameter of the sphere of equal volume.
+    semi_axes_mm : (M, 3), descending, of the most spherical ellipsoid with these outlines.
+    ray_miss_mm : (M,) of the outlines' centres.
+    zonal_probability : (M,) posterior probability of the model `zonal`.
     """
 
     points_mm: Array
@@ -322,14 +344,14 @@ def fit_bodies(
     shape_sigma: ArrayLike | None = None,
     gap_sigma_px: float = 0.0,
 ) -> Bodies:
-    """Centres of volume of M pairs of outlines, row i of one table matching row i of the other.
+    """Estimate centres of volume and sizes from M pairs of outlines.
 
-    shape_sigma : standard deviations of the shape's coefficients (harmonics of unit mean square,
-    relative to the radius) of degree 3 and 4, one number for both; by default
-    `estimate_shape_sigma` of these pairs.
-
-    gap_sigma_px : how far the cameras' own motion or their calibration may part the two views
-    along the shared coordinate; so much of the centres' difference says nothing of the shape.
+    first, second : detection tables of M rows; row i of both is one bubble.
+    shape_sigma : prior standard deviation of the shape's coefficients of degree 3 and 4 (harmonics
+        of unit mean square, relative to the radius), or one number for both. By default
+        `estimate_shape_sigma` of these pairs.
+    gap_sigma_px : standard deviation of the difference between the two views along the shared
+        coordinate that shake or calibration errors can cause, and not the shape.
 
     Raises InputError for tables of unequal length or a shape_sigma that is not positive.
     """
@@ -353,10 +375,15 @@ def fit_bodies(
 def estimate_shape_sigma(
     first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
 ) -> Array:
-    """(2,) standard deviations of the shape's coefficients of degree 3 and 4, learned from a run.
+    """Estimate the standard deviations (2,) of the shape's coefficients of degree 3 and 4 from a
+    run.
 
-    Empirical Bayes: the mean square of the outlines' third and fourth harmonics, less their noise,
-    with a little of `DEFAULT_SHAPE_SIGMA`. Raises InputError for tables of unequal length.
+    Empirical Bayes: the mean square of the outlines' third and fourth harmonics minus their noise,
+    with `DEFAULT_SHAPE_SIGMA` as a weak prior.
+
+    first, second : detection tables; row i of both is one bubble.
+
+    Raises InputError for tables of unequal length.
     """
     return learned_sigma(_paired(first, second, cameras))
 
@@ -387,7 +414,7 @@ def _checked_sigma(shape_sigma: ArrayLike) -> Array:
 
 
 def learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
-    """`estimate_shape_sigma` of outlines."""
+    """Return `estimate_shape_sigma` for two sets of outlines."""
     whole = outlines[0].whole & outlines[1].whole
     out = []
     for degree, part, default in zip((3, 4), (slice(2, 4), slice(4, 6)), DEFAULT_SHAPE_SIGMA):
@@ -403,7 +430,10 @@ def learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
 
 
 def _variance(outlines: Outlines, degree: int, part: slice, less: float = 1.0) -> Array:
-    """(M,) one degree's sigma^2 from one outline each, unbiased with once the noise taken off."""
+    """Return an estimate (M,) of one degree's sigma^2 from each outline alone.
+
+    less : how often the variance of the noise is subtracted; unbiased for 1.
+    """
     noise = np.einsum("mii->m", outlines.trace_covariance[:, part, part])
     power = (outlines.trace[:, part] ** 2).sum(-1) - less * noise
     return np.asarray(power / (2 * silhouette.TRACE_VARIANCE[degree, degree]))
@@ -425,7 +455,7 @@ def _fill_points(
     cameras: tuple[Camera, Camera],
     rows: Bools,
 ) -> None:
-    """The outlines' centres triangulated."""
+    """Fill in the triangulated centres of the outlines."""
     pair = [o.rows(rows) for o in outlines]
     found = triangulate(
         cameras, (pair[0].uv_px, pair[1].uv_px), (pair[0].covariance_px2, pair[1].covariance_px2)
@@ -444,7 +474,7 @@ def _inside_both(
     cameras: tuple[Camera, Camera],
     rows: Bools,
 ) -> Bools:
-    """(M,) whether the triangulated point appears inside both outlines, as of one body."""
+    """Return whether (M,) the triangulated point lies inside both outlines."""
     pixels, _ = stacked_jacobian(cameras, points_mm)
     pair = [o.rows(rows) for o in outlines]
     gap = np.concatenate([o.uv_px for o in pair], -1) - pixels
@@ -462,7 +492,7 @@ def _fill_shapes(
     *,
     correct: bool,
 ) -> None:
-    """Sizes; the centres of volume, or else what the shape adds to the outlines' centres' error."""
+    """Fill in the sizes, and either corrected centres or the covariance of uncorrected ones."""
     pixels, jacobian = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
     axes_px = (pair[0].axes_px, pair[1].axes_px)
     shapes = _ellipsoids((jacobian[:, :2], jacobian[:, 2:]), axes_px)
@@ -487,7 +517,7 @@ def _correct(
     sigma: Array,
     gap_sigma_px: float,
 ) -> None:
-    """Centres of volume: every shape model, weighted by its evidence."""
+    """Fill in centres of volume: the mean over the shape models by their evidence."""
     measured, noise, conversion = _measured(pair, pixels)
     shared = _images(jacobian, (shapes.pair.shared, shapes.pair.shared))
     noise[:, :4, :4] += _gap_covariance(shared, gap_sigma_px)
@@ -517,7 +547,9 @@ def _correct(
 
 
 def _gap_covariance(shared: tuple[Array, Array], gap_sigma_px: float) -> Array:
-    """(M, 4, 4) of the two centres moved apart along the shared coordinate."""
+    """Return the covariance (M, 4, 4) of a difference of the two centres along the shared
+    coordinate.
+    """
     left, right = (image / np.linalg.norm(image, axis=-1, keepdims=True) for image in shared)
     apart = np.concatenate([left, -right], -1) / 2
     return gap_sigma_px**2 * apart[:, :, None] * apart[:, None, :]
@@ -525,12 +557,14 @@ def _gap_covariance(shared: tuple[Array, Array], gap_sigma_px: float) -> Array:
 
 @dataclass(frozen=True)
 class _Ellipsoids:
-    """The ellipsoids that M pairs of outlines allow.
+    """Ellipsoids with the outlines of M pairs.
 
-    pair : their ellipses in mm.  moments_mm2, oblate_mm2 : (M, 3, 3) A A^T of the most spherical
-    ellipsoid and of the nearest oblate spheroid; couplings : two (M,), theirs (`EllipsePair`);
-    coupling_sigma : (M,) uncertainty of the first.  poles : two (M, 2), where the spheroid's pole
-    appears in the outlines' unit circles.
+    pair : their ellipses in mm.
+    moments_mm2 : (M, 3, 3) A A^T of the most spherical ellipsoid.
+    oblate_mm2 : (M, 3, 3) A A^T of the nearest oblate spheroid.
+    couplings : two (M,), those of both bodies (see `EllipsePair`).
+    coupling_sigma : (M,) standard deviation of the first.
+    poles : two (M, 2) positions of the spheroid's pole in the outlines' unit circles.
     """
 
     pair: EllipsePair
@@ -542,7 +576,7 @@ class _Ellipsoids:
 
 
 def _ellipsoids(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> _Ellipsoids:
-    """jacobians : two (M, 2, 3), px per mm.  axes_px : two (M, 2, 2), columns are semi-axes."""
+    """Return the ellipsoids; jacobians : two (M, 2, 3), px per mm; axes_px : two (M, 2, 2)."""
     pair = silhouette.ellipse_pair(jacobians, axes_px)
     moments = silhouette.most_spherical(pair)
     pole, oblate = silhouette.oblate_spheroid(pair)
@@ -562,7 +596,7 @@ def _ellipsoids(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) ->
 
 
 def _images(jacobian: Array, directions: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Two (M, 2): the first direction in the first view, the second in the second."""
+    """Return the images (M, 2) of one direction in each view."""
     left, right = (
         (jacobian[:, 2 * c : 2 * c + 2] @ d[..., None])[..., 0] for c, d in enumerate(directions)
     )
@@ -570,7 +604,7 @@ def _images(jacobian: Array, directions: tuple[Array, Array]) -> tuple[Array, Ar
 
 
 def _measured(pair: tuple[Outlines, Outlines], pixels: Array) -> tuple[Array, Array, Array]:
-    """`Views.measured`, `Views.noise`, and (M, 4) what was added to the ellipses' centres."""
+    """Return `Views.measured`, `Views.noise` and `Views.conversion_px`."""
     count = len(pixels)
     measured, noise = np.zeros((count, 8)), np.zeros((count, 8, 8))
     conversion = np.zeros((count, 4))
@@ -600,10 +634,10 @@ def _pixel_noise(pair: tuple[Outlines, Outlines]) -> Array:
 
 
 def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
-    """(M,) each bubble's sigma of degree 3: the run's, as `_RUN_WEIGHT` harmonics, and its own.
+    """Return each bubble's sigma of degree 3 (M,), from its own harmonics and the run's value.
 
-    Mean of an inverse gamma distribution, so that the blind components are covered; less twice the
-    noise, so that a bubble without shape is left alone.
+    It is the mean of an inverse gamma distribution, which allows for unobserved components. Twice
+    the noise is subtracted, so that a bubble without harmonics is not corrected.
     """
     own = np.sum([2 * _variance(o, 3, slice(2, 4), 2.0) for o in pair], 0)
     return np.asarray(np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 2)))
@@ -616,10 +650,12 @@ _RUN_SHARE = 2.0  # harmonics' worth of the run's variances against a bubble's o
 
 
 def rim_excess(pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
-    """(M,) log of the outlines' size over the volume's, by the third and fourth harmonics.
+    """Return the log ratio (M,) of the outlines' size to the volume's, by third and fourth
+    harmonics.
 
-    sigma : (2,) of the run. Its standard deviation is as large as itself. 0 where no harmonics are
-    known.
+    Its standard deviation is as large as itself. It is 0 where no harmonics are known.
+
+    sigma : (2,) of the run.
     """
     excess = np.zeros(len(pair[0].uv_px))
     whole = pair[0].whole & pair[1].whole
@@ -633,11 +669,11 @@ def rim_excess(pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
 def _diameter(
     shapes: _Ellipsoids, pair: tuple[Outlines, Outlines], sigma: Array
 ) -> tuple[Array, Array]:
-    """(M,) volume's diameter and its standard deviation.
+    """Return the equivalent diameter (M,) and its standard deviation, in mm.
 
-    Three things are open: the coupling of the viewing directions (the mean of the most spherical
-    ellipsoid and the oblate spheroid is taken), the fourth degree's share of the ellipses, and the
-    outlines' noise. The rims' excess is taken off.
+    The standard deviation includes three contributions: the coupling of the viewing directions (for
+    which the mean of the most spherical ellipsoid and the oblate spheroid is taken), modes of
+    degree 4, and the outlines' noise. The excess of the rims is subtracted.
     """
     logs = [np.log(np.linalg.det(m)) / 6 for m in (shapes.moments_mm2, shapes.oblate_mm2)]
     unseen = np.hypot((logs[1] - logs[0]) / 2, shapes.coupling_sigma**2 / np.sqrt(18))
@@ -649,7 +685,8 @@ def _diameter(
 
 
 def _axis_sigma(shapes: _Ellipsoids, pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
-    """(M,) how well a spheroid's axis is known: errors of the ellipses over its flatness."""
+    """Return the sd (M,) of a spheroid's axis: relative errors of the ellipses over its
+    flatness."""
     squares = np.linalg.eigvalsh(shapes.oblate_mm2)
     flatness = 1 - squares[:, 0] / squares[:, 2]
     error2 = 4 * _relative_noise2(pair) + (6.7 * sigma[1]) ** 2 + (80 * sigma[0] ** 2) ** 2

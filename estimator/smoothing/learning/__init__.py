@@ -1,5 +1,5 @@
-"""Hyper-parameters of shake and bubbles, learned by maximum marginal likelihood.
+"""Learns the hyper-parameters of shake and bubbles by maximum marginal likelihood.
 
-In: a ``SmoothingProblem``. Out: its priors. Read ``learn``, then ``lines_of_sight`` and
-``evidence``.
+In: a ``SmoothingProblem``. Out: a ``ShakeModel``, its priors. Read ``learn`` first, then
+``lines_of_sight`` and ``evidence``.
 """

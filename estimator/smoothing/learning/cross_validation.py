@@ -1,8 +1,8 @@
-"""Do learned hyper-parameters hold for the parts of a run that they were not learned from?
+"""Cross-validates learned hyper-parameters in parts of the run that they were not learned from.
 
-In windows elsewhere in the run: the squared distance of the signals from the model, which is one
-per sample for a right model, and the modes' frequencies, refitted there. A mode whose frequency
-differs by more than its uncertainty drifts along the run.
+In each part the mean squared whitened prediction error is computed, which is 1 if the model is
+right, and the frequencies of the modes are fitted again. A frequency that differs by more than its
+uncertainty drifts along the run.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ _LARGEST_SQUARE = 1.3
 
 @dataclass(frozen=True)
 class OtherWindow:
-    """The comparison of one part of a run with the model that was learned from another part.
+    """Cross-validation in one part of a run.
 
-    from_s, to_s : its time. square : mean squared whitened distance of a sample from the model's
-    prediction; 1 if the model is right. frequencies : by the name of a mode's frequency, its value
-    in this part, and the standard deviation of its ratio to the learned value.
+    from_s, to_s : times of its first and last frame.
+    square : mean squared whitened prediction error of a sample; 1 if the model is right.
+    frequencies : {hyper-parameter: (frequency in this part (Hz), standard deviation of the
+        logarithm of its ratio to the learned one)}.
     """
 
     from_s: float
@@ -42,7 +43,9 @@ class OtherWindow:
     frequencies: dict[str, tuple[float, float]]
 
     def drifted(self, model: ShakeModel) -> dict[str, float]:
-        """Return the frequencies that differ from the learned ones, by name."""
+        """Return {hyper-parameter: Hz} of the frequencies that differ significantly from the
+        learned ones.
+        """
         out = {}
         for name, (value, sigma) in self.frequencies.items():
             shift = abs(float(np.log(value / value_of(model, name))))
@@ -52,14 +55,14 @@ class OtherWindow:
 
 
 def cross_validate(problem: SmoothingProblem, model: ShakeModel) -> list[OtherWindow]:
-    """Return the comparison with up to three windows that a model was not learned from."""
+    """Compare a learned model with up to three windows that it was not learned from."""
     used = _used(problem)
     found = [_compared(w, model) for w in other_windows(problem, used, _MOST_WINDOWS)]
     return [one for one in found if one is not None]
 
 
 def _used(problem: SmoothingProblem) -> Window:
-    """Return the frames from the first to the last that a model is learned from."""
+    """Return the run from the first to the last frame that was learned from."""
     parts = learning_parts(problem)
     if len(parts) == 1:
         return parts[0]
@@ -89,7 +92,11 @@ def _compared(window: Window, model: ShakeModel) -> OtherWindow | None:
 def learning_record(
     problem: SmoothingProblem, model: ShakeModel
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return from what a model was learned, how it holds elsewhere, and warnings if it does not."""
+    """Cross-validate a learned model.
+
+    Returns the entry of smoothing.json about the data it was learned from and the prediction errors
+    elsewhere, and warnings if these are too large or a frequency drifts.
+    """
     t = _used(problem).problem.t_s
     frames = sum(len(part.problem.t_s) for part in learning_parts(problem))
     record: dict[str, Any] = {

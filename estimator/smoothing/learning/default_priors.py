@@ -1,4 +1,4 @@
-"""Priors for users who have given none: from what was measured, and from a first solution."""
+"""Default priors of shake, bubbles and carriage, and their adaptation to a first solution."""
 
 from __future__ import annotations
 
@@ -43,7 +43,13 @@ DEFAULT_FLOOR = 0.12
 
 
 def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
-    """Return a broad prior of the shake with marks or arm sensors; else a guess at its modes."""
+    """Return default priors for a problem.
+
+    If marks or accelerometers on the arms measure the shake, its prior is a broad band; otherwise
+    it consists of a few guessed modes.
+
+    encoder_sigma_mm : standard deviation of an encoder reading.
+    """
     bands: tuple[BroadBand, ...] = ()
     modes: tuple[RigMode, ...] = ()
     cameras = range(len(problem.cameras))
@@ -67,7 +73,7 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
 
 
 def _scale_sigma(problem: SmoothingProblem) -> float:
-    """Return the prior sd of the encoder's scale, which is held (0) without marks."""
+    """Return the prior sd of the encoder's scale factor; 0 (held) without marks."""
     marked = len(problem.references) > 0 and problem.stage is not None
     return default_scale_sigma(problem.travel) if marked else 0.0
 
@@ -77,10 +83,13 @@ def _band(camera: int) -> BroadBand:
 
 
 def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeModel:
-    """Return the broad-band priors with the RMS and the dominant frequency that were found.
+    """Return the broad-band priors adapted to an estimated RMS and dominant frequency.
 
-    rms_mm : (C, 3) of each camera's offset (posterior mean and variance), the expectation step of
-    expectation maximisation. What is common to the cameras keeps its share.
+    This is the maximisation step of expectation maximisation. The ratio of common-mode to
+    differential shake stays.
+
+    rms_mm : (C, 3) of each camera's offset, posterior variance included.
+    frequency_hz : the dominant frequency.
     """
     own = [b for b in model.broad_bands if b.camera != CARRIAGE]
     common = [b for b in model.broad_bands if b.camera == CARRIAGE]
@@ -105,7 +114,9 @@ def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeMode
 
 
 def default_bubble(problem: SmoothingProblem) -> BubbleModel:
-    """Return the zigzag at the frequency that the tracks show, with its second harmonic upwards."""
+    """Return a zigzag of the frequency that the tracks show, with its second harmonic along the
+    vertical.
+    """
     frequency, rms = zigzag(problem) or (_ZIGZAG_GUESS_HZ, _ZIGZAG_RMS_MM)
     across, up = 1 - np.abs(problem.up), np.abs(problem.up)
     return BubbleModel(
@@ -124,9 +135,9 @@ def _triple(values: Array) -> tuple[float, float, float]:
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
     """Return frequency (Hz) and RMS (mm) of the bubbles' zigzag; None without usable tracks.
 
-    They come from the spectrum (Lomb-Scargle) of up to 20 tracks that show `_LEAST_PERIODS` of all
-    frequencies. If there are none, they are the most likely ones of short tracks: the spectrum of
-    what a parabola leaves of a track peaks at its own length.
+    They come from the Lomb-Scargle spectrum of up to 20 tracks that are long enough for 1.5 periods
+    at 3 Hz. Short tracks are fitted by an oscillator instead, because a trend removed from a short
+    track leaves a spectral peak at the inverse of its length.
     """
     from scipy.signal import lombscargle
 
@@ -154,10 +165,10 @@ def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
 
 
 def _likely_zigzag(tracks: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
-    """Return frequency and RMS of an oscillator, by the restricted likelihood of times and places.
+    """Return frequency and RMS of an oscillator, by restricted maximum likelihood.
 
-    Each track has a position and a velocity of its own, and white noise. The frequency has a prior
-    about `_ZIGZAG_GUESS_HZ`.
+    tracks : times (n,) and lateral positions (n, 3). Each has its own mean position and velocity,
+        and white noise. The frequency has a log-normal prior.
     """
     trials = np.arange(*_ZIGZAG_HZ, 0.25)
     noise = np.geomspace(1e-8, 1.0, 17)  # variances over the swing's
@@ -187,8 +198,8 @@ def _likely_zigzag(tracks: Sequence[tuple[Array, Array]]) -> tuple[float, float]
 def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> CarriageModel:
     """Return the default model of the carriage's motion.
 
-    Without accelerometers the encoder's readings are taken as they are; with accelerometers the
-    motion between the readings is modelled, too.
+    With accelerometers, or with encoder readings too sparse for linear interpolation, the motion
+    between the readings is modelled; otherwise they are interpolated.
     """
     stage = problem.stage
     if stage is None:
@@ -201,7 +212,7 @@ def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> Carr
 
 
 def _dense(stage: Stage, t_s: Array, sigma_mm: float) -> bool:
-    """Whether a straight line between two readings misses less than their noise."""
+    """Return whether linear interpolation between two readings errs by less than their noise."""
     if len(stage.t_s) < 3:
         return False
     step = float(np.median(np.diff(stage.t_s)))
@@ -210,7 +221,7 @@ def _dense(stage: Stage, t_s: Array, sigma_mm: float) -> bool:
 
 
 def acceleration_rms(stage: Stage) -> float:
-    """Return the RMS acceleration in mm/s^2, of parabolas through windows of about 20 ms."""
+    """Return the RMS acceleration of the stage in mm/s^2, from parabolas over 20 ms."""
     step = float(np.median(np.diff(stage.t_s)))
     window = int(np.clip(round(0.02 / step) // 2 * 2 + 1, 5, len(stage.t_s) // 2 * 2 - 1))
     if window < 5:
@@ -223,7 +234,7 @@ def acceleration_rms(stage: Stage) -> float:
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
-_LEAST_TOLD, _PRIOR_SAMPLES, _SCALED = 0.05, 1.0, (0.1, 10.0)
+_LEAST_REDUCTION, _PRIOR_SAMPLES, _SCALED = 0.05, 1.0, (0.1, 10.0)
 _LEAST_SPARE = 0.2
 _LEAST_PIXELS = 60
 _SD_OF_MEDIAN = 1.16
@@ -237,11 +248,10 @@ _INDEPENDENT = 0.5
 
 
 def adapted(solution: Solution) -> ShakeModel | None:
-    """Return the model with noise, RMS and encoder's scale adapted to a first solution.
+    """Return the priors adapted to a first solution, or None if nothing changes.
 
-    Returns None if nothing has to change.
-
-    Learned modes keep their RMS.
+    Adapted are the pixel noise, the RMS of broad bands and of guessed modes, and the encoder's
+    scale; learned modes keep their RMS.
     """
     model = solution.graph.model
     inflation = _noise_factor(solution)
@@ -269,16 +279,16 @@ def adapted(solution: Solution) -> ShakeModel | None:
 
 
 def guessed_modes(model: ShakeModel) -> bool:
-    """Return whether the modes are those of `default_model`, which no measurement has changed."""
+    """Return whether the modes are the guess of `default_model`."""
     return model.name == "default" and bool(model.modes)
 
 
 def _size_of_offsets(solution: Solution) -> Array:
-    """Return by axis (3,) the factor on the RMS of the modes with which they explain the offsets.
+    """Return factors (3,) on the modes' RMS along each axis, so that they explain the offsets.
 
-    The squares of the estimated offsets are expected to be the prior variance less the posterior
-    one (MacKay, Neural Computation 4:415, 1992). The prior RMS counts as `_PRIOR_SAMPLES`
-    independent offsets; an axis about which the data say nothing keeps 1.
+    The expected square of an estimated offset is the prior variance minus the posterior variance
+    (MacKay, Neural Computation 4:415, 1992). The prior RMS counts as one independent offset. Axes
+    that the data do not determine keep 1.
     """
     graph, found = solution.graph, solution.covariances
     rows, t = graph.shake.offset[:-1], graph.problem.t_s
@@ -288,9 +298,9 @@ def _size_of_offsets(solution: Solution) -> Array:
     if found is None:
         return np.ones(3)
     left = np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True).mean(0)
-    told = np.sum(prior - left, axis=0)
-    known = told > _LEAST_TOLD * prior.sum(0)
-    square = (_offsets(solution) ** 2).mean(0).sum(0) / np.where(known, told, 1.0)
+    reduction = np.sum(prior - left, axis=0)
+    known = reduction > _LEAST_REDUCTION * prior.sum(0)
+    square = (_offsets(solution) ** 2).mean(0).sum(0) / np.where(known, reduction, 1.0)
     samples = 2 * (t[-1] - t[0]) * graph.model.modes[0].frequency_hz
     square = (samples * square + _PRIOR_SAMPLES) / (samples + _PRIOR_SAMPLES)
     return np.where(known, np.clip(np.sqrt(square), *_SCALED), 1.0)
@@ -303,14 +313,17 @@ def _with_floor(model: ShakeModel, floor: float | None) -> ShakeModel:
 
 
 def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) -> float | None:
-    """Return the bands' floor that offsets show below the frequencies of the shake itself.
+    """Return the low-frequency floor of the broad bands by Whittle's likelihood of the offsets.
 
-    t_s (F,); offsets_mm (F, C, 3) of the cameras, 0 where unseen; a band for each camera.
-    How far a mode yields to slow forces, its damping, decides how well the slow motion of a bubble
-    is known. Whittle's likelihood of the low end of the spectra (Whittle, Arkiv foer Matematik 2,
-    1953), with a prior of a factor of two about `DEFAULT_FLOOR`. None where the run is too short,
-    where a band is common to the cameras, and where the first solution's offsets are the prior's as
-    much as the data's.
+    The floor is the density below the band relative to the density in it. It decides how well the
+    slow motion of a bubble is known. The likelihood (Whittle, Arkiv foer Matematik 2, 1953) covers
+    the frequencies below 0.4 of the band; the prior is a factor of two about `DEFAULT_FLOOR`.
+
+    t_s : (F,).
+    offsets_mm : (F, C, 3) estimated offsets of the cameras, 0 along unseen axes.
+    bands : one for each camera.
+
+    Returns None for a short run, and if a band is common to the cameras or steep.
     """
     t = np.asarray(t_s, float)
     if any(b.camera == CARRIAGE or b.tail > 2 for b in bands) or not bands[0].floor or len(t) < 2:
@@ -338,7 +351,7 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
 
 
 def _periodogram(series: Array, step_s: float) -> Array:
-    """Return one-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
+    """Return the one-sided density (F,) of a series (n,) without its trend, with Hann's window."""
     from scipy.signal import detrend, periodogram
 
     taper: Any = np.hanning(len(series))
@@ -352,7 +365,9 @@ def _offsets(solution: Solution) -> Array:
 
 
 def _offset_rms(solution: Solution) -> Array:
-    """Return the RMS (C, 3) of cameras' offsets and their uncertainty; the mean where unseen."""
+    """Return the RMS (C, 3) of the cameras' offsets, uncertainty included; the mean along unseen
+    axes.
+    """
     rows, found = solution.graph.shake.offset[:-1], solution.covariances
     square = _offsets(solution) ** 2
     if found is not None:
@@ -364,7 +379,7 @@ def _offset_rms(solution: Solution) -> Array:
 
 
 def _dominant_hz(solution: Solution) -> float:
-    """Return the RMS of the offsets' velocity over that of the offsets."""
+    """Return the RMS of the offsets' velocity over 2 pi times that of the offsets."""
     graph, place = solution.graph, _offsets(solution)
     states = graph.shake_at_frames(solution.state.shake)
     speed = np.einsum("cid,fd->fci", graph.shake.offset_velocity[:-1], states)
@@ -372,12 +387,12 @@ def _dominant_hz(solution: Solution) -> float:
 
 
 def _noise_factor(solution: Solution) -> float:
-    """Return by how much the pixels' stated noise is too small, 1 at least.
+    """Return the factor by which the stated pixel noise is too small, at least 1.
 
-    It follows from the median squares of rows and of columns, beside those of residuals drawn from
-    the model; the larger one counts, because an outline's centre wanders along both, and the fit
-    may take it for motion along one. For the same reason the noise is never taken for smaller than
-    stated, and coordinates of which the fit takes up nearly all are left out.
+    It compares the median squared residuals with those of draws from the model, separately for u
+    and v, and takes the larger factor: the centre of a bubble's outline wanders along both, and the
+    fit may absorb it along one. Coordinates whose residuals the fit absorbs almost completely do
+    not count.
     """
     observed, kept = solution.graph.problem.observations, solution.weights[0] > 0.5
     if solution.covariances is None or not kept.any():

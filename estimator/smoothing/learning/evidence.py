@@ -1,7 +1,7 @@
-"""Computes the marginal likelihood (evidence), posterior and gradient of one line-of-sight signal.
+"""Marginal likelihood (evidence), posterior means and gradient for one line-of-sight signal.
 
-The precision of a chain of states is block-tridiagonal and eliminated frame by frame. Let H_t be
-the precision of frame t given those before, and J_t its coupling forward:
+The precision matrix of a Markov chain of states is block tridiagonal and is eliminated frame by
+frame. With H_t the precision of frame t given the earlier frames, and J_t its coupling to the next:
 
     L_t L_t^T = H_t,   M_t = J_t L_t^-T,   H_{t+1} -= M_t M_t^T
 
@@ -10,15 +10,14 @@ PICA Conf., 1973):
 
     S_t = (L_t L_t^T)^-1 + G_t^T S_{t+1} G_t,   S_{t+1,t} = -S_{t+1} G_t
 
-Constants (mean velocities, places of marks) are eliminated after the chain. The evidence equals
-the graph's, signal by signal (see tests/estimator/smoothing/test_shake_learning.py).
+Constants (mean velocities, positions of marks) are eliminated last. The evidence is equal to that
+of the graph (tests/estimator/smoothing/test_shake_learning.py).
 
-The gradient by the hyper-parameters costs a few evaluations, whatever their number. Fisher's
-identity: the derivative of the log evidence is the posterior mean of the derivative of the log
-density of states and measurements together (Cappe, Moulines, Ryden, Inference in Hidden Markov
-Models, 2005, sec. 10.1.3). That density is a sum over independent processes, each a function of its
-own few states, so that second moments of these, summed over the frames, are all that is needed of
-the posterior.
+The gradient costs as much as a few evaluations, whatever the number of hyper-parameters. By
+Fisher's identity it is the posterior mean of the derivative of the joint log density of states and
+measurements (Cappe, Moulines, Ryden, Inference in Hidden Markov Models, 2005, sec. 10.1.3). That
+density is a sum over independent processes with few states each, so that it needs only the
+posterior second moments of these, summed over the frames.
 """
 
 from __future__ import annotations
@@ -54,12 +53,12 @@ _EVERY = 8
 
 @dataclass(frozen=True)
 class Chain:
-    """The Cholesky factor of a block tridiagonal precision matrix with F blocks of D states.
+    """Cholesky factor of a block tridiagonal precision matrix with F blocks of D states.
 
-    upper : (F, D, D) L_t^T, the transposed diagonal blocks of the factor. following : (F - 1, D, D)
-    M_t, its blocks below the diagonal.
-    sides : (F, S, D) right-hand sides that were eliminated together with each frame, times L_t^-T.
-    steady : first and last frame between which the blocks no longer change.
+    upper : (F, D, D) L_t^T, the transposed diagonal blocks.
+    sides : (F, S, D) right-hand sides times L_t^-T.
+    following : (F - 1, D, D) M_t, the blocks below the diagonal.
+    steady : first and last frame between which the blocks are constant.
     """
 
     upper: Array
@@ -83,7 +82,7 @@ class Chain:
         return out
 
     def means(self, sides: Array) -> Array:
-        """Return the solutions (F, K, D) for right sides (F, K, D) as in ``sides``."""
+        """Return the solutions (F, K, D) for eliminated right-hand sides (F, K, D)."""
         turned = np.swapaxes(self.inverses(), -1, -2)
         out, gain = sides @ turned, self.following @ turned[:-1]
         part = np.empty(out.shape[1:])
@@ -93,8 +92,10 @@ class Chain:
         return np.asarray(out)
 
     def moments(self, sides: Array) -> tuple[Array, Array, Array]:
-        """Return what `means` returns, the covariances (F, D, D) of the states, and those
-        (F - 1, D, D) with the state of the frame before."""
+        """Return means as `means` does, covariances (F, D, D), and cross-covariances (F - 1, D, D).
+
+        The cross-covariances are those of a frame's states (rows) with the states one frame before.
+        """
         inverse = self.inverses()
         turned = np.swapaxes(inverse, -1, -2)
         size = self.upper.shape[-1]
@@ -128,12 +129,15 @@ class Chain:
 
 
 def _alike(one: Array, other: Array) -> bool:
-    """Whether two blocks (D, D) are equal but for `_STEADY` of the largest of each column."""
+    """Return whether two blocks (D, D) agree within `_STEADY` of each column's largest entry."""
     return bool((np.abs(one - other) <= _STEADY * np.abs(one).max(0)).all())
 
 
 def _carry_on(values: Array, gain: Array) -> None:
-    """Subtract from each of values (n, K, D) the one before times a gain (D, D), in place."""
+    """Apply the recursion values[t] -= values[t - 1] @ gain in place.
+
+    values : (n, K, D).  gain : (D, D).
+    """
     part = np.empty(values.shape[1:])
     for before, value in pairwise(values):
         np.matmul(before, gain, out=part)
@@ -141,9 +145,13 @@ def _carry_on(values: Array, gain: Array) -> None:
 
 
 def eliminated(own: Array, following: Array, sides: Array) -> Chain:
-    """Return the factor of diagonal (F, D, D) and lower (F - 1, D, D) blocks, with sides (F, S, D).
+    """Factorise a block tridiagonal precision matrix.
 
-    Raises numpy's LinAlgError where the precision is not positive definite. The input is used up.
+    own : (F, D, D) diagonal blocks; overwritten.
+    following : (F - 1, D, D) blocks below the diagonal.
+    sides : (F, S, D) right-hand sides.
+
+    Raises numpy.linalg.LinAlgError if the matrix is not positive definite.
     """
     count = sides.shape[1]
     joined = np.zeros((len(own), count + own.shape[-1], own.shape[-1]))
@@ -153,13 +161,16 @@ def eliminated(own: Array, following: Array, sides: Array) -> Chain:
 
 
 def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
-    """Eliminate frame by frame, in place; return `Chain.steady`.
+    """Factorise a block tridiagonal precision matrix in place; return `Chain.steady`.
 
-    own : (F, D, D), in: diagonal blocks, out: L_t^T. joined : (F, S + D, D), in: rows of the sides
-    and of the next frame, out: the same times L_t^-T.
-    Where frames are alike, the recursion comes to rest after the filter's memory: from then on only
-    the sides are carried on. Raises numpy's LinAlgError for a precision that is not positive
-    definite.
+    Where consecutive frames have equal blocks, the recursion converges; from then on only the
+    right-hand sides are updated.
+
+    own : (F, D, D) diagonal blocks; becomes L_t^T.
+    joined : (F, S + D, D) right-hand sides, then the coupling to the next frame; becomes the same
+        times L_t^-T.
+
+    Raises numpy.linalg.LinAlgError if the matrix is not positive definite.
     """
     from scipy.linalg.blas import dtrsm
     from scipy.linalg.lapack import dpotrf, dtrtri
@@ -193,7 +204,7 @@ def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
 
 
 def _ends_of_alike(own: Array, following: Array) -> list[int]:
-    """Return for each frame the end of the stretch of frames whose blocks are like its own."""
+    """Return for each frame the end of the run of frames with equal blocks that it belongs to."""
     root = np.sqrt(np.abs(np.diagonal(own, axis1=-2, axis2=-1)).max(0))
     scale = 1e-13 * root[:, None] * root
     same = [(np.abs(a[1:] - a[:-1]) <= scale).all((1, 2)) for a in (own, following)]
@@ -209,11 +220,12 @@ _DIFFERENCE = 1e-4
 
 @dataclass(frozen=True)
 class SignalPosterior:
-    """The log evidence of a line-of-sight signal, and posterior means.
+    """Log evidence and posterior means for one line-of-sight signal.
 
-    position_mm, velocity_mm_s : (B, F) motion of the moving items along the signal's direction;
-    positions are relative to the items' start. R replicates of an item follow each other.
-    offset_mm : (J, F) offset of each of J cameras.
+    log_evidence : natural logarithm.
+    position_mm, velocity_mm_s : (B, F) of the B moving items along the signal's direction;
+        positions are relative to the item's start. R replicates of an item are consecutive rows.
+    offset_mm : (J, F) shake of the J cameras.
     """
 
     log_evidence: float
@@ -224,10 +236,14 @@ class SignalPosterior:
 
 @dataclass(frozen=True)
 class _System:
-    """States per frame: the shake's components, then each moving item's.
+    """Linear state-space model of a signal: D states of the shake's components, then of each
+    item's.
 
-    rows : (P, D) that read a pair's measurement. columns : (F, P, c) effects of the constants.
-    prior_sigma : (c,). offset : (J, D).
+    rows : (P, D) measurement of each pair of item and camera.
+    offset : (J, D) shake of each camera.
+    position, velocity : (B, D) of each moving item.
+    columns : (F, P, c) measurement matrix of the constants.
+    prior_sigma : (c,) of the constants.
     """
 
     components: tuple[Component, ...]
@@ -240,12 +256,12 @@ class _System:
 
 
 def signal_evidence(signal: Signal, model: ShakeModel) -> float:
-    """Return the natural logarithm of the density of the signal's measurements."""
+    """Return the log marginal likelihood of a signal."""
     return Factor(signal, model).log_evidence()
 
 
 def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
-    """Return the log evidence of a signal, and the posterior means of motion and offsets."""
+    """Return the log marginal likelihood of a signal, and posterior means."""
     return Factor(signal, model).posterior()
 
 
@@ -275,7 +291,10 @@ def _system(signal: Signal, model: ShakeModel) -> _System:
 
 
 def _constants(signal: Signal, model: ShakeModel) -> tuple[Array, Array]:
-    """Return (F, P, I): a moving item's travel at 1 mm/s, a fixed item's place; priors (I,)."""
+    """Return the measurement matrix (F, P, I) and prior sd (I,) of the constants, one per item.
+
+    The constant is the mean velocity of a moving item and the position of a fixed one.
+    """
     t = signal.t_s
     columns = np.zeros((len(t), len(signal.item), len(signal.moving)))
     for p, item in enumerate(signal.item):
@@ -287,10 +306,15 @@ def _constants(signal: Signal, model: ShakeModel) -> tuple[Array, Array]:
 
 
 class Factor:
-    """The Cholesky factor of the states' precision, and the constants' after them.
+    """Factorised posterior precision of a signal's states and constants.
 
-    which : (F,) of each frame among ``bases`` (U + 1, D, D). rows : (U + 1, P, D). rest : (F, P, R)
-    measured less ``guess``. constants : (c, R).
+    which : (F,) index of each frame's basis.
+    bases : (U + 1, D, D) bases of the states.
+    rows : (U + 1, P, D) measurement matrix in each basis.
+    guess : (c, R) approximate constants, which are subtracted first to keep digits.
+    rest : (F, P, R) measured values minus those of ``guess``.
+    constants : (c, R) posterior means, minus ``guess``.
+    square : minimum of chi-square.
     """
 
     def __init__(self, signal: Signal, model: ShakeModel) -> None:
@@ -318,7 +342,10 @@ class Factor:
         self._fix_constants(data.reshape(-1, wide).T @ weighted.reshape(-1, wide))
 
     def _fix_constants(self, square: Array) -> None:
-        """Eliminate the constants; square : (R + c, R + c) of measurements and columns."""
+        """Eliminate the constants.
+
+        square : (R + c, R + c) weighted products of measurements and columns of the constants.
+        """
         from scipy.linalg import cho_factor, cho_solve
 
         count, prior = self.count, 1 / self.system.prior_sigma**2
@@ -339,10 +366,11 @@ class Factor:
         return float(self.count * each - self.square / 2)
 
     def spread(self) -> tuple[Array, Array]:
-        """Return right sides (F, K, D) of F frames' states and values (c, K) of the c constants.
+        """Return right-hand sides (F, K, D) and constants (c, K) for the posterior second moments.
 
-        Solved for, and their squares summed over K, they add to the second moments for known
-        constants: the replicates' posterior means, and the uncertainty of the constants.
+        The first R of the K belong to the replicates' posterior means. The other c spread by one
+        standard deviation of the constants. The sum of squares over K, plus the covariance for
+        known constants, gives the second moments.
         """
         from scipy.linalg import solve_triangular
 
@@ -371,8 +399,9 @@ class Factor:
 
 
 def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:
-    """Yield each distinct value of an index (n,) and its positions: a slice if they are contiguous,
-    otherwise an index array."""
+    """Yield each distinct value of an index (n,) with its positions, as a slice if they are
+    contiguous.
+    """
     order = np.argsort(index, kind="stable")
     values, first = np.unique(index[order], return_index=True)
     for value, mine in zip(values.tolist(), np.split(order, first[1:])):
@@ -381,13 +410,13 @@ def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:
 
 
 def _replicates(signal: Signal) -> Array:
-    """Return the measurements (F, P, R) of R replicates that differ in their values only."""
+    """Return the measurements (F, P, R) of R replicates, which share their weights."""
     values = signal.value_mm
     return values if values.ndim == 3 else values[..., None]
 
 
 def _fitted(signal: Signal, system: _System, weight: Array) -> Array:
-    """Return constants (c, R) near the answer: what is small without them keeps its digits."""
+    """Return approximate constants (c, R) by a straight-line fit to each moving item."""
     values = _replicates(signal)
     out = np.zeros((len(signal.moving), values.shape[-1]))
     for item in np.flatnonzero(signal.moving):
@@ -404,7 +433,7 @@ def _fitted(signal: Signal, system: _System, weight: Array) -> Array:
 
 
 def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
-    """Return diagonal (F, D, D) and lower (F - 1, D, D) blocks of the prior; half log det."""
+    """Return the prior's diagonal (F, D, D) and lower (F - 1, D, D) blocks, half its log det."""
     which = np.append(steps.index, len(steps.basis) - 1)
     last, ahead, place = steps.distinct_in_basis(which[1:])
     backward, forward = (np.swapaxes(a, -1, -2) for a in (last, ahead))
@@ -423,10 +452,12 @@ def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
 
 @dataclass(frozen=True)
 class _Moments:
-    """Second moments under the posterior, summed over replicates.
+    """Posterior second moments, summed over replicates.
 
-    step : (U, 2 D, 2 D) of (w, x), the whitened noise of a step and the state before it, summed
-    over the steps of one length. start : (D, D). residual : of the whitened measurements.
+    step : (U, 2 D, 2 D) of (w, x), the whitened process noise of a step and the state before it,
+        summed over the steps of equal length.
+    start : (D, D) of the first state.
+    residual : of the whitened measurements.
     """
 
     step: Array
@@ -436,7 +467,12 @@ class _Moments:
 
 @dataclass(frozen=True)
 class _Change:
-    """A process (its place among the signal's) with one hyper-parameter moved up or down."""
+    """A process with one hyper-parameter moved by a small step, for a difference quotient.
+
+    process, name : indices of the process and of the hyper-parameter.
+    sign : 1 or -1.
+    component : the changed process.
+    """
 
     process: int
     name: int
@@ -445,9 +481,9 @@ class _Change:
 
 
 def signal_gradient(signal: Signal, model: ShakeModel, names: Sequence[str]) -> tuple[float, Array]:
-    """Return the log evidence of a signal, and its derivatives (n,).
+    """Return the log marginal likelihood of a signal and its gradient (n,).
 
-    They are with respect to the logarithms of the n hyper-parameters ``names``.
+    names : n hyper-parameters; the derivatives are with respect to their logarithms.
     """
     factor = Factor(signal, model)
     moments = _moments(factor)
@@ -477,14 +513,21 @@ def _changes(found: list[Process], names: Sequence[str]) -> list[_Change]:
 
 @dataclass(frozen=True)
 class _Places:
-    """begin : (N + 1,) first state of each process.  copies : (N,) of it, ``width`` apart."""
+    """Where the states of each process stand in the state vector.
+
+    begin : (N + 1,) first state of each process.
+    copies : (N,) number of copies of it (bubbles).
+    width : distance between copies.
+    """
 
     begin: Ints
     copies: Ints
     width: int
 
     def moments(self, found: _Moments, which: Ints) -> tuple[Array, Array]:
-        """Return (m, U, 2 n, 2 n) and (m, n, n) of processes of n states, their copies' summed."""
+        """Return moments (m, U, 2 n, 2 n) and (m, n, n) of processes of n states, summed over
+        copies.
+        """
         size, count = len(found.start), self.copies[which]
         states = np.arange(self.begin[which[0] + 1] - self.begin[which[0]])
         step, start = np.zeros(()), np.zeros(())
@@ -505,7 +548,7 @@ def _expected(
     bubble: list[Process],
     changes: list[_Change],
 ) -> Array:
-    """Return the posterior mean (changes,) of the states' log density under each process."""
+    """Return the posterior mean of the log density of the states under each changed process."""
     dt_s, index = distinct_steps(np.diff(factor.signal.t_s))
     counts = np.bincount(index, minlength=len(dt_s))
     own = [p.component for p in (*shake, *bubble)]
@@ -531,7 +574,7 @@ def _expected(
 
 
 def _noise_rows(stack: Steps, old: Ints, new: Ints) -> Array:
-    """Return whitened noise (m, U, n, 2 n) of new processes, from the old noise and the state."""
+    """Return the whitened noise of new processes (m, U, n, 2 n), linear in (w, x) of the old."""
     one, two = (np.swapaxes(stack.whitener[at], -1, -2) for at in (old, new))
     same = np.swapaxes(np.linalg.solve(one, two), -1, -2)
     moved = stack.whitener[new] @ (stack.transition[old] - stack.transition[new])

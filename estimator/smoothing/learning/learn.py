@@ -1,10 +1,10 @@
-"""Hyper-parameters of shake and bubbles from the run itself, by maximum marginal likelihood.
+"""Learns the hyper-parameters of shake and bubbles from a run by maximum marginal likelihood.
 
-Lines of the spectrum are tried one by one as what they could be (a mode that all cameras share, a
-mode of one camera's arm, an oscillation of the bubbles), kept while the Bayesian information
-criterion falls (Schwarz, Ann. Stat. 6:461, 1978), and climbed together to the most probable
-values; the curvature there (Laplace) says how well they are known. A run of the stage that watches
-a target standing still is the best source: there every line is the rig's.
+Peaks of the spectrum are added one by one, each with the owner that fits best: a mode common to all
+cameras, a mode of one camera's arm, or an oscillation of the bubbles. A line is kept if it lowers
+the Bayesian information criterion (Schwarz, Ann. Stat. 6:461, 1978). Finally all parameters are
+optimised together, and Laplace's approximation gives their covariance. The best source is a run in
+which the stage moves in front of a target at rest: there every line belongs to the rig.
 """
 
 from __future__ import annotations
@@ -72,14 +72,17 @@ def learn(
     options: Learning | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> ShakeModel:
-    """Return a model whose modes, dampings and intensities are the most probable for the run.
+    """Return the model with the most probable modes, dampings and noise intensities for a run.
 
-    start : gives what is not learned. Its modes are kept and improved, unless they are the default
-    guess (its name is "default"). progress : called with what was found and the share (0 to 1)
-    done.
-    The model's name is "learned"; ``learned`` has the standard deviations of its log-parameters. Of
-    a long run only the frames of `learning_signals` are used. With accelerometers a default start
-    is returned unchanged, since its broad band needs no modes.
+    problem : of a long run only the frames of `learning_signals` are used.
+    start : the model to begin from, which also supplies what is not learned. Its modes are kept and
+        optimised, except the guessed ones of the model named "default". With accelerometers a
+        default start is returned unchanged, since its broad band needs no modes.
+    options : what to learn.
+    progress : called with a text and the completed share, from 0 to 1.
+
+    In the returned model ``name`` is "learned", and ``learned`` contains the standard deviation of
+    the logarithm of each learned parameter.
     """
     options = options or Learning()
     if start.name == "default" and problem.accelerometers:
@@ -149,10 +152,11 @@ def _learn_group(
 
 
 def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeModel, Learning]:
-    """Return the modes found so far, moving across too, their frequencies and dampings held.
+    """Return the model with each mode of the first group repeated along the second group's
+    directions.
 
-    A single camera and bubble cannot show whether they do; a rig that shakes along one axis is not
-    taken for still along the others.
+    Frequencies and dampings are held, the RMS is learned. One camera and one bubble cannot show
+    whether the rig vibrates there, too.
     """
     at, rig = len(model.modes), [m for m in model.modes if max(m.rms_mm) > 0]
     added = []
@@ -166,7 +170,7 @@ def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeMo
 
 
 def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
-    """Return names of the RMS of modes across that others began, and what those expect of it."""
+    """Return the modes that `_seeded` added: {name of the RMS: its prior median in mm}."""
     return {
         f"modes.{i}.rms_mm": max(mode.rms_mm)
         for i, mode in enumerate(model.modes)
@@ -175,10 +179,12 @@ def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
 
 
 def posterior_rms(signals: Sequence[Signal], model: ShakeModel, name: str, median: float) -> float:
-    """Return an RMS that the data hardly determine as the root of its posterior's mean square.
+    """Return the posterior root mean square of an RMS parameter that the data hardly determine.
 
-    The most probable RMS of a line that bubbles' wide swings hide is next to 0. median : of the
-    log-normal prior.
+    The most probable value would be almost 0 where wide swings of the bubbles hide the line.
+
+    name : of the parameter.
+    median : of its log-normal prior, mm.
     """
     values = median * np.exp(_LOG_RATIOS)
     found = np.array([evidence(signals, with_values(model, [name], [v])) for v in values])
@@ -193,7 +199,7 @@ def _is_kept(label: Attribution, model: ShakeModel, options: Learning) -> bool:
 
 
 def _highest(group: Group, model: ShakeModel) -> float:
-    """Return the highest frequency at which something stands out."""
+    """Return the highest frequency with a significant spectral line, at least `LOW_HZ`."""
     lines = [
         line
         for signal in group.signals
@@ -206,7 +212,7 @@ def _highest(group: Group, model: ShakeModel) -> float:
 
 
 def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = False) -> ShakeModel:
-    """Return the model with the RMS of lines in means over ``factor`` frames, or back."""
+    """Return the model with the RMS of lines as they are after averaging over frames, or back."""
     if factor < 2:
         return model
     lines = [n for n in names_of(model) if n.endswith("rms_mm") and not n.startswith("broad")]
@@ -219,9 +225,10 @@ def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = Fa
 
 @dataclass(frozen=True)
 class Step:
-    """The state of the search for spectral lines.
+    """State of the search for spectral lines.
 
-    fit : the model and its fit. found : for each line that was added, whose line it is.
+    fit : the model and its fit.
+    found : owner of each line that was added.
     """
 
     fit: Fit
@@ -229,9 +236,11 @@ class Step:
 
 
 def with_one_more_mode(group: Group, step: Step, options: Learning, first: bool) -> Step | None:
-    """Return the model with the spectral line added that improves the fit most.
+    """Return the search with the spectral line added that improves the fit most.
 
-    Returns None if no line improves it by more than its penalty.
+    first : whether the group is the first one.
+
+    Returns None if no line improves the evidence by more than its penalty.
     """
     tried = []
     for where in group.owners:
@@ -258,7 +267,7 @@ def with_one_more_mode(group: Group, step: Step, options: Learning, first: bool)
 
 
 def try_low_pass_force(group: Group, step: Step, options: Learning, first: bool) -> Step:
-    """Low-pass filter the modes' white forces, where the information criterion prefers that."""
+    """Replace the modes' white forces by low-pass filtered ones if the BIC prefers them."""
     model = step.fit.model
     white = bool(model.modes) and all(m.force_hz is None for m in model.modes)
     if not first or not white or is_held(FORCE, model, options) or step.found[-1:] == (BUBBLE,):
@@ -273,7 +282,7 @@ def try_low_pass_force(group: Group, step: Step, options: Learning, first: bool)
 
 
 def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
-    """Return the fit with white forces, unless the information criterion prefers the low-pass."""
+    """Replace low-pass filtered forces by white ones unless the BIC prefers the former."""
     names = free_names(fit.model, group, options, True)
     if FORCE not in names:
         return fit
@@ -284,7 +293,7 @@ def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
 
 
 def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeModel:
-    """Add an arm's first mode to the other arms as well, which are built alike."""
+    """Copy an arm's first mode to the other arms, which are built alike."""
     cameras = group.signals[0].cameras
     have = {m.camera for m in model.modes[:-1] if m.camera != CARRIAGE}
     if where not in cameras or have:
@@ -295,9 +304,10 @@ def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeMode
 
 
 def _bic_penalty(group: Group, model: ShakeModel) -> float:
-    """Return the log-likelihood ratio that a line must bring, 3/2 log n (Schwarz).
+    """Return the increase of log evidence that a new line must bring: 3/2 log n.
 
-    n : two samples for each cycle of the fastest line. More frames inform on the noise alone.
+    n is two samples per period of the fastest line; more frames carry information on the noise
+    only.
     """
     span_s = group.signals[0].span_s
     lines = [mode.frequency_hz for mode in model.modes]
@@ -309,7 +319,7 @@ def _bic_penalty(group: Group, model: ShakeModel) -> float:
 def _distinct(
     trials: Sequence[tuple[float, Owner, ShakeModel]],
 ) -> list[tuple[float, Owner, ShakeModel]]:
-    """Return the best trial of each kind, of the three best kinds."""
+    """Return the best trial of each owner, for up to three owners."""
     out: dict[Owner, tuple[float, Owner, ShakeModel]] = {}
     for trial in trials:
         out.setdefault(trial[1], trial)
@@ -317,9 +327,10 @@ def _distinct(
 
 
 def _preference(model: ShakeModel, where: Owner, rival: Owner, up: Array) -> float:
-    """Return the log-likelihood ratio by which an owner must win over another.
+    """Return the log-likelihood ratio by which an owner must win over a rival.
 
-    A line that fits both goes to the rig, but the zigzag's second harmonic to the bubble.
+    If both fit equally, the line belongs to the rig; the second harmonic of a zigzag belongs to the
+    bubbles.
     """
     if BUBBLE not in (where, rival) or where == rival:
         return 0.0
@@ -369,7 +380,7 @@ def _last_line(model: ShakeModel, where: Owner) -> list[str]:
 
 
 def pruned(group: Group, fit: Fit, options: Learning, first: bool, given: int = 0) -> Fit:
-    """Remove lines that the information criterion does not need; the first ``given`` modes stay."""
+    """Remove lines without which the BIC is lower; the first ``given`` modes stay."""
     at = 0
     while True:
         names = [
@@ -415,16 +426,15 @@ BUBBLE = "bubble"
 
 @dataclass(frozen=True)
 class Learning:
-    """What may be learned from a run.
+    """Options of learning.
 
-    most_modes : largest number of spectral lines of one kind (common mode, mode of each arm,
-    bubbles' line).
+    most_modes : largest number of spectral lines per owner (common mode, each arm, bubbles).
     hold : patterns of names of hyper-parameters (see ``parameters``) that keep their start values,
-    for example "modes.*" for a rig that is known. The cut-off of the forces is held if any mode is
-    held completely.
+        for example "modes.*" for a known rig. If all parameters of a mode are held, so is the
+        cut-off of the forces.
     target : whether the tracks are those of a target at rest.
-    force_hz : first cut-off frequency of the modes' low-pass filtered force; None for a white
-    force, which is low-pass filtered only if the information criterion prefers that.
+    force_hz : initial cut-off frequency of the modes' low-pass filtered force. None begins with a
+        white force, which is low-pass filtered if the BIC prefers that.
     """
 
     most_modes: int = 3
@@ -437,9 +447,9 @@ class Learning:
 class Group:
     """Line-of-sight signals from which hyper-parameters are learned together.
 
-    pattern : (3,) share of a line's RMS along each axis of the rig. owners : to what a spectral
-    line in these signals may belong: to all cameras, to one arm, or to the bubbles. up : (3,) unit
-    vector against gravity.
+    pattern : (3,) relative RMS of a line along each axis of the rig.
+    owners : possible owners of a spectral line: all cameras, one camera's arm, or the bubbles.
+    up : (3,) unit vector against gravity.
     """
 
     signals: tuple[Signal, ...]
@@ -453,9 +463,9 @@ class Group:
 
 
 def groups_of(signals: Sequence[Signal], options: Learning, up: Array) -> list[Group]:
-    """Return the signals of the shared coordinate, and those of the other coordinates, as groups.
+    """Return two groups of signals: those of the shared coordinate, and the others.
 
-    The signals of a group are learned from together. up : (3,) unit vector against gravity.
+    up : (3,) unit vector against gravity.
     """
     if not signals:
         return []
@@ -477,9 +487,9 @@ def _pattern(square: Array) -> Triple:
 
 
 def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) -> list[str]:
-    """Return the names of the hyper-parameters that a group determines and that are not held.
+    """Return the names of the free hyper-parameters that a group determines.
 
-    first : whether it is the group that is learned from first.
+    first : whether it is the first group.
     """
     names = []
     for name in names_of(model):
@@ -509,7 +519,7 @@ def _low_pass_modes(model: ShakeModel) -> list[int]:
 
 
 def _concerns(group: Group, model: ShakeModel, name: str) -> bool:
-    """Whether a line moves along the group's directions more than along the others."""
+    """Return whether a line's largest RMS lies along the group's directions."""
     parts = name.split(".")
     lines = model.bubble.zigzags if parts[0] == "bubble" else getattr(model, parts[0])
     rms = np.asarray(lines[int(parts[-2])].rms_mm)

@@ -1,9 +1,9 @@
-"""The evidence of several signals: its maximum, its curvature there, and the spread by that.
+"""Evidence of several signals: its maximum, its curvature, and the effect on the covariances.
 
-Covariances contain the uncertainty of learned hyper-parameters (Laplace's approximation): every
-learned parameter is moved by one standard deviation up and down; by how much the smoothed
-positions, velocities and offsets move with it is added to their covariances. The parameters count
-as independent, which errs on the wide side where they are not.
+The covariances of a solution contain the uncertainty of learned hyper-parameters by Laplace's
+approximation: each parameter is moved by plus and minus one standard deviation, and the square of
+half the change of the smoothed positions, velocities and offsets is added to their variances. The
+parameters count as independent, which overestimates the variances if they are correlated.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ _IMPOSSIBLE = -1e12
 
 @dataclass(frozen=True)
 class Fit:
-    """A model and how well it fits.
+    """A fitted model.
 
-    log_evidence : log density of the data under the model. log_posterior : the same plus the log
-    prior density of the fitted hyper-parameters.
+    log_evidence : log density of the data under the model.
+    log_posterior : the same plus the log prior density of the fitted hyper-parameters.
     """
 
     model: ShakeModel
@@ -54,10 +54,7 @@ class Fit:
 
 
 def evidence(signals: Sequence[Signal], model: ShakeModel) -> float:
-    """Return the log evidence of all signals together.
-
-    It is a very low value if the model cannot be evaluated numerically.
-    """
+    """Return the log evidence of all signals together; -1e12 if it cannot be computed."""
     try:
         total = sum(signal_evidence(c, model) for c in signals)
     except np.linalg.LinAlgError:
@@ -68,7 +65,7 @@ def evidence(signals: Sequence[Signal], model: ShakeModel) -> float:
 def evidence_gradient(
     signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """Return the evidence and its derivatives (n,) by the logarithms of the named parameters."""
+    """Return the log evidence and its derivatives (n,) by the logarithms of parameters."""
     try:
         each = [signal_gradient(c, model, names) for c in signals]
     except np.linalg.LinAlgError:
@@ -82,7 +79,9 @@ def evidence_gradient(
 def _posterior_gradient(
     signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """Return `evidence_gradient` with the parameters' priors added."""
+    """Return the log posterior density and its derivatives: `evidence_gradient` plus the log
+    priors.
+    """
     found, slope = evidence_gradient(signals, model, names)
     priors = [prior_of(n) for n in names]
     of_prior = [p.log_gradient(value_of(model, n)) for n, p in zip(names, priors)]
@@ -92,7 +91,10 @@ def _posterior_gradient(
 def maximise(
     signals: Sequence[Signal], model: ShakeModel, names: Sequence[str], *, steps: int = 25
 ) -> Fit:
-    """Maximise over the logarithms of the named parameters within bounds (quasi-Newton)."""
+    """Maximise the posterior over the logarithms of the named parameters (L-BFGS-B, within bounds).
+
+    steps : largest number of iterations.
+    """
     from scipy.optimize import minimize
 
     if not names:
@@ -124,9 +126,9 @@ def maximise(
 
 
 def laplace_covariance(signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]) -> Array:
-    """Return the covariance (n, n) of the log-parameters by Laplace's approximation.
+    """Return the covariance (n, n) of the logarithms of the parameters by Laplace's approximation.
 
-    Curvature that is not positive (a flat or bounded direction) is filled up by the prior's.
+    No direction has less curvature than the prior gives it.
     """
     scale = np.array([prior_of(n).step for n in names])
     values = np.log([value_of(model, n) for n in names])
@@ -157,10 +159,10 @@ _Triple = tuple[Array, Array, Array]
 
 
 def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
-    """Return the solution with the spread by its model's ``learned`` parameters in its covariances.
+    """Return the solution with the uncertainty of learned hyper-parameters in its covariances.
 
-    Bubbles and frames beyond those that learning uses get the mean spread of those. The solution is
-    unchanged without covariances, learned parameters or measurements of positive weight.
+    Bubbles and frames that learning did not use get the mean increase. The solution is unchanged
+    without covariances, learned parameters or measurements of positive weight.
     """
     found, model, problem = solution.covariances, solution.graph.model, solution.graph.problem
     if found is None or not model.learned or not problem.bubbles:
@@ -187,7 +189,7 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
 
 
 def _spread(signal: Signal, model: ShakeModel) -> _Triple:
-    """Return variances (B, F) of position and velocity, NaN if unseen, and (J, F) of offsets."""
+    """Return variances of position and velocity (B, F), NaN off the tracks, and offsets (J, F)."""
     parts = pooled(signal)
     total = [np.zeros((1, len(signal.t_s)))] * 3
     for name, sigma in model.learned.items():
@@ -206,7 +208,7 @@ def _spread(signal: Signal, model: ShakeModel) -> _Triple:
 
 
 def _there(signal: Signal) -> Bools:
-    """Return (B, F) whether each moving item has been seen and will be seen again."""
+    """Return whether each moving item's track covers each frame (B, F)."""
     seen = np.array(
         [(signal.weight[:, signal.item == i] > 0).any(1) for i in np.flatnonzero(signal.moving)]
     )
@@ -215,12 +217,12 @@ def _there(signal: Signal) -> Bools:
 
 
 def _same(signal: Signal, one: ShakeModel, two: ShakeModel) -> bool:
-    """Whether both models are the same for this signal."""
+    """Return whether two models have the same processes for a signal."""
     return all(a is b for a, b in zip(processes(signal, one), processes(signal, two)))
 
 
 def _moved(signal: Signal, up: ShakeModel, down: ShakeModel) -> _Triple:
-    """Return the posterior means under one model minus those under the other."""
+    """Return the difference of the posterior means under two models."""
     one, two = signal_posterior(signal, up), signal_posterior(signal, down)
     return (
         one.position_mm - two.position_mm,
@@ -235,7 +237,7 @@ def _still(signal: Signal) -> _Triple:
 
 
 def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
-    """Return the signals of each bubble, where they are split into mean and differences."""
+    """Return the signals of each bubble from those of the mean and the differences."""
     if len(moved) == 1:
         return moved[0]
     (position, velocity, offset), apart = moved
@@ -252,7 +254,9 @@ def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
 
 
 def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
-    """Return (rows,) of the bubbles' states, from (B, F) of the signal's bubbles, or (1, 1)."""
+    """Return values (rows,) for all states of bubbles from (B, F) of the signal's bubbles, or (1,
+    1).
+    """
     graph = solution.graph
     if variance.size == 1:
         return np.full(graph.rows, variance.item())
@@ -270,14 +274,14 @@ def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
 
 
 def _mean(variance: Array) -> Array:
-    """Return the mean (1, 1) of all that are known."""
+    """Return the mean (1, 1) of the finite values."""
     return np.asarray(np.mean(variance[np.isfinite(variance)])).reshape(1, 1)
 
 
 def _shaken(
     solution: Solution, signals: list[Signal], spreads: list[Array], found: Covariances
 ) -> Array:
-    """Return the covariance (F, D, D) of the shake, widened along what the cameras see."""
+    """Return the covariance (F, D, D) of the shake, increased along the signals' directions."""
     layout, out = solution.graph.shake, found.shake.copy()
     for signal, variance in zip(signals, spreads):
         rows = np.einsum("i,cid->cd", signal.direction, layout.offset[list(signal.cameras)])

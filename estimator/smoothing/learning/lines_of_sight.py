@@ -1,10 +1,10 @@
-"""Line-of-sight signals: what the cameras measure, one coordinate at a time.
+"""Line-of-sight signals: the measurements of all cameras, one coordinate at a time.
 
-For cameras without distortion of the second order in shake, a pixel is a linear function of the
-bubble's place across the line of sight. Along one direction d seen by camera j it measures
-d . (bubble - offset_j), the encoder added. The coordinate that two cameras share (their common
-perpendicular) makes one signal, each camera's other coordinate another. Learning and the swaps of
-attributions work on signals: a few states each, where the whole graph has dozens.
+For small shake a pixel is a linear function of the bubble's position across the line of sight.
+Along a direction d that camera j sees, it measures d . (bubble - offset_j), plus the encoder
+position. The coordinate that two cameras share (along their common perpendicular) is one signal,
+each camera's other coordinate is another. A signal has a few states where the graph has dozens, so
+that learning is fast.
 """
 
 from __future__ import annotations
@@ -29,19 +29,22 @@ PRESENT = 0.75
 
 @dataclass(frozen=True)
 class Signal:
-    """Measurements of one coordinate.
+    """Measurements of one coordinate by J cameras: F frames, I items (bubbles, marks), P pairs.
 
-    direction : (3,) unit vector in rig axes. cameras : indices of those that see it.
-    t_s : (F,). value_mm, weight : (F, P) measured d . (item - offset) less ``start_mm``, and 1 /
-    variance, 0 where nothing was seen; P = pairs of an item and a camera.
-    item, camera : (P,) of each pair, the camera as index into ``cameras``. moving : (I,) False for
-    what is fixed to the tank. first : (I,) frame it was first seen. start_mm : (I,). start_sigma_mm
-    : (I,) prior of a fixed item's place. bubble : (I,) index into the problem's bubbles, -1 for
-    marks.
-    pooled : number of bubbles whose mean the moving item is. shaken : False for differences of
-    bubbles, which no shake reaches.
-    Values (F, P, R) are replicates, which differ in nothing but their values: differences of
-    bubbles, or pieces of a run (`stacked`).
+    direction : (3,) unit vector in the rig frame.
+    cameras : (J,) indices of the cameras that see it.
+    t_s : (F,).
+    value_mm : (F, P) d . (item - offset) less ``start_mm``; or (F, P, R) for R replicates, which
+        share all other fields: differences of bubbles, or pieces of a run (`stacked`).
+    weight : (F, P) 1 / variance; 0 where nothing was seen.
+    item, camera : (P,) of each pair, as indices into the items and into ``cameras``.
+    moving : (I,) False for items at rest in the tank.
+    first : (I,) frame in which it was first seen.
+    start_mm : (I,).
+    start_sigma_mm : (I,) prior sd of an item at rest.
+    bubble : (I,) index into the problem's bubbles; -1 for marks.
+    pooled : number of bubbles whose mean the moving item is.
+    shaken : False for differences of bubbles, in which the shake cancels.
     """
 
     direction: Array
@@ -65,13 +68,13 @@ class Signal:
 
     @property
     def span_s(self) -> float:
-        """Time from the first to the last frame, of all replicates together."""
+        """Time from the first to the last frame, summed over replicates."""
         replicates = self.value_mm.shape[-1] if self.value_mm.ndim == 3 else 1
         return float(self.t_s[-1] - self.t_s[0]) * replicates
 
 
 def sight_directions(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, ...]]]:
-    """Return directions (3,) with the cameras that see them; the shared one first, if any."""
+    """Return the measured directions (3,) and the cameras that see each; the shared one first."""
     depths = np.array([c.camera_from_rig.rotation[2] for c in problem.cameras])
     cross = np.cross(depths[0], depths[-1])
     length = float(np.linalg.norm(cross))
@@ -88,14 +91,14 @@ def sight_directions(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, 
 
 
 def _signed(direction: Array) -> Array:
-    """Return the same line, its largest component positive."""
+    """Return the direction with the sign that makes its largest component positive."""
     return np.asarray(direction * np.sign(direction[np.abs(direction).argmax()]))
 
 
 def signals_of(problem: SmoothingProblem, *, fixed: bool = False) -> tuple[Signal, ...]:
-    """Return the problem's signals, of its marks and of the bubbles that are learned from.
+    """Return the signals of a problem, from its marks and up to `MOST_BUBBLES` bubbles.
 
-    fixed : the tracks are those of a target at rest.
+    fixed : whether the tracks are those of a target at rest.
     """
     chosen, position = _chosen(problem, fixed), problem.encoder_mm
     out = []
@@ -109,7 +112,7 @@ def signals_of(problem: SmoothingProblem, *, fixed: bool = False) -> tuple[Signa
 
 
 def _chosen(problem: SmoothingProblem, fixed: bool) -> Ints:
-    """Return the bubbles that were seen longest, or, where they are `pooled`, all of these."""
+    """Return the indices of the bubbles that are seen longest, or of all that can be `pooled`."""
     seen = np.zeros((len(problem.bubbles), len(problem.cameras)), np.int64)
     np.add.at(seen, (problem.observations.item, problem.observations.camera), 1)
     present = np.flatnonzero(seen.min(1) >= PRESENT * len(problem.t_s))
@@ -151,7 +154,7 @@ def _along(
     problem: SmoothingProblem, obs: Observations, points: Array, position: Array, direction: Array,
     cameras: tuple[int, ...],
 ) -> _Rows:  # fmt: skip
-    """Return pixels turned into lab coordinates along the direction, linearised at ``points``."""
+    """Convert pixels to laboratory coordinates along a direction, linearised at ``points``."""
     parts: list[_Rows] = []
     for index, c in enumerate(cameras):
         mine = np.flatnonzero(obs.camera == c)
@@ -203,11 +206,11 @@ def _signal(
 
 
 def pooled(signal: Signal) -> tuple[Signal, ...]:
-    """Return the mean of the bubbles and their differences, where all were nearly always seen.
+    """Split a signal of several bubbles into their mean and their differences.
 
-    For bubbles alike in noise and presence the two are independent, and the likelihood is that of a
-    single bubble twice. Few missing pixels are bridged by straight lines. Other signals stay as
-    they are.
+    For equal noise in all frames the two are independent, so that the likelihood costs as much as
+    that of two bubbles. Short gaps are interpolated. A signal with marks or with bubbles that are
+    often unseen is returned as it is.
     """
     movers = np.flatnonzero(signal.moving)
     cameras, count = len(signal.cameras), len(movers)
@@ -235,7 +238,7 @@ def pooled(signal: Signal) -> tuple[Signal, ...]:
 
 
 def stacked(pieces: Sequence[Signal]) -> Signal:
-    """Return one signal of equally long pieces of a run, as replicates (F, P, R)."""
+    """Return equally long pieces of a run as one signal with replicates (F, P, R)."""
     parts = [_bridged(p.t_s, p.value_mm, p.weight) for p in pieces]
     value = np.stack([v for v, _ in parts], -1)
     weight = np.mean([w for _, w in parts], axis=0)
@@ -243,13 +246,13 @@ def stacked(pieces: Sequence[Signal]) -> Signal:
 
 
 def contrasts(count: int) -> Array:
-    """Return (count - 1, count) orthonormal rows that are blind to the mean (Helmert)."""
+    """Return Helmert contrasts (count - 1, count): orthonormal rows, orthogonal to the mean."""
     full = np.linalg.qr(np.c_[np.ones(count), np.eye(count)[:, : count - 1]])[0]
     return np.asarray(full[:, 1:].T)
 
 
 def _bridged(t_s: Array, value: Array, weight: Array) -> tuple[Array, Array]:
-    """Return the values (F, P) with their gaps closed; weights (F, P), the same at all frames."""
+    """Return values (F, P) with gaps interpolated, and weights (F, P), constant in time."""
     out = value.copy()
     for column in range(value.shape[1]):
         good = weight[:, column] > 0

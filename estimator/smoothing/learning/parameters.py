@@ -1,8 +1,8 @@
-"""Hyper-parameters by name: numbers inside a `ShakeModel`, and the processes that they make.
+"""Names of hyper-parameters in a `ShakeModel`, and the processes that they describe.
 
-Names are paths: ``modes.0.frequency_hz``, ``bubble.zigzags.1.rms_mm``, ``pixel_inflation``. An RMS
-with three components is one number, its largest component; setting it keeps the proportions. The
-low-pass cut-off of the modes' force is one for all, ``modes.force_hz``.
+A name is a path: ``modes.0.frequency_hz``, ``bubble.zigzags.1.rms_mm``, ``pixel_inflation``. An RMS
+with three components counts as one number, the largest; setting it keeps the proportions. All
+low-pass filtered forces share one cut-off, ``modes.force_hz``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def prior_of(name: str) -> Prior:
 
 
 def value_of(model: ShakeModel, name: str) -> float:
-    """Return the hyper-parameter with a name of `names_of`, in the unit that the name ends in.
+    """Return the value of a hyper-parameter, in the unit that its name ends with.
 
     Raises InputError for an unknown name.
     """
@@ -74,7 +74,7 @@ def value_of(model: ShakeModel, name: str) -> float:
 
 
 def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]) -> ShakeModel:
-    """Return the model with these numbers replaced."""
+    """Return the model with new values of the named hyper-parameters."""
     out: Any = model
     for name, value in zip(names, values):
         if name == FORCE:
@@ -95,7 +95,7 @@ def with_cutoff(model: ShakeModel, force_hz: float) -> ShakeModel:
 
 
 def with_low_pass_force(model: ShakeModel, force_hz: float | None) -> ShakeModel:
-    """Return the model with another cut-off of all modes' forces; None makes them white noise."""
+    """Return the model with another cut-off of all modes' forces; None makes them white."""
     return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
 
 
@@ -132,7 +132,7 @@ _broad_band, _slow_ou = lru_cache(maxsize=512)(broad_band), lru_cache(maxsize=51
 
 
 def names_of_process(process: Process) -> dict[str, str]:
-    """Return the hyper-parameters' names, mapped to their last parts."""
+    """Return {name of the hyper-parameter in the model: its name in the process}."""
     return {FORCE if n == "force_hz" else f"{process.stem}.{n}": n for n in process.learned}
 
 

@@ -1,9 +1,8 @@
-"""Finds the spectral lines that a model leaves unexplained, and attributes each line to the bubbles
-or to the rig.
+"""Finds spectral lines that a model leaves unexplained, and decides between rig and bubbles.
 
-With one bubble the likelihood is the same for both owners; several bubbles, marks or sensors make
-the owner identifiable. An ambiguous line is shared between both owners, half of the variance each:
-the share is unknown then, and the posterior covariance contains both explanations.
+With one bubble the likelihood is the same for both owners; several bubbles, marks or accelerometers
+make the owner identifiable. Half of the variance of an ambiguous line is given to each owner, so
+that the posterior covariance contains both explanations.
 """
 
 from __future__ import annotations
@@ -34,7 +33,10 @@ _ENOUGH = 500
 
 @dataclass(frozen=True)
 class Line:
-    """Holds a peak of the spectrum; ``excess`` is its height over the model's."""
+    """A spectral peak.
+
+    excess : ratio of the observed to the expected density at the peak.
+    """
 
     frequency_hz: float
     rms_mm: float
@@ -42,7 +44,7 @@ class Line:
 
 
 def density(components: Iterable[Component], frequency_hz: Array) -> Array:
-    """Return the one-sided density (n,) in mm^2/Hz of the sum of independent processes."""
+    """Return the one-sided spectral density (n,) in mm^2/Hz of the sum of independent processes."""
     s = 2j * np.pi * frequency_hz
     total = np.zeros(len(frequency_hz))
     for part in components:
@@ -53,7 +55,7 @@ def density(components: Iterable[Component], frequency_hz: Array) -> Array:
 
 
 def averaged(signal: Signal, factor: int) -> Signal:
-    """Return means over ``factor`` frames. They keep all noise and blur fast lines a little."""
+    """Return the signal averaged over blocks of ``factor`` frames."""
     if factor < 2 or len(signal.t_s) < 8 * factor:
         return signal
     count = len(signal.t_s) // factor
@@ -71,9 +73,10 @@ def averaged(signal: Signal, factor: int) -> Signal:
 
 
 def averaging_factor(t_s: Array, highest_hz: float) -> int:
-    """Return how many frames may be averaged before a line of that frequency fades by 2 %.
+    """Return over how many frames a signal may be averaged.
 
-    By 8 % while more than `_ENOUGH` frames are left.
+    The amplitude of a line at ``highest_hz`` falls by at most 2 %; by at most 8 % while more than
+    500 blocks remain.
     """
     step = float(np.median(np.diff(t_s)))
     little, more = (int(s / (np.pi * highest_hz * step)) for s in (_SMEAR_RAD, _MOST_SMEAR_RAD))
@@ -81,17 +84,19 @@ def averaging_factor(t_s: Array, highest_hz: float) -> int:
 
 
 def averaging_loss(frequency_hz: float, factor: int, t_s: Array) -> float:
-    """Return the factor by which a mean over ``factor`` frames shrinks a line's amplitude."""
+    """Return the amplitude ratio of a line after averaging over ``factor`` frames."""
     step = float(np.median(np.diff(t_s)))
     fine = np.sinc(frequency_hz * step)
     return float(np.sinc(frequency_hz * step * factor) / fine)
 
 
 def unexplained(signal: Signal, model: ShakeModel, where: int | str, count: int = 3) -> list[Line]:
-    """Return the highest peaks of a spectrum over the model's.
+    """Return the peaks of the spectrum that exceed the model's spectrum most.
 
-    where : CARRIAGE: the mean of all items and cameras; "bubble": bubbles less their mean (of one
-    bubble: as CARRIAGE); a camera: its difference from the mean of the cameras.
+    where : the owner that is searched for. CARRIAGE uses the mean over items and cameras; "bubble"
+        each bubble minus the mean (with one bubble as CARRIAGE); a camera its difference from the
+        others.
+    count : the number of peaks.
     """
     frequency, power, expected = _spectra(signal, model, where)
     if not len(frequency):
@@ -108,7 +113,7 @@ def unexplained(signal: Signal, model: ShakeModel, where: int | str, count: int 
 
 
 def _spectra(signal: Signal, model: ShakeModel, where: int | str) -> tuple[Array, Array, Array]:
-    """Return frequencies, the observed density (Hann windows), and the expected density."""
+    """Return frequencies (F,), and observed (Hann windows) and expected densities (F,)."""
     from scipy.signal import periodogram
 
     t = signal.t_s
@@ -152,7 +157,7 @@ def _expected(signal: Signal, model: ShakeModel, where: int | str, frequency: Ar
 
 
 def _series(signal: Signal, where: int | str) -> tuple[list[Array], list[Array]]:
-    """Return independent series (F,) of one kind and their weights (1 / variance)."""
+    """Return series (F,) for one owner, and their weights (1 / variance)."""
     if signal.value_mm.ndim == 3:
         pieces = np.moveaxis(signal.value_mm, -1, 0)
         each = [_series(replace(signal, value_mm=piece), where) for piece in pieces]
@@ -175,7 +180,7 @@ def _series(signal: Signal, where: int | str) -> tuple[list[Array], list[Array]]
 
 
 def _level(signal: Signal) -> Array:
-    """Return the values minus each item's mean, so that items may come and go."""
+    """Return the values minus the mean of each item."""
     total = signal.weight.sum(0)
     mean = (signal.weight * signal.value_mm).sum(0) / np.where(total > 0, total, 1.0)
     return np.asarray(signal.value_mm - mean)
@@ -203,10 +208,12 @@ _LEAST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Attribution:
-    """A line's owner, and the log-likelihood ratio to the other owner, lines refitted.
+    """The owner of a spectral line.
 
-    owner : "rig" or "bubble". index : into the model's modes or zigzags. log_prior_ratio : of what
-    is known before any image, as of a zigzag's second harmonic.
+    owner : "rig" or "bubble".
+    index : of the line among the model's modes or zigzags.
+    log_likelihood_ratio : to the other owner, with the lines refitted.
+    log_prior_ratio : from prior knowledge; positive for a zigzag's second harmonic.
     """
 
     owner: str
@@ -224,9 +231,10 @@ class Attribution:
 def attributions(
     signals: Sequence[Signal], model: ShakeModel, pattern: Sequence[float], up: Array
 ) -> list[Attribution]:
-    """Return the lines of these signals that could be the whole rig's or the bubbles'.
+    """Return the owners of the lines that could be a common mode of the rig or the bubbles'.
 
-    pattern : (3,) the directions along rig axes in which lines are moved. up : (3,).
+    pattern : (3,) axes of the rig along which lines are tested.
+    up : (3,) unit vector against gravity.
     """
     if not any(c.moving.any() for c in signals):
         return []
@@ -247,7 +255,7 @@ def attributions(
 
 
 def _is_common(mode: RigMode, signals: Sequence[Signal]) -> bool:
-    """Return whether a mode is common to all cameras; only then it looks like a bubble's."""
+    """Return whether a mode moves all cameras of the signals alike, as a bubble's motion does."""
     if mode.camera == CARRIAGE:
         return True
     return all(c.cameras == (mode.camera,) for c in signals if mode.camera in c.cameras)
@@ -259,7 +267,7 @@ def _lies_in(rms_mm: Sequence[float], pattern: Sequence[float]) -> bool:
 
 
 def _cost(signals: Sequence[Signal], model: ShakeModel, other: ShakeModel, at: float) -> float:
-    """Return the loss of log-likelihood, with the lines refitted where that could matter."""
+    """Return the loss of log-likelihood in another model, lines refitted if that may matter."""
     loss = at - evidence(signals, other)
     if AMBIGUOUS_LOG_RATIO / 2 < loss < _REFIT_LOG_RATIO:
         loss = min(loss, at - maximise(signals, other, _line_names(other), steps=8).log_evidence)
@@ -273,10 +281,9 @@ def _line_names(model: ShakeModel) -> list[str]:
 
 
 def _own_motion_log_ratio(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
-    """Return the prior log ratio: wide swings and their second harmonic are the bubbles'.
+    """Return the prior log ratio for the bubbles: wide swings and their second harmonic are theirs.
 
-    Where the cameras shake against each other, the rig may well shake as a whole: then the second
-    harmonic is not taken for the bubbles'.
+    If there is differential shake, a common mode is likely as well, and the harmonic gets no bonus.
     """
     line = model.bubble.zigzags[index]
     swings = [z for z in model.bubble.zigzags if is_zigzag(z, up)]
@@ -287,7 +294,7 @@ def _own_motion_log_ratio(model: ShakeModel, index: int, differential: bool, up:
 
 
 def is_zigzag(line: Zigzag, up: Array) -> bool:
-    """Return whether a line is a wide swing across the vertical, as bubbles' paths have."""
+    """Return whether a line is a wide lateral swing, as in the path of a rising bubble."""
     rms, upright = np.asarray(line.rms_mm), np.abs(up)
     across = float(np.linalg.norm(rms * (1 - upright)))
     wide = across > _ZIGZAG_MM and across > float(np.linalg.norm(rms * upright))
@@ -295,7 +302,7 @@ def is_zigzag(line: Zigzag, up: Array) -> bool:
 
 
 def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
-    """Return the model with a share of a mode's variance given to the bubbles."""
+    """Return the model with a share of a mode's variance moved to the bubbles."""
     mode = model.modes[index]
     rms = _scaled(mode.rms_mm, np.sqrt(share))
     added = Zigzag(mode.frequency_hz, mode.damping, rms, mode.force_hz)
@@ -305,7 +312,7 @@ def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeM
 
 
 def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
-    """Return the model with a share of a bubble line's variance given to a mode of the rig."""
+    """Return the model with a share of a bubble line's variance moved to a mode of the rig."""
     line = model.bubble.zigzags[index]
     rms = _scaled(line.rms_mm, np.sqrt(share))
     added = RigMode(line.frequency_hz, line.damping, rms, force_hz=line.force_hz)
@@ -314,7 +321,7 @@ def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeMode
 
 
 def _with_rest(lines: tuple[L, ...], index: int, share: float) -> tuple[L, ...]:
-    """Return the lines after one has lost a share of its variance; without it if all is lost."""
+    """Return the lines with one line's variance reduced by a share; without it for 1."""
     line = lines[index]
     rest: tuple[L, ...] = ()
     if share < 1:
@@ -323,7 +330,7 @@ def _with_rest(lines: tuple[L, ...], index: int, share: float) -> tuple[L, ...]:
 
 
 def _joined(lines: tuple[Zigzag, ...], added: Zigzag) -> tuple[Zigzag, ...]:
-    """Return the lines, with the variances of equal ones added."""
+    """Return the lines with another one added; variances of equal lines add up."""
     for i, line in enumerate(lines):
         near = abs(line.frequency_hz / added.frequency_hz - 1) < _SAME_HZ
         near &= line.force_hz == added.force_hz
@@ -339,7 +346,7 @@ def _scaled(rms_mm: Sequence[float], factor: float) -> tuple[float, float, float
 
 
 def with_split_lines(model: ShakeModel, found: Sequence[Attribution]) -> ShakeModel:
-    """Return the model in which rig and bubbles share the variance of each ambiguous line."""
+    """Return the model in which rig and bubbles share each ambiguous line's variance equally."""
     for label in sorted(found, key=lambda one: -one.index):
         if label.ambiguous and label.owner == "bubble":
             model = moved_to_rig(model, label.index, 0.5)
@@ -354,10 +361,10 @@ def with_hidden_modes(
 ) -> ShakeModel:
     """Return the model with hidden modes: modes of the rig at the frequency of a bubbles' line.
 
-    The bubbles' differences show their own line; a rig's line of the same frequency adds to what
-    they have in common, where a share of 1 / bubbles is theirs anyway. Its RMS is the root of the
-    posterior's mean square, under a flat prior up to the bubbles' own, less where the rig's main
-    line is seen elsewhere. Wide swings across the vertical are the bubbles'.
+    The differences of n bubbles determine the bubbles' line. A mode of the same frequency adds to
+    the bubbles' mean, which contains 1/n of the line's variance anyway. The RMS of the mode is the
+    root mean square of its posterior; its prior is flat up to the RMS of the line, and lower where
+    the rig's main mode is seen at another frequency. Zigzags are never attributed to the rig.
     """
     own = [m for m in model.modes if _lies_in(m.rms_mm, pattern) and not _is_half(m, model)]
     for index, line in enumerate(model.bubble.zigzags):
@@ -378,9 +385,9 @@ def with_hidden_modes(
 def _with_hidden_mode(
     signals: Sequence[Signal], model: ShakeModel, index: int, rig: RigMode, share: float
 ) -> Fit:
-    """Return the model with a share of a line given to the rig, the bubbles' line refitted.
+    """Fit the model with a hidden mode of a share of the line's RMS; the bubbles' line is refitted.
 
-    Found without it, the bubbles' line is too wide: it had to be what they have in common, too.
+    The line was too wide, because it had to explain the mean of the bubbles as well.
     """
     stem = f"bubble.zigzags.{index}"
     names = [f"{stem}.{last}" for last in ("frequency_hz", "damping", "rms_mm")]
@@ -391,16 +398,18 @@ def _with_hidden_mode(
 
 
 def _is_half(mode: RigMode, model: ShakeModel) -> bool:
-    """Return whether a mode is half of an ambiguous line, the other half being the bubbles'."""
+    """Return whether a mode is the rig's half of an ambiguous line."""
     return any(z.frequency_hz == mode.frequency_hz for z in model.bubble.zigzags)
 
 
 def hidden_mode_weights(line: Zigzag, own: Sequence[RigMode]) -> Array:
-    """Return the prior weights of hidden modes, by their `_SHARES` of the line's RMS.
+    """Return the prior weights of hidden modes with `_SHARES` (n,) of the line's RMS.
 
-    They are alike where the rig shows no line of its own elsewhere (a quarter of the frequency
-    away). A mode weaker than the strongest there would be one more, and lie just here by chance:
-    with the probability that one of `_MORE` falls so near. What it loses goes to none (the first).
+    own : modes of the rig.
+
+    They are equal if the rig has no mode at another frequency. Otherwise a mode weaker than the
+    strongest of these would have to lie at the line's frequency by chance, and its weight is the
+    probability that one of `_MORE` modes does. The rest of the weight goes to the first share, 0.
     """
     away = [max(m.rms_mm) for m in own if m.camera == CARRIAGE and _is_elsewhere(m, line)]
     strongest = max(away, default=0.0)

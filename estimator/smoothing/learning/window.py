@@ -1,4 +1,4 @@
-"""From which frames of a run its hyper-parameters are learned, so that the cost is bounded."""
+"""Chooses the frames of a run from which hyper-parameters are learned, to limit the cost."""
 
 from __future__ import annotations
 
@@ -30,7 +30,11 @@ much the steps of frames may differ then."""
 def learning_signals(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
 ) -> tuple[Signal, ...]:
-    """Return the signals of `learning_parts`, several parts as replicates of each other."""
+    """Return the signals of `learning_parts`; several parts become replicates of one signal.
+
+    weights : of the observations of bubbles and of marks; those below 0.5 are left out.
+    fixed : whether the tracks are those of a target at rest.
+    """
     parts = [part.problem for part in learning_parts(problem, weights, fixed=fixed)]
     if len(parts) > 1:
         return tuple(stacked(some) for some in zip(*map(signals_of, parts)))
@@ -40,10 +44,10 @@ def learning_signals(
 def learning_parts(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
 ) -> list[Window]:
-    """Return the parts of a run that hyper-parameters are learned from, in their order.
+    """Return the parts of a run that hyper-parameters are learned from, in order of time.
 
-    That is `learning_window`, or, of tracks that come and go, short pieces of the run in which some
-    bubbles are seen all the time.
+    This is `learning_window`; or, if tracks are short, several pieces of the run in each of which
+    some bubbles are always seen. Arguments as for `learning_signals`.
     """
     window = learning_window(problem, weights)
     return ([] if fixed else _pieces(problem, weights, window)) or [window]
@@ -52,10 +56,9 @@ def learning_parts(
 def _pieces(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None, window: Window
 ) -> list[Window]:
-    """Return the longest pieces of a run in which enough bubbles are seen all the time.
+    """Return the longest pieces of a run in which at least three bubbles are always seen.
 
-    None where enough are seen all of the ``window``, for short runs, and where something stands
-    still.
+    The list is empty if ``window`` is such a piece, for short runs, and for runs with marks.
     """
     length, end = len(window.problem.t_s), window.first + len(window.problem.t_s)
     firsts, lasts = (np.array([getattr(b, n) for b in problem.bubbles]) for n in ("first", "last"))
@@ -87,14 +90,14 @@ def _pieces(
 
 
 def _all_see(problem: SmoothingProblem) -> bool:
-    """Whether every camera sees every bubble most of the time."""
+    """Return whether every camera sees every bubble in 75 % of the frames."""
     seen = np.zeros((len(problem.cameras), len(problem.bubbles)), np.int64)
     np.add.at(seen, (problem.observations.camera, problem.observations.item), 1)
     return bool(seen.min() >= PRESENT * len(problem.t_s))
 
 
 def _with_fewer(piece: Window, count: int) -> Window:
-    """Return the piece with so many bubbles only."""
+    """Return the piece with its ``count`` longest tracks."""
     fewer = cut_out(piece.problem, 0, len(piece.problem.t_s), most_bubbles=count)
     return Window(fewer.problem, piece.first, piece.bubbles[fewer.bubbles])
 
@@ -102,11 +105,12 @@ def _with_fewer(piece: Window, count: int) -> Window:
 def learning_window(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None = None
 ) -> Window:
-    """Return the `MOST_FRAMES` frames in which the bubbles that learning uses are seen most.
+    """Return the window of up to `MOST_FRAMES` frames in which the longest tracks are seen most.
 
-    They are fewer where tracks are shorter: bubbles that are seen nearly all of the time are
-    learned from as one (`pooled`), at a fraction of the cost. weights : those below 0.5 are left
-    out.
+    It is shorter if three bubbles are nearly always seen in a shorter window: these can be
+    `pooled`, which is faster.
+
+    weights : of the observations of bubbles and of marks; those below 0.5 are left out.
     """
     count = len(problem.t_s)
     if weights is not None:
@@ -123,7 +127,10 @@ def learning_window(
 
 
 def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tuple[int, int]:
-    """Return the first frame of the window in which most is seen, and how many bubbles are."""
+    """Return the first frame of the best window, and the number of bubbles that are seen in it.
+
+    share : of the frames in which a bubble has to be seen to count.
+    """
     count, step = len(problem.t_s), max(length // _PLACES, 1)
     firsts = np.unique(np.append(np.arange(0, count - length, step), count - length))
     seen, cameras = problem.observations, len(problem.cameras)
@@ -138,7 +145,7 @@ def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tup
 
 
 def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Window]:
-    """Return up to ``most`` windows over the rest, as long as the one used, or `MOST_FRAMES`."""
+    """Return up to ``most`` windows outside the used one, of its length or `MOST_FRAMES`."""
     end = used.first + len(used.problem.t_s)
     length = min(end - used.first, MOST_FRAMES)
     before, after = _spread(0, used.first, length), _spread(end, len(problem.t_s), length)

@@ -1,4 +1,4 @@
-"""What a smoothing problem is: measurements, geometry, priors.
+"""Defines the smoothing problem: measurements, geometry and priors of one run.
 
 In: tracks and sensor tables. Out: a ``SmoothingProblem``. Read ``problem`` first.
 """

@@ -24,12 +24,13 @@ a vibration that is common to all cameras.
 
 @dataclass(frozen=True)
 class RigMode:
-    """One vibration of the rig; those along the axes x, y and z are independent.
+    """One vibration mode of the rig, with independent motion along x, y and z.
 
-    damping : damping ratio. rms_mm : RMS displacement along x, y and z. camera : index of the
-    camera whose arm vibrates, or CARRIAGE for all cameras.
-    force_hz : cut-off frequency of the two-pole low-pass filter of the driving force; None for a
-    white force, which is possible only without accelerometers.
+    frequency_hz, damping : natural frequency and damping ratio.
+    rms_mm : RMS displacement along x, y and z of the rig frame.
+    camera : index of the camera whose arm vibrates, or CARRIAGE for all cameras.
+    force_hz : cut-off frequency of the two-pole low-pass filter of the driving force. None for a
+        white force, which is possible only without accelerometers.
     """
 
     frequency_hz: float
@@ -41,12 +42,13 @@ class RigMode:
 
 @dataclass(frozen=True)
 class BroadBand:
-    """Shake whose modes are unknown, of one camera or of all cameras.
+    """Prior of shake with unknown modes, of one camera or of all cameras.
 
-    rms_mm : RMS displacement along x, y and z. camera : its index, or CARRIAGE. low_hz, high_hz,
-    floor, tail : see `telerig.factors.state_space.broad_band`.
+    rms_mm : RMS displacement along x, y and z of the rig frame.
+    camera : index of the camera, or CARRIAGE for all cameras.
+    low_hz, high_hz, floor, tail : see `telerig.factors.state_space.broad_band`.
     slow_rms_mm, slow_tau_s : RMS and correlation time of an additional slow offset
-    (Ornstein-Uhlenbeck process), which accelerometers do not measure.
+        (Ornstein-Uhlenbeck process), which accelerometers do not measure.
     """
 
     rms_mm: Triple
@@ -61,13 +63,13 @@ class BroadBand:
 
 @dataclass(frozen=True)
 class CarriageModel:
-    """The prior of the carriage's motion along the travel axis.
+    """Prior of the carriage's motion along the travel axis.
 
-    kind : "readings" for no dynamics, where the position at a frame is what the encoder reads;
-    "force" for a random acceleration, which accelerometers and slow encoders need.
-    acceleration_rms_mm_s2, corner_hz : its RMS, and cut-off frequency of its three-pole low-pass
-    filter. servo : RMS (mm), frequency (Hz) and damping ratio of an additional oscillation, or
-    None.
+    kind : "readings" for no dynamics: the position at a frame is the interpolated encoder reading.
+        "force" for a random acceleration, which accelerometers and slow encoders need.
+    acceleration_rms_mm_s2 : RMS of this acceleration.
+    corner_hz : cut-off frequency of its three-pole low-pass filter.
+    servo : (RMS (mm), frequency (Hz), damping ratio) of an additional oscillation, or None.
     """
 
     kind: Literal["readings", "force"] = "readings"
@@ -78,18 +80,18 @@ class CarriageModel:
 
 @dataclass(frozen=True)
 class ShakeModel:
-    """All hyper-parameters of a smoothing: the priors of bubbles and shake, and the sensors' noise.
+    """All hyper-parameters of a smoothing: priors of bubbles and shake, and noise of the sensors.
 
-    bubble : prior of the bubbles' motion. modes, broad_bands : vibrations of the rig. carriage :
-    prior of the carriage's motion.
+    bubble : prior of the bubbles' motion.
+    modes, broad_bands : priors of the rig's vibrations.
+    carriage : prior of the carriage's motion.
     encoder_sigma_mm : standard deviation of an encoder reading.
     encoder_scale_sigma, accelerometer_scale_sigma : prior standard deviations of the relative scale
-    errors; 0 if they are not estimated.
+        errors; 0 if they are not estimated.
     encoder_delay_sigma_s, accelerometer_delay_sigma_s : the same for the delays.
-    pixel_inflation : factor by which the stated noise of pixels is multiplied.
-    name : origin of the values, in words.
-    learned : for each learned hyper-parameter, by name, the standard deviation of its natural
-    logarithm.
+    pixel_inflation : factor on the stated noise of pixels.
+    name : origin of the values: "given", "default" or "learned".
+    learned : {hyper-parameter: standard deviation of its natural logarithm} of the learned ones.
     """
 
     bubble: BubbleModel = field(default_factory=BubbleModel)
@@ -107,23 +109,22 @@ class ShakeModel:
 
     @property
     def force_hz(self) -> float | None:
-        """Cut-off frequency of the low-pass filter of the modes' forces; None if the forces are
-        white or have different cut-off frequencies.
-        """
+        """Cut-off frequency of the modes' forces; None if they are white or differ."""
         cutoffs = {m.force_hz for m in self.modes if m.force_hz is not None}
         return cutoffs.pop() if len(cutoffs) == 1 else None
 
     def without_shake(self) -> ShakeModel:
-        """Return this model without any shake: the cameras stand still on the carriage."""
+        """Return this model without any shake: the cameras are at rest on the carriage."""
         return replace(self, modes=(), broad_bands=())
 
 
 @dataclass(frozen=True)
 class Observations:
-    """The M measured pixels of bubbles, or of marks.
+    """M measured pixels of bubbles or of marks.
 
     item, frame, camera : (M,) indices of the bubble or mark, the frame and the camera.
-    uv_px : (M, 2). covariance_px2 : (M, 2, 2).
+    uv_px : (M, 2).
+    covariance_px2 : (M, 2, 2).
     """
 
     item: Ints
@@ -149,9 +150,8 @@ class Observations:
         return bool(np.all(self.frame[1:] >= self.frame[:-1]))
 
     def between(self, first: int, end: int) -> Observations:
-        """Return the observations in the frames from ``first`` to before ``end``.
-
-        Their frames are counted from ``first``.
+        """Return the observations in frames ``first`` to ``end`` - 1, with frames counted from
+        ``first``.
         """
         keep: Any = (
             (self.frame >= first) & (self.frame < end)
@@ -163,17 +163,19 @@ class Observations:
 
     @staticmethod
     def none() -> Observations:
-        """Return zero observations."""
+        """Return an empty set of observations."""
         ints = np.zeros(0, np.int64)
         return Observations(ints, ints, ints, np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
 
 @dataclass(frozen=True)
 class Bubble:
-    """One bubble that is smoothed, from its first to its last frame.
+    """One bubble to be smoothed.
 
-    start_mm : (3,) prior mean of its first position, in the laboratory frame. guess_mm : (last -
-    first + 1, 3) positions at which the projection is linearised in the first pass.
+    particle : its number in the tracks.
+    first, last : its first and last frame.
+    start_mm : (3,) prior mean of its first position in the laboratory frame.
+    guess_mm : (last - first + 1, 3) positions at which the projection is first linearised.
     """
 
     particle: int
@@ -188,10 +190,10 @@ class Bubble:
 
 @dataclass(frozen=True)
 class Mark:
-    """A mark that is fixed to the tank.
+    """A mark fixed to the tank.
 
-    guess_mm : (3,) prior mean of its position in the laboratory. sigma_mm : prior standard
-    deviation along each axis.
+    guess_mm : (3,) prior mean of its position in the laboratory frame.
+    sigma_mm : prior standard deviation along each axis.
     """
 
     name: str
@@ -201,9 +203,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Stage:
-    """The encoder's E readings.
+    """E readings of the encoder.
 
-    t_s : (E,) times. position_mm : (E,) positions, corrected for a calibrated scale error.
+    t_s : (E,) times.
+    position_mm : (E,) positions, corrected for a calibrated scale error.
     """
 
     t_s: Array
@@ -212,12 +215,13 @@ class Stage:
 
 @dataclass(frozen=True)
 class Travel:
-    """What is known about the stage's travel before the run.
+    """Prior of the stage's travel axis and of the encoder's scale.
 
-    axis : (3,) unit vector in the rig frame. basis : (3, 2) two unit vectors perpendicular to it.
+    axis : (3,) unit vector in the rig frame.
+    basis : (3, 2) two unit vectors perpendicular to it.
     scale : relative scale error of the encoder, for which the readings of `Stage` are corrected.
-    covariance : (3, 3) of the axis' two tilts (rad, along ``basis``) and of the scale. source :
-    "stage_axis" if calibrated, "rig.toml" if stated there, or "assumed".
+    covariance : (3, 3) of the axis' two tilts (rad, along ``basis``) and of the scale.
+    source : "stage_axis" if calibrated, "rig.toml" if stated there, or "assumed".
     """
 
     axis: Array
@@ -229,17 +233,22 @@ class Travel:
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """The record of one accelerometer, which has N samples.
+    """The record of one accelerometer with N samples.
 
-    camera : index of the camera that carries it, or CARRIAGE. t_s : (N,). reading_mm_s2 : (N, 3).
+    camera : index of the camera that carries it, or CARRIAGE.
+    t_s : (N,).
+    reading_mm_s2 : (N, 3).
     axes : (3, 3) the sensor's axes as rows, in the rig frame.
-    sigma_mm_s2 : noise standard deviation of one sample. bias_sigma_mm_s2 : prior standard
-    deviation of the bias of each axis. delay_s : a sample with time t was measured at t - delay_s.
-    clock : "frames" if its times are those of the frames' clock, "unknown" if only an alignment
-    with the images can place it. kept : (N,) whether each sample is used; the others are
-    interpolated. unused_axes : indices of axes that are not used.
-    offset_s, drift_ppm : what alignment with the images took out of its stamps; offset_sd_s : None
-    if no offset was found. confirmed : whether the images confirm its clock; None if not tried.
+    sigma_mm_s2 : noise standard deviation of one sample.
+    bias_sigma_mm_s2 : prior standard deviation of the bias of each axis.
+    delay_s : prior mean of the delay; a sample with time t was measured at t - delay_s.
+    clock : "frames" if its times are those of the frames' clock, "unknown" if the offset has to be
+        found by alignment with the images.
+    kept : (N,) whether each sample is used; the others are interpolated. None for all.
+    unused_axes : indices of axes that are not used.
+    offset_s, drift_ppm : clock offset and drift that the alignment subtracted from the times.
+    offset_sd_s : standard deviation of the offset; None if none was found.
+    confirmed : whether the images confirm its clock; None if this was not tested.
     """
 
     name: str
@@ -268,12 +277,15 @@ class Accelerometer:
 
 @dataclass(frozen=True)
 class CalibrationShare:
-    """The calibration's uncertainty that moves pixels, in r independent unit directions.
+    """Uncertainty of the calibration that affects pixels, in r independent directions of unit
+    variance.
 
-    root : (P, r); root root^T is the covariance of the rig block's P parameters, except for
-    directions that move no pixel. free : for each camera its free intrinsics. covariance : (P, P)
-    before the run. drift : (6, 6) prior covariance, included in it, of a movement of the second
-    camera since the calibration (rad, mm); None if it is assumed not to have moved.
+    root : (P, r); root root^T is the covariance of the rig block's P parameters, without directions
+        that affect no pixel.
+    free : names of the free intrinsics of each camera.
+    covariance : (P, P) prior covariance.
+    drift : (6, 6) prior covariance, included in it, of a movement of the second camera since the
+        calibration (rad, mm); None if it is assumed not to have moved.
     """
 
     root: Array
@@ -287,11 +299,11 @@ ConstantFamily = Literal["sensors", "constants", "marks", "clocks"]
 
 @dataclass(frozen=True)
 class Known:
-    """Hold the information of other parts of a run about some constants x_k.
+    """Information from other pieces of a run about constants x_k: the cost |sum_k A_k x_k - b|^2.
 
-    It is the squared residual |sum_k A_k x_k - b|^2.
-
-    keys : kind and number of each constant. blocks : A_k (n, d_k). side : (n,) b.
+    keys : (family, index) of each constant.
+    blocks : A_k (n, d_k).
+    side : (n,) b.
     """
 
     keys: tuple[tuple[ConstantFamily, int], ...]
@@ -315,18 +327,20 @@ def check_increasing(t_s: Array, where: str) -> None:
 
 @dataclass(frozen=True)
 class SmoothingProblem:
-    """Hold everything that was measured in one run of F frames, and the geometry of the rig.
+    """Everything that was measured in one run of F frames, and the geometry of the rig.
 
+    cameras : calibrated cameras.
     t_s : (F,) times of the frames.
     axis, up : (3,) unit vectors in the rig frame: the travel axis, and the direction opposite to
         gravity.
     bubbles, observations : the bubbles and their pixels.
     stage : record of the encoder; None without an encoder.
+    accelerometers : records of the accelerometers.
     marks, references : the marks fixed to the tank and their pixels.
-    calibration : uncertainty of the calibration; None if it moves no pixel.
-    travel : how well travel axis and encoder scale are known; None if they are exact.
-    gravity_m_s2 : gravity of the laboratory, which accelerometers read at rest.
-    known : for a part of a run, what the other parts tell of its constants.
+    calibration : uncertainty of the calibration; None if it affects no pixel.
+    travel : prior of travel axis and encoder scale; None if they are exact.
+    gravity_m_s2 : gravity in the laboratory.
+    known : for a piece of a run, information from the other pieces about its constants.
 
     Raises InputError for times that do not increase and for fewer than two frames.
     """

@@ -1,7 +1,7 @@
-"""Holds the sensors of a run against its images: clocks, mounting, units, encoder, frame times.
+"""Compares the sensors of a run with its images: clocks, mounting, units, encoder, frame times.
 
-In: a `SmoothingProblem` with the whole records of its sensors. Out: the problem with each record on
-the clock of the frames and cut to them, and what was found. The regressions are in
+In: a `SmoothingProblem` with complete sensor records. Out: the problem with each record on the
+clock of the frames and cut to them, and findings. The regressions are in
 `telerig.estimator.sensors`.
 """
 
@@ -26,8 +26,8 @@ from telerig.estimator.sensors.drift import LEAST_PARTS, drift_of
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
 from telerig.estimator.sensors.mounting import (
-    CLEAR_NATS,
-    Felt,
+    CLEAR_LOG_RATIO,
+    Expected,
     Mounting,
     mounting,
     preference,
@@ -53,10 +53,10 @@ _LEAST_SAMPLES = 100
 _DIFFERENT_SDS = 5.0
 _LONG_S = 1.2
 _WINDOW_S = 3.0
-_MOST_DRIFT, _DRIFT_NATS = 0.02, 5.0
+_MOST_DRIFT, _DRIFT_LOG_RATIO = 0.02, 5.0
 """No clock's rate is off by a larger share; a drift explains the images better by at least this."""
 _WINDOW_MARGIN_S = 0.1
-_FACTOR_NATS = 60.0
+_FACTOR_LOG_RATIO = 60.0
 _LEAST_FRAMES = 150
 _FRAME_FACTORS = {
     1e-3: "they are in milliseconds",
@@ -80,12 +80,15 @@ LogEvidence = Callable[[SmoothingProblem], float]
 def aligned(
     problem: SmoothingProblem, known: Sequence[Finding], log_evidence: LogEvidence
 ) -> tuple[SmoothingProblem, list[Finding]]:
-    """Return the problem with its sensors on the clock of the frames, and what was found.
+    """Put the sensors on the clock of the frames and check them against the images.
 
-    Sensors whose clock is unknown and cannot be found are left out. known : what other checks have
-    found, which is returned, too. log_evidence : the log-likelihood of all measurements of a run.
-    Of axes that gravity alone has shown to be wrong, the images tell which would be right; a clock
-    that hardly covers the frames is no fault if they show its offset.
+    problem : with complete sensor records.
+    known : findings of earlier checks.
+    log_evidence : function that returns the log-likelihood of all measurements of a run.
+
+    Returns the problem, without sensors whose unknown clock cannot be found, and all findings.
+    Where gravity has shown wrong axes, the axes that fit the images replace the earlier proposal. A
+    record that hardly overlaps the frames is accepted if the images show its clock offset.
     """
     refused = [f for f in known if f.code is not None]
     placed, found = _aligned(problem, refused, log_evidence)
@@ -117,7 +120,7 @@ def _aligned(
     for one in (c for c in seen if c.connected):
         if _in_place(one, encoder, problem):
             break
-        elsewhere = max(elsewhere, one.nats)
+        elsewhere = max(elsewhere, one.log_ratio)
     else:
         wrong = _frame_times(problem, elsewhere)
         if wrong is not None:
@@ -152,7 +155,7 @@ def _aligned(
 
 
 def _in_place(clock: Alignment, encoder: Alignment | None, problem: SmoothingProblem) -> bool:
-    """Whether a clock has the offset at which it is expected, where that is known."""
+    """Return whether a clock's offset is near 0, or unknown before the alignment."""
     free = clock is not encoder and any(s.clock == "unknown" for s in problem.accelerometers)
     return free or abs(clock.offset_s) < 2 * SAME_CLOCK_S
 
@@ -162,7 +165,7 @@ def _with(problem: SmoothingProblem, sensors: Sequence[Accelerometer]) -> Smooth
 
 
 def _cut(problem: SmoothingProblem) -> SmoothingProblem:
-    """Return the problem with the samples near the frames, by the clocks as they are stated."""
+    """Return the problem with the samples near the frames, by the stated clocks."""
     cut = [near_frames(s, problem.t_s) for s in problem.accelerometers]
     return _with(problem, [s for s in cut if len(s.t_s) > 1])
 
@@ -172,9 +175,9 @@ def _sure(clock: Alignment | None) -> bool:
 
 
 def _clocks(problem: SmoothingProblem, images: _Images) -> list[tuple[list[int], Alignment | None]]:
-    """Return groups of sensors with their clocks, the clearest first.
+    """Return groups of sensors with their clocks, the most significant first.
 
-    Where sensors with the same stamps do not agree with the images together, each is alone.
+    Sensors with equal time stamps are aligned together, or one by one if that fails.
     """
     out = []
     for group in _groups(problem):
@@ -183,11 +186,11 @@ def _clocks(problem: SmoothingProblem, images: _Images) -> list[tuple[list[int],
             out.append((group, clock))
             continue
         out += [([index], _clock(problem, images, [index])) for index in group]
-    return sorted(out, key=lambda g: -(g[1].nats if g[1] is not None else 0.0))
+    return sorted(out, key=lambda g: -(g[1].log_ratio if g[1] is not None else 0.0))
 
 
 def _groups(problem: SmoothingProblem) -> list[list[int]]:
-    """Return the indices of the sensors by clock: those with the same stamps share one."""
+    """Return the indices of the sensors, grouped by equal time stamps."""
     groups: list[list[int]] = []
     for index, sensor in enumerate(problem.accelerometers):
         for group in groups:
@@ -201,10 +204,11 @@ def _groups(problem: SmoothingProblem) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class _Images:
-    """What the images and the encoder show, on one grid.
+    """Accelerations that images and encoder show, on a common time grid.
 
-    cameras : (camera, "marks" or "bubbles", accelerations (n, 2)). encoder : accelerations (n, 1)
-    of the carriage along its axis; None without an encoder.
+    grid : n times.
+    cameras : (camera index, "marks" or "bubbles", accelerations (n, 2)).
+    encoder : acceleration (n, 1) of the carriage along its axis; None without an encoder.
     """
 
     grid: Grid
@@ -213,19 +217,21 @@ class _Images:
 
     @classmethod
     def of(cls, problem: SmoothingProblem) -> _Images | None:
-        """Return None if the run is too short for the kernel, if frames are too far apart to show
-        shake, or if nothing was seen.
+        """Return the accelerations of a problem.
+
+        Returns None for a run that is too short, a frame rate too low to show shake, or no
+        detections.
         """
         noise = _noise_mm(problem)
         pace = float(np.median(np.diff(problem.t_s)))
         if noise is None or pace > _SLOWEST_S or np.ptp(problem.t_s) > _MOST_STEPS * pace:
             return None
 
-        def felt(grid: Grid) -> float:
+        def sensed_rms(grid: Grid) -> float:
             rms = [_readings(grid, s).values.std(0).max() for s in problem.accelerometers]
             return float(min(rms))
 
-        grid = frame_grid(problem.t_s, noise, felt if problem.accelerometers else None)
+        grid = frame_grid(problem.t_s, noise, sensed_rms if problem.accelerometers else None)
         if grid.count < 8 * grid.knots:
             return None
         seen = (("marks", problem.references), ("bubbles", problem.observations))
@@ -250,18 +256,20 @@ class _Images:
     def channels(
         self, problem: SmoothingProblem, group: Sequence[int], *, images_alone: bool = False
     ) -> list[Channel]:
-        """Return what the sensors of a group explain: the images of their cameras, and the
-        encoder unless ``images_alone``.
+        """Return the accelerations that a group of sensors has to explain: images and encoder.
+
+        group : indices of the sensors.
+        images_alone : leave out the encoder.
         """
         mounts = {i: problem.accelerometers[i].camera for i in group}
         number = {i: n for n, i in enumerate(group)}
         out = []
         for camera, source, seen in self.cameras:
             name = f"{source} in camera {problem.cameras[camera].name}"
-            felt = tuple(number[i] for i in group if mounts[i] in (camera, CARRIAGE))
-            if felt:
+            mounted = tuple(number[i] for i in group if mounts[i] in (camera, CARRIAGE))
+            if mounted:
                 out += [
-                    Channel(f"{name}, {way}", seen.values[:, k], seen.known, felt)
+                    Channel(f"{name}, {way}", seen.values[:, k], seen.known, mounted)
                     for k, way in enumerate(("along rows", "along columns"))
                 ]
         for source in ("marks", "bubbles"):
@@ -280,8 +288,12 @@ class _Images:
     def differences(
         self, problem: SmoothingProblem, source: str
     ) -> list[tuple[str, Array, Bools, tuple[int, int]]]:
-        """Return, for each two cameras, what both see of a point cancelled: the motion of one
-        camera against the other along the direction that they share.
+        """Return the differential accelerations of each pair of cameras along their shared
+        direction.
+
+        In the difference the motion of the observed points cancels.
+
+        Returns (name, values (n,), known (n,), indices of both cameras).
         """
         seen = {camera: a for camera, kind, a in self.cameras if kind == source}
         out = []
@@ -301,7 +313,9 @@ class _Images:
         return out
 
     def encoder_alignment(self, problem: SmoothingProblem) -> Alignment | None:
-        """Return the clock of the encoder against the images along the travel axis."""
+        """Return the offset of the encoder's clock, by the images' acceleration along the travel
+        axis.
+        """
         if self.encoder is None:
             return None
         channels = [
@@ -313,20 +327,23 @@ class _Images:
 
 
 def shared_rows(problem: SmoothingProblem, first: int, second: int) -> Array:
-    """Return the combination (4,) of two cameras' directions that no motion of a point changes."""
+    """Return the combination (4,) of two cameras' image directions in which a point's motion
+    cancels.
+    """
     seen = np.concatenate([directions(problem.cameras[c]) for c in (first, second)])
     return np.asarray(np.linalg.svd(seen)[0][:, 3])
 
 
 def along_axis(problem: SmoothingProblem, camera: int, seen: Accelerations) -> Array | None:
-    """Return a camera's accelerations (n,) along the travel axis; None if it looks along it."""
+    """Return a camera's acceleration (n,) along the travel axis; None if it looks along that
+    axis."""
     axis = directions(problem.cameras[camera]) @ problem.axis
     size = float(axis @ axis)
     return np.asarray(seen.values @ axis / size) if size > 0.1 else None
 
 
 def _noise_mm(problem: SmoothingProblem) -> float | None:
-    """Return the sd of the mean position in one frame, of marks or bubbles, whichever is less."""
+    """Return the smaller sd of the mean position of marks or bubbles in a frame."""
     found = []
     for observed in (problem.references, problem.observations):
         if len(observed):
@@ -347,7 +364,7 @@ def _readings(grid: Grid, sensor: Accelerometer) -> Accelerations:
 def _of_images(
     problem: SmoothingProblem, images: _Images, encoder: Alignment | None
 ) -> Iterator[Alignment]:
-    """Return what aligns encoder and accelerometers with the images, and not with each other."""
+    """Yield the alignments of encoder and accelerometers with the images alone."""
     if encoder is not None:
         yield encoder
     for group in _groups(problem):
@@ -364,9 +381,10 @@ def _clock(
     images_alone: bool = False,
     beside: Sequence[Accelerometer] = (),
 ) -> Alignment | None:
-    """Return the clock of a group of sensors.
+    """Return the clock offset of a group of sensors; None if it cannot be computed.
 
-    beside : sensors on the clock of the frames, which the group is compared with as well.
+    images_alone : do not compare with the encoder.
+    beside : sensors on the clock of the frames to compare with as well.
     """
     sensors = [problem.accelerometers[i] for i in group]
     channels = images.channels(problem, group, images_alone=images_alone)
@@ -398,9 +416,10 @@ def _between_steps(
     channels: Sequence[Channel],
     sensors: Sequence[Accelerometer],
 ) -> Alignment:
-    """Return a unique offset again from records that it has placed, until it no longer changes.
+    """Refine a unique offset by repeated alignment of the shifted records.
 
-    The parabola through three lags of the grid is off by up to a tenth of a step between them.
+    One alignment interpolates between the lags of the grid, with an error of up to a tenth of a
+    step.
     """
     step_s = images.grid.step_s
     if not found.unique:
@@ -431,7 +450,8 @@ def _aligned_by(
 
 
 def _unaligned(sensor: Accelerometer, t_s: Array) -> tuple[Accelerometer | None, list[Finding]]:
-    """Return a sensor that nothing can be compared with: as it is if it has the frames' clock."""
+    """Return a sensor for which no comparison is possible: unchanged if it has the frames'
+    clock."""
     where = f"accelerometer {sensor.name}"
     near = near_frames(sensor, t_s)
     if sensor.clock == "frames":
@@ -450,14 +470,14 @@ def _left_out(where: str, why: str) -> Finding:
 
 
 def _keeps_clock(sensor: Accelerometer, clock: Alignment | None) -> bool:
-    """Whether the images agree with the clock of the frames, which the sensor is said to have."""
+    """Return whether the images confirm a sensor that is stated to be on the frames' clock."""
     return sensor.clock == "frames" and clock is not None and clock.at_zero
 
 
 def _placed(
     sensor: Accelerometer, clock: Alignment | None, problem: SmoothingProblem
 ) -> tuple[Accelerometer | None, list[Finding]]:
-    """Return a sensor on the clock of the frames, None if it is left out, and what to say."""
+    """Return a sensor on the clock of the frames, or None if it is left out, and findings."""
     where = f"accelerometer {sensor.name}"
     shared = sensor.clock == "frames"
     if clock is not None and _keeps_clock(sensor, clock):
@@ -489,7 +509,7 @@ def _placed(
 
 
 def _unconfirmed_words(clock: Alignment | None) -> str:
-    """Say why the offset of an unknown clock is not taken."""
+    """Return why the offset of an unknown clock is not accepted."""
     if clock is None:
         return (
             "its clock is unknown, and its record is too short or too slow to be compared with the "
@@ -511,22 +531,21 @@ def _unconfirmed_words(clock: Alignment | None) -> str:
 def _without_drift(
     sensors: Sequence[Accelerometer], group: list[int], problem: SmoothingProblem, images: _Images
 ) -> tuple[Sequence[Accelerometer], list[Finding]]:
-    """Return sensors of one clock with its drift taken out, where the run is long enough and the
-    images are explained better without it.
-    """
+    """Correct the drift of a clock if the run is long enough and this explains the images
+    better."""
     t = problem.t_s
     channels = images.channels(problem, group)
 
-    def nats(some: Sequence[Accelerometer]) -> float:
+    def log_ratio(some: Sequence[Accelerometer]) -> float:
         near = [near_frames(s, t, _WINDOW_MARGIN_S) for s in some]
         found = _aligned_by(images, channels, near)
-        return -np.inf if found is None else found.nats
+        return -np.inf if found is None else found.log_ratio
 
     best = sensors
     for _ in range(_MOST_REFINEMENTS if t[-1] - t[0] >= _LONG_S else 0):
-        sds, needed = (_DIFFERENT_SDS, _DRIFT_NATS) if best is sensors else (1.0, 0.0)
+        sds, needed = (_DIFFERENT_SDS, _DRIFT_LOG_RATIO) if best is sensors else (1.0, 0.0)
         corrected = _corrected_drift(best, t, channels, images, sds)
-        if corrected is None or not nats(corrected) > nats(best) + needed:
+        if corrected is None or not log_ratio(corrected) > log_ratio(best) + needed:
             break
         best = corrected
     if best is sensors:
@@ -544,7 +563,9 @@ def _corrected_drift(
     images: _Images,
     least_sds: float,
 ) -> list[Accelerometer] | None:
-    """Return the sensors without the drift that their offsets in parts of the run show, or None."""
+    """Return the sensors corrected for the drift of their offsets over the run, or None without
+    one.
+    """
     length_s, stamps = float(t_s[-1] - t_s[0]), sensors[0].t_s
     windows = max(round(length_s / _WINDOW_S), LEAST_PARTS)
     edges = np.linspace(t_s[0], t_s[-1], windows + 1)
@@ -578,7 +599,7 @@ def _corrected_drift(
 
 
 def _at_frames(images: _Images, sensor: Accelerometer) -> tuple[Array, Bools]:
-    """Return a placed sensor's smoothed readings (n, 3) on the images' grid, and the known."""
+    """Return a sensor's smoothed readings (n, 3) on the images' grid, and which are known (n,)."""
     found = _readings(images.grid, sensor)
     if found.grid.count < 2:
         return np.zeros((images.grid.count, 3)), np.zeros(images.grid.count, bool)
@@ -589,13 +610,14 @@ def _mountings(
     problem: SmoothingProblem, images: _Images, refused: Sequence[Finding],
     log_evidence: LogEvidence,
 ) -> list[Finding]:  # fmt: skip
-    """Return the sensors whose axes, place or unit contradict the images, encoder and each other.
+    """Return findings about sensors whose axes, place or unit contradict the other measurements.
 
-    The sensor with the clearest contradiction is corrected first; then the others are compared with
-    it. All measurements together have the last word: whether they are as likely with its axes
-    corrected, and which is wrong of two sensors of which either could be corrected.
+    The sensor with the clearest contradiction is corrected first, and the others are then compared
+    with it. A correction of axes has to make all measurements together at least as likely as
+    before; if either of two sensors could be corrected, the more likely correction is proposed.
 
-    refused : known faults; their units are not judged twice, and without gravity no axes.
+    refused : earlier findings. Sensors with a wrong unit are not tested for it again, and axes are
+        not tested without gravity.
     """
     without = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_GRAVITY}
     measured = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_UNIT}
@@ -615,7 +637,7 @@ def _mountings(
         return {
             s.name: mounting(
                 s.axes, np.median(s.reading_mm_s2, axis=0), problem.up, *read[s.name],
-                _felt(problem, images, s, axes, read),
+                _expected(problem, images, s, axes, read),
             )
             for s in sensors
         }  # fmt: skip
@@ -627,9 +649,7 @@ def _mountings(
     while True:
         judged = judge()
         leads = {
-            n: m.lead_nats
-            for n, m in judged.items()
-            if m.clear and not np.allclose(axes[n], m.axes)
+            n: m.lead for n, m in judged.items() if m.clear and not np.allclose(axes[n], m.axes)
         }
         worst = max(leads, key=lambda n: leads[n], default=None)
         if worst is None or any(f.fix.get("sensor") == worst for f in findings):
@@ -645,12 +665,12 @@ def _mountings(
         if np.isfinite(leads[worst]):
             likely = {
                 n: log_evidence_with({n: judged[n].axes})
-                for n in [worst, *sorted(rivals, key=lambda n: -judged[n].lead_nats)[:1]]
+                for n in [worst, *sorted(rivals, key=lambda n: -judged[n].lead)[:1]]
             }
             first, *second = sorted(likely, key=lambda n: -likely[n])
             if likely[first] < log_evidence_with({}):
                 break
-            if second and likely[first] < likely[second[0]] + CLEAR_NATS:
+            if second and likely[first] < likely[second[0]] + CLEAR_LOG_RATIO:
                 return [*findings, _one_of(first, second[0], judged)]
             worst = first
         axes[worst] = judged[worst].axes
@@ -682,7 +702,7 @@ def _axes_finding(name: str, found: Mounting) -> Finding:
 
 
 def _one_of(first: str, second: str, judged: dict[str, Mounting]) -> Finding:
-    """Return that two sensors contradict each other, and nothing tells which of them is wrong."""
+    """Return the finding that two sensors contradict each other, and either could be wrong."""
     return Finding(
         "they contradict each other: the axes of one of them are wrong, and the measurements do "
         "not show clearly which",
@@ -699,30 +719,31 @@ def _axes_line(name: str, found: Mounting) -> str:
     return f"[accelerometers.{name}] axes = [{line}]"
 
 
-def _felt(
+def _expected(
     problem: SmoothingProblem,
     images: _Images,
     sensor: Accelerometer,
     axes: dict[str, Array],
     read: dict[str, tuple[Array, Bools]],
-) -> list[Felt]:
-    """Return the accelerations that a sensor should feel, of images, encoder and other sensors."""
+) -> list[Expected]:
+    """Return the accelerations that a sensor should measure, by images, encoder and other
+    sensors."""
     out = []
     for camera, _, seen in images.cameras:
         if sensor.camera in (camera, CARRIAGE):
             out += [
-                Felt(d, seen.values[:, k], seen.known)
+                Expected(d, seen.values[:, k], seen.known)
                 for k, d in enumerate(directions(problem.cameras[camera]))
             ]
     if images.encoder is not None:
         out.append(
-            Felt(problem.axis, images.encoder.values[:, 0], images.encoder.known, whole=False)
+            Expected(problem.axis, images.encoder.values[:, 0], images.encoder.known, whole=False)
         )
     for other in problem.accelerometers:
         if other.name != sensor.name and other.name in read:
             values, known = read[other.name]
             force = values @ axes[other.name]
-            out += [Felt(d, force @ d, known, whole=False) for d in np.eye(3)]
+            out += [Expected(d, force @ d, known, whole=False) for d in np.eye(3)]
     return out
 
 
@@ -732,12 +753,12 @@ def _exchanged(
     sensors: Sequence[Accelerometer],
     read: dict[str, tuple[Array, Bools]],
 ) -> Finding | None:
-    """Return two sensors on different cameras whose records fit better exchanged, if there are."""
+    """Return a finding if the records of two cameras' sensors fit better when exchanged."""
     for i, one in enumerate(sensors):
         for two in sensors[i + 1 :]:
             if CARRIAGE in (one.camera, two.camera) or one.camera == two.camera:
                 continue
-            if _lead_of_exchange(problem, images, one, two, read) > CLEAR_NATS:
+            if _lead_of_exchange(problem, images, one, two, read) > CLEAR_LOG_RATIO:
                 names = f"{one.name} and {two.name}"
                 return Finding(
                     "the images of each camera fit the readings of the other camera's sensor",
@@ -756,9 +777,7 @@ def _lead_of_exchange(
     two: Accelerometer,
     read: dict[str, tuple[Array, Bools]],
 ) -> float:
-    """Return by how much the log-likelihood of what two cameras show is larger if the records of
-    their sensors are exchanged.
-    """
+    """Return the log-likelihood ratio of exchanged to stated records of two cameras' sensors."""
     known = read[one.name][1] & read[two.name][1]
     force = {s.camera: read[s.name][0] @ s.axes for s in (one, two)}
     exchanged = {s.camera: read[o.name][0] @ s.axes for s, o in ((one, two), (two, one))}
@@ -787,9 +806,10 @@ def _encoder(
     clock: Alignment | None,
     refused: Sequence[Finding],
 ) -> list[Finding]:
-    """Return what is wrong with the encoder's sign, unit and clock, or whether it is stuck.
+    """Return findings about the encoder: stuck, or a wrong sign, unit or clock.
 
-    refused : faults that are known. A sensor that has one is no witness.
+    clock : its alignment with the images.
+    refused : earlier findings; the sensors that they concern are not compared with.
     """
     where = "stage"
     if problem.stage is None:
@@ -835,9 +855,11 @@ def _gains(
     encoder: Accelerations,
     sensors: Sequence[Accelerometer],
 ) -> list[tuple[float, float]]:
-    """Return the true motion over the encoder's, with its sd, by images and by sensors.
+    """Return ratios of the true motion to the encoder's, with sd: one by images, one by each
+    sensor.
 
-    The cameras see the same bubbles, whose own motion is the error: two are no better than one.
+    The images of several cameras count once, because their errors, the bubbles' motion, are the
+    same.
     """
     x, out = encoder.values[:, 0], []
     seen_by = []
@@ -857,7 +879,7 @@ def _gains(
 
 
 def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Return how far the marks move in the images over how far the encoder moves, and its sd."""
+    """Return the ratio of the marks' displacement to the encoder's, with its sd; None without."""
     seen = problem.references
     if not len(seen) or problem.stage is None or not np.ptp(problem.encoder_mm) > 0:
         return None
@@ -884,9 +906,10 @@ def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
 
 
 def _gain_finding(gain: float, sd: float, where: str) -> Finding:
-    """Name the sign or the unit that explains the true motion over the encoder's.
+    """Return a finding that names the sign or unit which explains a gain.
 
-    A gain that is no unit is proposed only where it is known to `_KNOWN_GAIN`.
+    gain, sd : true motion over the encoder's, and its standard deviation. A gain that no unit
+        explains is proposed as a factor only if it is known to 1 %.
     """
     units = {1000.0: "m", 25.4: "inches", 10.0: "cm", 0.001: "µm", 1.0: "mm"}
     size = min(units, key=lambda u: abs(np.log(abs(gain) / u)))
@@ -908,7 +931,7 @@ def _gain_finding(gain: float, sd: float, where: str) -> Finding:
 
 
 def _stuck(problem: SmoothingProblem) -> list[Finding]:
-    """Return the stretch in which the encoder does not change although the carriage must move."""
+    """Return a finding if the encoder's reading is constant while the carriage must be moving."""
     stage = problem.stage
     if stage is None:
         return []
@@ -945,8 +968,9 @@ def _stuck(problem: SmoothingProblem) -> list[Finding]:
 
 
 def _sweeps(problem: SmoothingProblem) -> bool:
-    """Return whether the images say that a carriage moves whose encoder stands still: marks that
-    sweep through, or bubbles that all stand still in the images.
+    """Return whether the carriage moves according to the images, although the encoder is constant.
+
+    It does if marks move through the images, or if there are none and all bubbles rest in them.
     """
     speeds = []
     for observed in (problem.references, problem.observations):
@@ -968,7 +992,7 @@ def _sweeps(problem: SmoothingProblem) -> bool:
 
 
 def _rise(problem: SmoothingProblem) -> list[Finding]:
-    """Return a refusal of bubbles that rise or sink faster than any bubble."""
+    """Return a finding if the bubbles rise or sink faster than 3 m/s."""
     speeds = []
     for bubble in problem.bubbles:
         seconds = float(problem.t_s[bubble.last] - problem.t_s[bubble.first])
@@ -989,14 +1013,14 @@ def _rise(problem: SmoothingProblem) -> list[Finding]:
     ]
 
 
-def _frame_times(problem: SmoothingProblem, nats_as_stated: float) -> Finding | None:
-    """Return a factor of the frames' times with which images and sensors or encoder agree.
+def _frame_times(problem: SmoothingProblem, as_stated: float) -> Finding | None:
+    """Return a finding if the images agree with the sensors after scaling the frame times.
 
-    nats_as_stated : how well the clearest of them agrees with the images at the stated times.
+    as_stated : largest log-likelihood ratio of an alignment at the stated times.
     """
     if len(problem.t_s) < _LEAST_FRAMES:
         return None
-    nats: dict[float, float] = {}
+    log_ratio: dict[float, float] = {}
     pace = float(np.median(np.diff(problem.t_s)))
     for factor in (f for f in _FRAME_FACTORS if f * pace > _FASTEST_S):
         trial = replace(problem, t_s=problem.t_s * factor)
@@ -1006,9 +1030,9 @@ def _frame_times(problem: SmoothingProblem, nats_as_stated: float) -> Finding | 
             shift = abs(factor - 1) * abs(float(problem.t_s[0])) + SAME_CLOCK_S
             free = any(s.clock == "unknown" for s in problem.accelerometers)
             near = [c for c in found if free or abs(c.offset_s) < shift]
-            nats[factor] = sum(c.nats for c in near if c.unique)
-    best = max(nats, key=lambda f: nats[f], default=None)
-    if best is None or nats[best] < max(_FACTOR_NATS, 2 * nats_as_stated):
+            log_ratio[factor] = sum(c.log_ratio for c in near if c.unique)
+    best = max(log_ratio, key=lambda f: log_ratio[f], default=None)
+    if best is None or log_ratio[best] < max(_FACTOR_LOG_RATIO, 2 * as_stated):
         return None
     return Finding(
         f"the images agree with the sensors only if the times are multiplied by {best:g}: "

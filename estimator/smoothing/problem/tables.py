@@ -1,4 +1,4 @@
-"""Tables as the smoother takes them: encoder, accelerometers, marks, and the tracks' pixels."""
+"""Converts tables to parts of a smoothing problem: encoder, accelerometers, marks, tracks."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 _MICRO_G_MM_S2 = 1e-3 * STANDARD_GRAVITY_M_S2
 MARGIN_S = 0.25
 _MARK_SIGMA_MM = 100.0
-_FELT_PX = 2e-3
+_VISIBLE_PX = 2e-3
 
 
 def stage_of(encoder: Encoder | None, t_s: Array) -> Stage | None:
-    """Return the encoder's readings in the time of the frames, with a margin; None without one.
+    """Return the encoder's readings during the frames, with a margin; None without an encoder.
 
     t_s : (F,) times of the frames.
     """
@@ -57,10 +57,7 @@ def stage_of(encoder: Encoder | None, t_s: Array) -> Stage | None:
 def accelerometers_of(
     sensors: Sequence[Sensor], cameras: Sequence[Camera]
 ) -> tuple[Accelerometer, ...]:
-    """Return the accelerometers with their whole records, in mm/s^2.
-
-    sensors : with their noise densities.
-    """
+    """Return the accelerometers with their complete records, converted to mm/s^2."""
     names = [c.name for c in cameras]
     out = []
     for sensor in sensors:
@@ -79,23 +76,24 @@ def accelerometers_of(
 
 
 def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = MARGIN_S) -> Accelerometer:
-    """Return the sensor with the samples that were measured within a margin about the frames.
+    """Return the sensor with the samples within a margin of the frames, possibly none.
 
-    t_s : (F,) times of the frames.  There may be no such samples.
+    t_s : (F,) times of the frames.
     """
     return sensor.of(_near(sensor.t_s - sensor.delay_s, t_s, margin_s))
 
 
 def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelerometer, ...]:
-    """Return samples averaged in blocks of at most step_s, at their mean times; none over a gap.
+    """Return the sensors with samples averaged in blocks of at most ``step_s``, none across gaps.
 
-    An average over T of a motion at w is too small by (w T)^2 / 24: 0.6 % at 60 Hz and 1 ms.
+    The average over a block of length T reduces a motion of angular frequency w by (w T)^2 / 24,
+    for example by 0.6 % at 60 Hz and 1 ms.
     """
     return tuple(_thinned(sensor, step_s) for sensor in sensors)
 
 
 def _thinned(sensor: Accelerometer, step_s: float) -> Accelerometer:
-    """Return the block averages. A block with a sample that is not used is left out."""
+    """Return the sensor with block averages; blocks with an unused sample are left out."""
     block = int(step_s / np.median(np.diff(sensor.t_s)) + 1e-6)
     count = len(sensor.t_s) // block if block > 1 else 0
     if count < 2:
@@ -120,7 +118,11 @@ def _thinned(sensor: Accelerometer, step_s: float) -> Accelerometer:
 def references_of(
     table: Any, cameras: Sequence[Camera], t_s: Array, positions_mm: Array, axis: Array
 ) -> tuple[tuple[Mark, ...], Observations, list[Finding]]:
-    """Return the marks where their rays come closest, their pixels, and a warning about frames.
+    """Return marks at their triangulated positions, their pixels, and warnings.
+
+    table : marks.csv.
+    t_s, positions_mm : (F,) times of the frames and positions of the carriage.
+    axis : (3,) travel axis in the rig frame.
 
     Raises InputError for a table that cannot be used.
     """
@@ -175,7 +177,10 @@ def _check_references(table: Any, cameras: Sequence[Camera]) -> None:
 def _marks(
     seen: Observations, cameras: Sequence[Camera], positions_mm: Array, axis: Array, count: int
 ) -> Array:
-    """Return lab points (count, 3) nearest to all rays, and to the origin in unseen depth."""
+    """Return the laboratory points (count, 3) nearest to all rays of each mark.
+
+    Along directions that no camera resolves they are nearest to the origin.
+    """
     normal, right = np.tile(1e-6 * np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     for c, camera in enumerate(cameras):
         mine = seen.camera == c
@@ -190,10 +195,14 @@ def _marks(
 def calibration_share(
     calibration: Calibration, points_mm: Array, sigma_px: float, drift: Array | None = None
 ) -> CalibrationShare | None:
-    """Return the directions of the calibration's covariance that move the pixels of rig points.
+    """Return the uncertainty of a calibration that affects the pixels of some points.
 
-    A direction whose effect stays far below the noise of a mean over the run is left out. drift :
-    (6, 6) prior of a movement of the second camera.
+    Directions of the covariance are left out if they move the pixels by far less than the noise of
+    a mean over the run.
+
+    points_mm : (n, 3) in the rig frame.
+    sigma_px : noise of a pixel.
+    drift : (6, 6) prior covariance of a movement of the second camera since the calibration.
     """
     from telerig.estimator.rig_drift import rig_block, with_drift
     from telerig.rig.triangulation import rig_jacobian
@@ -209,10 +218,10 @@ def calibration_share(
     rows = rig_jacobian(calibration.cameras, free, points_mm) @ root
     flat = rows.reshape(-1, root.shape[1])
     _, strength, turn = np.linalg.svd(flat, full_matrices=False)
-    felt = strength / np.sqrt(len(flat)) > min(_FELT_PX, 0.02 * sigma_px)
-    if not felt.any():
+    visible = strength / np.sqrt(len(flat)) > min(_VISIBLE_PX, 0.02 * sigma_px)
+    if not visible.any():
         return None
-    return CalibrationShare(root @ turn[felt].T, free, covariance, drift)
+    return CalibrationShare(root @ turn[visible].T, free, covariance, drift)
 
 
 def _near(t: Array, t_s: Array, margin_s: float = MARGIN_S) -> Bools:
@@ -239,12 +248,13 @@ def frames_between(tracks: Any, first: int, end: int) -> Any:
 
 @dataclass(frozen=True)
 class Tracked:
-    """Hold the tracks of a run as the smoothing needs them.
+    """The tracks of a run in the form that the smoothing needs.
 
-    tracks : the tracks as they were given. sample : some rows of their table, evenly spread; all
-        rows of a table in memory. particles : ids of the bubbles, in order.
-    observations : pixels of the bubbles, by their index in ``particles``. t_s : (F,) times of the
-        frames.
+    tracks : the tracks as they were given.
+    sample : some rows of their table, evenly spread; all rows of a table in memory.
+    particles : numbers of the bubbles, in ascending order.
+    observations : pixels of the bubbles, with indices into ``particles``.
+    t_s : (F,) times of the frames.
     places : for each bubble its first frame, and its positions (n, 3) in mm in the rig frame from
         this frame on, NaN in frames without a position.
     """
@@ -263,10 +273,12 @@ class Tracked:
 
 
 def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | None) -> Tracked:
-    """Read the pixels of the bubbles from tracks, and from detections that only one camera made.
+    """Read the pixels of bubbles from tracks and from detections that only one camera made.
 
     tracks : `Tracks`, `StoredTracks`, or a table with the columns of tracks.csv.
-    Raises InputError for missing columns, cameras that the calibration does not have, NaN.
+    frame_times_s : (F,) times of the frames; None to take them from the tracks.
+
+    Raises InputError for missing columns, cameras that the calibration does not have, and NaN.
     """
     ends: dict[int, tuple[int, int]] = {}
     corrected, samples, times_of = {c.name: False for c in cameras}, [], []
@@ -311,7 +323,7 @@ def _in_memory(tracks: Any) -> bool:
 
 
 def _parts(tracks: Any) -> Iterator[tuple[pd.DataFrame, pd.DataFrame | None]]:
-    """Yield the table of tracks and the detections: all, or some frames of stored ones."""
+    """Yield tables of tracks and of detections: one pair, or one for each part of stored tracks."""
     if _in_memory(tracks):
         yield getattr(tracks, "table", tracks), getattr(tracks, "detections", None)
         return
@@ -322,7 +334,7 @@ def _parts(tracks: Any) -> Iterator[tuple[pd.DataFrame, pd.DataFrame | None]]:
 
 
 def _place(table: pd.DataFrame, number: dict[int, int], places: list[tuple[int, Array]]) -> None:
-    """Put the table's positions into those of the bubbles."""
+    """Copy the positions of a table into those of the bubbles."""
     frame, item = table["frame"].to_numpy(np.int64), table["particle"].map(number).to_numpy()
     points = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     order = np.argsort(item, kind="stable")
@@ -333,7 +345,7 @@ def _place(table: pd.DataFrame, number: dict[int, int], places: list[tuple[int, 
 
 @dataclass
 class _Store:
-    """Collect observations: in memory, or their pixels in files of a folder."""
+    """Collects observations in memory, or their pixels in files of a folder."""
 
     folder: TemporaryDirectory[str] | None
     parts: list[Observations] = field(default_factory=list)
@@ -429,7 +441,7 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
 
 
 def _times(table: pd.DataFrame, last: int, frame_times_s: Array | None) -> Array:
-    """Times of the frames up to the last one, from those in a table if they are not given."""
+    """Return the times of frames 0 to ``last``, from a table if they are not given."""
     if frame_times_s is not None:
         if len(frame_times_s) <= last:
             raise InputError(
@@ -452,7 +464,7 @@ def _times(table: pd.DataFrame, last: int, frame_times_s: Array | None) -> Array
 def _paired(
     table: pd.DataFrame, index: int, camera: str, number: dict[int, int]
 ) -> tuple[Any, ...]:
-    """Return bubbles that both cameras saw, corrected towards the centre of volume where known."""
+    """Return detections of pairs, corrected to the projected centre of volume where it is known."""
     columns = [f"{camera}_{c}" for c in _PIXELS]
     values = table[columns].to_numpy(float)
     shift = [f"{camera}_du_px", f"{camera}_dv_px"]
@@ -473,7 +485,7 @@ def _single(
     ends: dict[int, tuple[int, int]],
     corrected: dict[str, bool],
 ) -> tuple[Any, ...]:
-    """Return the detections of a track in frames in which the other camera did not see it."""
+    """Return the detections of tracks in frames in which only this camera sees the bubble."""
     rows = detections[(detections["camera"] == camera) & detections["particle"].notna()]
     ids = rows["particle"].to_numpy(float).astype(np.int64)
     paired = set(zip(table["frame"].tolist(), table["particle"].tolist()))
@@ -506,7 +518,7 @@ def _covariance(values: Array) -> Array:
 
 
 def bubbles_of(tracked: Tracked, positions_mm: Array, axis: Array) -> tuple[Bubble, ...]:
-    """Return every bubble with its triangulated lab positions and straight lines over its gaps."""
+    """Return the bubbles with positions in the laboratory, linearly interpolated over gaps."""
     out, t = [], tracked.t_s
     for particle, (first, places) in zip(tracked.particles, tracked.places):
         frames = first + np.flatnonzero(np.isfinite(places[:, 0]))

@@ -1,4 +1,4 @@
-"""A window of a run: some of its frames, with the bubbles that are seen most in them."""
+"""Cuts a window out of a run: some frames, with the bubbles that are seen most in them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ from telerig.estimator.smoothing.problem.tables import MARGIN_S, near_frames
 
 @dataclass(frozen=True)
 class Window:
-    """The problem of the frames from ``first`` on, with uncut sensors, and its bubbles."""
+    """A part of a run.
+
+    problem : of the frames from ``first`` on, with complete sensor records.
+    first : the run's frame that is frame 0 here.
+    bubbles : indices of its bubbles in the run.
+    """
 
     problem: SmoothingProblem
     first: int
@@ -34,11 +39,12 @@ def cut_out(
     least_share: float = 0.0,
     throughout: bool = False,
 ) -> Window:
-    """Return the frames from ``first`` to before ``end``, with the bubbles seen more than once.
+    """Return the frames ``first`` to ``end`` - 1, with the bubbles that are seen more than once.
 
-    weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. most_bubbles : at
-    most, those seen in most frames. least_share : share of the frames in which all cameras together
-    have to see a bubble. throughout : only tracks from the first to the last frame.
+    weights : of the pixels of bubbles and of marks; those below 0.5 are left out.
+    most_bubbles : largest number of bubbles; those seen in most frames are taken.
+    least_share : share of the frames in which all cameras together have to see a bubble.
+    throughout : take only tracks from the first to the last frame.
     """
     seen, marks = problem.observations, problem.references
     if weights is not None:
@@ -64,10 +70,10 @@ def cut_out(
 
 
 def all_of(problem: SmoothingProblem, first: int, end: int) -> Window:
-    """Return the frames from ``first`` to before ``end`` with everything that was measured then.
+    """Return the frames ``first`` to ``end`` - 1 with everything that was measured in them.
 
-    Sensors are cut to a quarter of a second about the frames, the encoder to that and to the
-    readings on both sides.
+    Accelerometers are cut to a quarter of a second about the frames; the encoder also keeps one
+    reading on each side.
     """
     seen, marks = problem.observations.between(first, end), problem.references.between(first, end)
     t_s = problem.t_s[first:end]

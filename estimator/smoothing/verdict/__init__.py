@@ -1,5 +1,5 @@
-"""Can this run separate the bubbles' motion from the rig's shake?
+"""Tests whether a smoothed run separates the motion of the bubbles from the shake of the rig.
 
-In: a solved smoothing graph. Out: verdict, modes, tests of residuals. Read ``judge``, then
-``identifiability``.
+In: a solved smoothing graph. Out: verdict per axis, vibration modes, tests of the residuals. Read
+``judge`` first, then ``identifiability``.
 """

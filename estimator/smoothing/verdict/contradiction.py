@@ -1,13 +1,14 @@
-"""Do the measurements of a run disagree? Then no standard deviation of its result can be right.
+"""Tests whether the measurements of a run contradict each other.
 
-Residuals are compared with those that a right model would leave (`graph.draws`), by source,
-axis and window of time; constants with their priors; the bubbles' speed with what is possible.
-Where something is off, the run is solved again without each source in turn: the source whose
-absence removes the contradiction is named, and the distance of the two results widens the bands.
+If they do, no standard deviation of the result can be right. Tested are the squared residuals
+against those expected from the model (`graph.draws`), by source, axis and time window; biases and
+delays against their priors; and the bubbles' speed against a limit. If a test fails, the run is
+solved again with each source left out in turn. The source whose removal resolves the contradiction
+is named, and the standard deviations are enlarged to cover the difference of the two results.
 
-A bubble that is more lively than its prior leaves its mark in the motion prior, not in the pixels
-(of 20 in place of 10 mm/s: 2.3 and 1.00 times the expected squares), so that only pixels and the
-encoder's readings are tested.
+Only the residuals of pixels and encoder readings are tested. Bubbles that are livelier than their
+prior (20 instead of 10 mm/s) raise the squared residuals of the motion prior to 2.3 times the
+expected ones, and leave those of the pixels unchanged (1.00).
 """
 
 from __future__ import annotations
@@ -37,16 +38,21 @@ _BEYOND_NOISE = 3.0
 
 @dataclass(frozen=True)
 class Contradictions:
-    """Contradictions, the worst first, and factors (3,) for the standard deviations by axis."""
+    """The contradictions of a run and how much they enlarge its standard deviations.
+
+    found : the contradictions, the largest first.
+    inflation : factors of the standard deviations along x, y and z of the rig frame.
+    """
 
     found: tuple[Contradiction, ...] = ()
     inflation: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 def contradictions(solution: Solution, evidence: Evidence) -> Contradictions:
-    """Return what disagrees in a solved run.
+    """Test a solved run for contradictions and name the source that causes them.
 
-    solution : of the run, or of a part of it.  evidence : of the run.
+    solution : of the run, or of its middle piece; it is solved again with sources left out.
+    evidence : sums over the whole run.
     """
     found = list(_of_one(solution, evidence))
     if not found:
@@ -69,7 +75,7 @@ def _of_one(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _outliers(evidence: Evidence) -> Iterator[Contradiction]:
-    """Return the sources of which so many pixels are left out that these cannot be outliers."""
+    """Yield the sources of which more than `MOST_OUTLIERS` of the pixels were rejected."""
     for one in evidence.pixels.values():
         share = one.lost / max(one.count, 1)
         if share > MOST_OUTLIERS:
@@ -80,7 +86,7 @@ def _outliers(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _constants(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
-    """Return the biases and delays that their priors do not allow."""
+    """Yield the biases and delays that are more than 5 prior standard deviations off."""
     graph = solution.graph
     delays, (first, last) = solution.delays_s, evidence.times_s
     for i, sensor in enumerate(graph.problem.accelerometers):
@@ -101,7 +107,7 @@ def _constants(solution: Solution, evidence: Evidence) -> Iterator[Contradiction
 
 
 def _speeds(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
-    """Return a mean speed of the bubbles that no bubble has."""
+    """Yield a contradiction if the bubbles' median velocity exceeds `HIGHEST_SPEED_MM_S`."""
     problem, means = solution.graph.problem, evidence.mean_velocities
     if not len(means):
         return
@@ -116,10 +122,10 @@ def _speeds(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def speed_warnings(problem: SmoothingProblem, means: Array) -> list[str]:
-    """Return a warning for bubbles that hover or sink, as in a flow downwards.
+    """Return a warning if the bubbles do not rise although the stage moves.
 
-    An encoder with another sign or unit has the same effect, and without marks no residual shows
-    it.
+    Either the liquid flows downwards, or the encoder has a wrong sign or unit, which without marks
+    leaves no trace in the residuals.
 
     means : (K, 3) mean velocities of the bubbles, mm/s.
     """
@@ -148,9 +154,11 @@ def sample_warnings(evidence: Evidence) -> list[str]:
 
 
 def residual_contradictions(evidence: Evidence) -> Iterator[Contradiction]:
-    """Return the sources whose residuals are larger than a right model leaves them, and than noise.
+    """Yield the sources whose sum of squared residuals is too large for model and noise.
 
-    The latter keeps short runs, whose fit takes up most of the noise, from false alarms.
+    The sum has to exceed the expectation from the model by 6 standard deviations and 20 %, and also
+    the number of residuals: a short run's fit absorbs most of the noise, so that the first test
+    alone would raise false alarms.
     """
     for tally in evidence.tallies.values():
         seen, expected, count = float(tally.seen.sum()), float(tally.expected.sum()), tally.count
@@ -167,7 +175,7 @@ def residual_contradictions(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _when(tally: Tally, evidence: Evidence) -> tuple[float, float]:
-    """Return the first and last time of the windows in which the residuals are too large."""
+    """Return the start and end (s) of the time in which the residuals are too large."""
     (begin, end), width = evidence.times_s, evidence.window_s
     seen, expected = tally.seen, tally.expected
     off = seen > np.maximum(_RATIO * expected, expected + _WINDOW_SURE * np.sqrt(2 * expected))
@@ -176,7 +184,9 @@ def _when(tally: Tally, evidence: Evidence) -> tuple[float, float]:
 
 
 def _without(problem: SmoothingProblem) -> Iterator[tuple[tuple[str, ...], SmoothingProblem]]:
-    """Yield the problem without one accelerometer, without the marks, without all of the former."""
+    """Yield the problem without each accelerometer in turn, without the marks, and without all
+    sensors.
+    """
     problem = replace(problem, known=())
     sensors = problem.accelerometers
     for one in sensors:
@@ -191,7 +201,9 @@ def _without(problem: SmoothingProblem) -> Iterator[tuple[tuple[str, ...], Smoot
 def _blamed(
     solution: Solution, found: list[Contradiction]
 ) -> tuple[tuple[str, ...], Solution | None]:
-    """Return the sources without which least is off, and the solution without them."""
+    """Return the sources whose removal reduces the contradictions most, and the solution without
+    them.
+    """
     problem = solution.graph.problem
     named = {f.source for f in found if f.test in (Disagreement.BIAS, Disagreement.DELAY)}
     best: tuple[float, tuple[str, ...], Solution | None] = (np.inf, (), None)
@@ -217,14 +229,14 @@ def _blamed(
 
 
 def _named(one: Contradiction, blamed: tuple[str, ...]) -> Contradiction:
-    """Return the contradiction with the other side of it."""
+    """Return the contradiction with the sources that it contradicts."""
     if one.source not in blamed:
         return one.model_copy(update={"against": blamed})
     return one
 
 
 def _spread(solution: Solution, other: Solution) -> tuple[float, float, float]:
-    """Return the factor by which the sd have to grow to hold the other result with its own sd."""
+    """Return the factors by axis that make our standard deviations cover the other solution."""
     ours, theirs = solution.graph, other.graph
     assert solution.covariances is not None and other.covariances is not None
     if not ours.rows:

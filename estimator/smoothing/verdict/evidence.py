@@ -1,7 +1,7 @@
-"""What the verdict and the summary need of a solution, as sums over its frames.
+"""Statistics of a solution that the verdict and the summary need, as sums over frames.
 
-Those of several pieces of a run add up to those of the run, so that no two solutions are in memory
-at once.
+The sums of the pieces of a long run add up to those of the run, so that only one piece has to be
+in memory.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ _USED = 0.5
 
 @dataclass(frozen=True)
 class Span:
-    """Name the frames of a solution that count.
+    """The frames of a piece that belong to it alone, without its overlap with other pieces.
 
-    own : as they count in the solution.  first : the run's frame that is the solution's frame 0.
+    own : these frames, numbered as in the piece's solution.
+    first : number in the run of the solution's frame 0.
     t_s : (F,) times of all frames of the run.
     """
 
@@ -42,16 +43,16 @@ class Span:
 
     @classmethod
     def whole(cls, solution: Solution) -> Span:
-        """Return all frames of a solution that is the run's."""
+        """Return the span of a solution that covers the whole run."""
         t_s = solution.graph.problem.t_s
         return cls(range(len(t_s)), 0, t_s)
 
     def holds(self, frame: Ints) -> Bools:
-        """(n,) whether frames (n,) of the solution count."""
+        """Return for frames (n,) of the solution whether they belong to the piece (n,)."""
         return np.asarray((frame >= self.own.start) & (frame < self.own.stop))
 
     def spans(self, t_s: Array) -> Bools:
-        """(n,) whether times (n,) are nearer to its frames than to those of other pieces."""
+        """Return whether times (n,) are nearer to the piece's frames than to others (n,)."""
         first, last = self.first + self.own.start, self.first + self.own.stop - 1
         low = self.t_s[first] if first else -np.inf
         high = self.t_s[last + 1] if last + 1 < len(self.t_s) else np.inf
@@ -59,16 +60,20 @@ class Span:
 
     @property
     def window_s(self) -> float:
-        """Length of the windows of time in which residuals are added up."""
+        """Length of the time windows in which `Tally` sums the residuals."""
         return max(_WINDOW_S, _LEAST_FRAMES * float(np.median(np.diff(self.t_s))))
 
 
 @dataclass(frozen=True)
 class Tally:
-    """Add up the squared residuals of one source along one axis.
+    """Sums of squared residuals of one source along one axis.
 
-    seen, expected : (n,) those of the solution, and of draws from the model, in windows of time
-        from the run's first frame on.  count : their number.  draws : from which is expected.
+    source : "bubbles", "marks" or "encoder".
+    axis : "x", "y" or "z"; "" for the encoder.
+    seen : (n,) sums in consecutive time windows from the run's first frame on.
+    expected : (n,) mean of the same sums over random draws from the model.
+    count : number of residuals.
+    draws : number of draws behind ``expected``.
     """
 
     source: str
@@ -97,11 +102,14 @@ def _padded_sum(one: Array, other: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Add up the pixels of one source.
+    """Sums over the detections of one source.
 
-    count, lost : how many there are, and how many of them have lost their weight.
-    from_s, to_s : the first and the last time of these.  total : sum of the others' squared
-    residuals.  some : up to 20,000 of these squares.
+    source : "bubbles" or "marks".
+    count : number of detections.
+    lost : number of those rejected as outliers.
+    from_s, to_s : times of the first and the last rejected one.
+    total : sum of the squared residuals of the others.
+    some : up to 20,000 of these squares.
     """
 
     source: str
@@ -122,10 +130,12 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Shake:
-    """Add up the cameras' offsets over frames away from the run's ends.
+    """Sums over the cameras' offsets, without a tenth of the run at both ends.
 
-    variance, square : by camera and by direction that it sees, the sum of the posterior variances,
-    and that of the squared estimates with these (mm^2).
+    frames : number of frames.
+    variance : for each camera (k,), posterior variance along its k directions of view, summed
+        (mm^2).
+    square : for each camera (k,), squared estimate plus its variance, summed (mm^2).
     """
 
     frames: int
@@ -142,8 +152,12 @@ class Shake:
 
 @dataclass(frozen=True)
 class Lost:
-    """Add up the samples of an accelerometer: all, those not used (masked), and the times (n,) of
-    those that the other measurements contradict."""
+    """Samples of one accelerometer that the solution does not use.
+
+    samples : number of all samples.
+    masked : number of unused ones.
+    t_s : (n,) times of those that the solution rejected because other measurements contradict them.
+    """
 
     samples: int
     masked: int
@@ -158,9 +172,12 @@ class Lost:
 
 @dataclass(frozen=True)
 class Mean:
-    """Hold the mean velocity of a bubble (3,) mm/s, its sd, and in how many frames it was seen.
+    """Mean velocity of one bubble.
 
-    way_sigma_mm : (3,) standard deviation of the way from its first frame to its last one.
+    frames : number of frames from its first to its last detection.
+    velocity_mm_s : (3,).
+    sigma_mm_s : (3,) its standard deviation; None without covariances.
+    way_sigma_mm : (3,) standard deviation of the displacement from the first to the last frame.
     """
 
     frames: int
@@ -171,10 +188,17 @@ class Mean:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Hold the sums of one solution, or of all pieces of a run.
+    """Sums over one solution, or over all pieces of a run.
 
-    times_s : of the run's first and last frame.  window_s : of the windows of time of `Tally`.
-    tallies, pixels, lost, means : by source and axis, source, sensor, bubble.
+    times_s : times of the run's first and last frame.
+    window_s : length of the time windows of `Tally`.
+    tallies : squared residuals by (source, axis).
+    pixels : detections by source.
+    lost : unused samples by accelerometer.
+    means : mean velocities by particle number.
+    shake : None without a shake in the model.
+    nodes : number of times at which the shake is estimated.
+    passes : number of iterations of the solver.
     """
 
     times_s: tuple[float, float]
@@ -189,9 +213,10 @@ class Evidence:
 
     @classmethod
     def of(cls, solution: Solution, draws: Draws, span: Span | None = None) -> Evidence:
-        """Return the sums over some frames of a solution; None for all frames of a run's.
+        """Return the sums over one solution.
 
-        draws : at the solution.
+        draws : random draws at the solution.
+        span : which frames count; None for all.
         """
         span = span or Span.whole(solution)
         tallies = {(t.source, t.axis): t for t in _tallies(solution, draws, span)}
@@ -221,12 +246,12 @@ class Evidence:
 
     @property
     def mean_velocities(self) -> Array:
-        """(K, 3) of all bubbles, mm/s."""
+        """Mean velocities (K, 3) of all bubbles, mm/s."""
         return np.array([m.velocity_mm_s for m in self.means.values()]).reshape(-1, 3)
 
 
 def _added(one: Mapping[Any, Any], other: Mapping[Any, Any]) -> dict[Any, Any]:
-    """The sums of what both have, and what one of them has."""
+    """Return the union of two mappings, with the values of common keys added."""
     both = {key: value + other[key] for key, value in one.items() if key in other}
     return {**one, **other, **both}
 
@@ -280,7 +305,6 @@ def _pixels(solution: Solution, span: Span) -> dict[str, Pixels]:
 
 
 def _lost(solution: Solution, span: Span) -> dict[str, Lost]:
-    """Of each accelerometer."""
     out = {}
     for i, sensor in enumerate(solution.graph.problem.accelerometers):
         mine = span.spans(sensor.t_s)
@@ -294,7 +318,7 @@ def _lost(solution: Solution, span: Span) -> dict[str, Lost]:
 
 
 def _means(solution: Solution, span: Span) -> dict[int, Mean]:
-    """Of each bubble that has own frames."""
+    """Return the mean velocity of each bubble that is seen in the span."""
     found, moved, out = solution.covariances, solution.accelerations, {}
     graph = solution.graph
     speed = considered_variance(solution)[1] if moved is not None else np.zeros((graph.rows, 3))
@@ -312,9 +336,9 @@ def _means(solution: Solution, span: Span) -> dict[int, Mean]:
 
 
 def shake_of(solution: Solution, span: Span | None = None) -> Shake | None:
-    """Return the sums for the shake; None without a shake in the model, or without covariances.
+    """Return the sums over the cameras' offsets; None without a shake in the model or covariances.
 
-    span : as for `Evidence.of`.
+    span : which frames count; None for all.
     """
     span = span or Span.whole(solution)
     graph, found = solution.graph, solution.covariances
@@ -336,5 +360,5 @@ def shake_of(solution: Solution, span: Span | None = None) -> Shake | None:
 
 
 def evidence_of(parts: Sequence[Evidence]) -> Evidence:
-    """Return the sum."""
+    """Return the sum over the pieces of a run."""
     return reduce(Evidence.__add__, parts)

@@ -1,8 +1,9 @@
-"""Which axes of the bubbles' motion can this run separate from the rig's shake? In numbers.
+"""Computes how well a run separates the motion of the bubbles from the shake of the rig, by axis.
 
-Per axis of the rig: q, by how much not knowing the shake widens the bubbles' positions; eta, by
-how much the data reduce the shake's variance; and whether a spectral line could be the bubble's as
-well as the rig's (see `telerig.estimator.smoothing.learning.spectral_lines`).
+q is the ratio of a position's standard deviation to the one that it would have if the shake were
+known. eta is the share of the shake's prior variance that the data remove. In addition, a spectral
+line can be ambiguous: an oscillation of the bubbles as well as one of the rig
+(`telerig.estimator.smoothing.learning.spectral_lines`).
 """
 
 from __future__ import annotations
@@ -36,10 +37,15 @@ _SEEN = 0.25
 
 @dataclass(frozen=True)
 class AxisVerdict:
-    """One axis of the rig.
+    """Identifiability along one axis of the rig.
 
-    q : sigma(position) over sigma(position | shake known). eta : 1 - posterior over prior variance
-    of the shake, None without a shake in the model. shake_rms_mm : of the camera that shakes most.
+    verdict, flags : see `telerig.io.results.smoothing`.
+    q : standard deviation of a position over the one with known shake, median over the states.
+    eta : 1 - posterior variance / prior variance of the shake; None without a shake in the model.
+    sigma_mm : median standard deviation of a position.
+    sigma_shake_known_mm : the same, if the shake were known.
+    shake_rms_mm : RMS of the shake of the camera that shakes most.
+    lines : spectral lines with their owner.
     """
 
     verdict: Verdict
@@ -53,14 +59,14 @@ class AxisVerdict:
 
     @property
     def ambiguous_lines(self) -> tuple[Attribution, ...]:
-        """Return the modes of the rig that could be an oscillation of the bubbles."""
+        """Lines attributed to the rig that could be an oscillation of the bubbles."""
         return tuple(line for line in self.lines if line.owner == "rig" and line.ambiguous)
 
 
 def verdicts(solution: Solution, shake: Shake | None) -> dict[str, AxisVerdict]:
-    """Return the verdict of each axis; {} without bubbles or covariances.
+    """Return the identifiability along "x", "y" and "z"; {} without bubbles or covariances.
 
-    shake : of the run; None without a shake in the model.
+    shake : sums over the run; None without a shake in the model.
     """
     if solution.covariances is None or not solution.graph.problem.bubbles:
         return {}
@@ -81,6 +87,11 @@ def verdicts(solution: Solution, shake: Shake | None) -> dict[str, AxisVerdict]:
 def axis_verdict(
     sigma: Array, known: Array, eta: float | None, rms: float, lines: tuple[Attribution, ...]
 ) -> AxisVerdict:
+    """Return the identifiability along one axis.
+
+    sigma, known : (n,) standard deviations (mm) of positions, as they are and with known shake.
+    eta, rms, lines : as in `AxisVerdict`.
+    """
     q, base = float(np.median(sigma / known)), float(np.median(known))
     verdict = Verdict.UNRESOLVED
     if q <= RESOLVED_Q or (eta is not None and eta >= RESOLVED_ETA):
@@ -97,7 +108,7 @@ def axis_verdict(
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
-    """Return the sd (n, 3) of positions, and those if the shake were known, away from the ends."""
+    """Return standard deviations (n, 3) of positions: as they are, and with known shake."""
     still = solve(
         without_sensors(window.problem),
         replace(
@@ -118,12 +129,14 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
 
 
 def without_sensors(problem: SmoothingProblem) -> SmoothingProblem:
-    """Return the problem with the images of the bubbles and the encoder alone."""
+    """Return the problem without accelerometers and marks: detections of bubbles and encoder
+    remain.
+    """
     return replace(problem, accelerometers=(), marks=(), references=Observations.none(), known=())
 
 
 def _inner_rows(window: Window) -> Ints:
-    """Return the rows of the bubbles' states without a tenth of each track at both ends."""
+    """Return the rows of the bubbles' states, without a tenth of each track at both ends."""
     at, out = 0, []
     for bubble in window.problem.bubbles:
         edge = int(_EDGE * len(bubble))
@@ -139,7 +152,10 @@ def _position_sigma(solution: Solution, rows: Ints) -> Array:
 
 
 def shake_share(solution: Solution, shake: Shake | None) -> list[float | None]:
-    """Return eta by axis: the least over the directions near the axis that a camera sees."""
+    """Return eta along x, y and z: the least over the directions near the axis that a camera sees.
+
+    An axis without such a direction gets None.
+    """
     graph = solution.graph
     least: list[float | None] = [None, None, None]
     if shake is None:
@@ -158,7 +174,7 @@ def shake_share(solution: Solution, shake: Shake | None) -> list[float | None]:
 
 
 def shake_rms(solution: Solution, shake: Shake | None) -> Array:
-    """Return the RMS (3,) of the offsets, uncertainty included, of the camera that shakes most."""
+    """Return the shake's RMS (3,) in mm, uncertainty included, largest over the cameras."""
     out = np.zeros(3)
     if shake is None:
         return out
@@ -172,7 +188,7 @@ def shake_rms(solution: Solution, shake: Shake | None) -> Array:
 def _lines(
     problem: SmoothingProblem, model: ShakeModel
 ) -> list[tuple[Sequence[float], Attribution]]:
-    """Return spectral lines with owners and directions; none with sensors on the arms."""
+    """Return spectral lines with direction and owner; none if accelerometers measure the shake."""
     if problem.arms_with_sensor:
         return []
     signals = [c for c in signals_of(problem) if c.samples]
@@ -184,7 +200,7 @@ def _lines(
 
 
 def window_of(solution: Solution) -> Window:
-    """Return the middle of a solved run without outliers, with the bubbles seen longest."""
+    """Return the middle of a solved run with its longest tracks, without outliers."""
     problem = solution.graph.problem
     count = len(problem.t_s)
     first = max(0, (count - _MOST_FRAMES) // 2)

@@ -1,7 +1,7 @@
 """Makes the verdict part of smoothing.json: numbers and codes, and the sentences made from them.
 
-Where shake and bubble motion cannot be separated, the verdict says so and names the measurement
-that would separate them.
+Where shake and motion of the bubbles cannot be separated, the verdict names the measurement that
+would separate them.
 """
 
 from __future__ import annotations
@@ -42,9 +42,10 @@ def judge(
 ) -> dict[str, Any]:
     """Return the verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ...
 
-    Without covariances it is empty; without bubbles only the modes are listed.
-    evidence : of a run of which this is the piece in the middle; None for one that is solved as a
-        whole.
+    Without covariances it is empty; without bubbles it has the modes alone.
+
+    problem, model, solution : of the run; of its middle piece if the run was solved in pieces.
+    evidence : sums over all pieces; None for a run that was solved as a whole.
     """
     if solution.covariances is None:
         return {}
@@ -93,7 +94,7 @@ def judge(
 
 
 def _widened(axis: AxisVerdict, factor: float) -> AxisVerdict:
-    """Return the verdict along an axis where measurements disagree by a factor of sd."""
+    """Return the verdict with sd enlarged by a factor; CONTRADICTED beyond 1.25."""
     wide = replace(axis, q=axis.q * factor, sigma_mm=axis.sigma_mm * factor)
     if factor <= RESOLVED_Q:
         return wide
@@ -151,7 +152,7 @@ def _mode_json(mode: ShakeMode) -> dict[str, Any]:
 
 
 def remedies_of(problem: SmoothingProblem) -> tuple[Remedy, ...]:
-    """Return measurements that the run lacks and that would separate shake and motion better."""
+    """Return the missing measurements that would separate shake and motion better."""
     has_arms = len(problem.arms_with_sensor) == len(problem.cameras)
     if len(problem.references):
         return (Remedy.LONGER,) if has_arms else (Remedy.ARMS,)

@@ -1,4 +1,4 @@
-"""The table of what shakes: place, frequency, damping and RMS of each mode."""
+"""Makes the table of vibration modes: place, frequency, damping ratio and RMS of each."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ _STRONGER = 2.0
 
 @dataclass(frozen=True)
 class ShakeMode:
-    """One vibration of the rig.
+    """One vibration mode of the rig.
 
-    place : what vibrates. camera : its name, if the mode belongs to an arm or to a single view.
-    rms_mm : along x, y and z of the rig frame. source : "model", or "estimate" for a peak in the
-    spectrum of the estimated offsets.
+    place : the part that vibrates.
+    camera : name of the camera, if the mode belongs to one arm or one view; else "".
+    frequency_hz, damping : natural frequency and damping ratio.
+    rms_mm : [x, y, z] in the rig frame.
+    source : "model", or "estimate" for a peak in the spectrum of the estimated offsets.
     """
 
     place: Place
@@ -46,7 +48,7 @@ class ShakeMode:
 
 
 def shake_modes(solution: Solution) -> list[ShakeMode]:
-    """Return modes of the model, or peaks in the offsets' spectrum, the strongest first."""
+    """Return the model's modes, or peaks in the offsets' spectrum, the strongest first."""
     graph = solution.graph
     names = [c.name for c in graph.problem.cameras]
     rows = _from_offsets(solution, names)
@@ -64,10 +66,11 @@ def _from_model(mode: RigMode, names: Sequence[str]) -> ShakeMode:
 
 
 def _from_offsets(solution: Solution, names: Sequence[str]) -> list[ShakeMode]:
-    """Return lines of the cameras' offsets: who moves shows where two cameras see the same axis.
+    """Return spectral lines of the cameras' offsets, with the part that vibrates.
 
-    There the cameras move alike (common), one alone or both independently (arms). An axis that one
-    camera sees shares in the lines found so; another line has no known owner.
+    Along an axis that two cameras see, coherent lines are common-mode, others belong to one arm or
+    to both. A line along an axis that one camera sees belongs to the same part if its frequency is
+    the same; otherwise the part is unknown.
     """
     graph, found = solution.graph, solution.covariances
     if not graph.shake.size or not graph.model.broad_bands:
@@ -97,7 +100,10 @@ def _from_offsets(solution: Solution, names: Sequence[str]) -> list[ShakeMode]:
 
 @dataclass(frozen=True)
 class _Spectra:
-    """frequency_hz (F,), own (C, 3, F) and cross (C, C, 3, F) densities of (C, n, 3) series."""
+    """Spectral densities of (C, n, 3) series.
+
+    frequency_hz : (F,).  own : (C, 3, F) power.  cross : (C, C, 3, F) real part of cross spectra.
+    """
 
     frequency_hz: Array
     own: Array
@@ -106,7 +112,7 @@ class _Spectra:
 
 @dataclass(frozen=True)
 class _Line:
-    """A peak: its bins, and the half width from which its damping follows."""
+    """A spectral peak: its bins, and the half width at half height, which gives the damping."""
 
     frequency_hz: float
     half_hz: float
@@ -125,7 +131,7 @@ class _Line:
 def _owned(
     spectra: _Spectra, line: _Line, seen: Bools, shared: Bools, names: Sequence[str]
 ) -> list[ShakeMode]:
-    """Return the line as common, or as the arms'."""
+    """Return the line as one common mode, or as a mode of one or of all arms."""
     own, cross = line.power(spectra.own), line.power(spectra.cross)
     among = cross[:, :, shared].sum(-1)
     sd = np.sqrt(np.clip(np.diagonal(among), 0, None))
@@ -144,7 +150,7 @@ def _same_line(line: _Line, row: ShakeMode) -> bool:
 
 
 def _spectra(t_s: Array, series: Array) -> _Spectra | None:
-    """Return spectra of (C, n, 3) at times (n,); None for a short record or no motion."""
+    """Return spectra of series (C, n, 3) at times (n,); None for a short record or no motion."""
     step = float(np.median(np.diff(t_s)))
     if len(t_s) < _LEAST_SAMPLES or not np.any(series):
         return None
@@ -160,7 +166,7 @@ def _spectra(t_s: Array, series: Array) -> _Spectra | None:
 
 
 def _lines(spectra: _Spectra, total: Array, noise_mm2: float) -> list[_Line]:
-    """Return peaks of a density (F,) above its noise that hold a good share of its variance."""
+    """Return the peaks of a density (F,) that exceed the noise and a share of the variance."""
     frequency = spectra.frequency_hz
     width = float(frequency[1])
     variance = float(total.sum() * width)
@@ -192,7 +198,7 @@ def _half_width(total: Array, peak: int) -> int:
 
 
 def _from_carriage(solution: Solution) -> list[ShakeMode]:
-    """Return following errors: lines of the encoder's record after a smooth travel is taken off."""
+    """Return the servo's following error: the encoder's strongest line without its trend."""
     problem, noise = solution.graph.problem, solution.graph.model.encoder_sigma_mm
     if problem.stage is None:
         return []

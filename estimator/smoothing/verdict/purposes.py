@@ -1,8 +1,8 @@
-"""What is a run good for? Quantities of the bubbles with their standard deviations, and a grade.
+"""Grades what a run is usable for: quantities of the bubbles with their standard deviations.
 
-A verdict about the shake is not the whole answer: positions that are uncertain by the shake's
-half millimetre leave a mean velocity over a second known to a few mm/s. Standard deviations of
-means, spectra and amplitudes come from draws of the posterior, correlation in time included.
+A run can be usable although the verdict is bad: with 0.5 mm of unknown shake in every position,
+the mean velocity over a second is still known to a few mm/s. Standard deviations of means, spectra
+and amplitudes come from draws of the posterior, which contain its correlation in time.
 """
 
 from __future__ import annotations
@@ -29,10 +29,13 @@ _LEAST_SHARE = 0.3
 def uses(
     solution: Solution, draws: Draws, inflation: Sequence[float] = (1.0, 1.0, 1.0)
 ) -> list[Use]:
-    """Return what a solved run is good for, axis by axis; [] without bubbles or covariances.
+    """Return velocity, path, acceleration and zigzag with sd and grade, by axis.
 
-    draws : at the solution. inflation : (3,) factor of the standard deviations where measurements
-    disagree; then nothing is called better than limited.
+    The list is empty without bubbles or covariances.
+
+    draws : random draws at the solution.
+    inflation : (3,) factors of the standard deviations. If one is above 1, no grade is better than
+        LIMITED.
     """
     graph = solution.graph
     if solution.covariances is None or not graph.rows:
@@ -57,10 +60,16 @@ def uses(
 
 
 class _Path:
-    """One bubble: times (n,), positions and velocities (n, 3), and K draws of their errors."""
+    """One bubble: times (n,), positions and velocities (n, 3), and K draws of their errors (n, 3,
+    K).
+    """
 
     def __init__(self, solution: Solution, errors: Array, bubble: int, widen: Array) -> None:
-        """Prepare the path; errors : (rows, d, K) draws of all bubbles' increments."""
+        """Collect a bubble's states.
+
+        errors : (rows, d, K) draws of the errors of all bubbles.
+        widen : (3,) factors of the standard deviations.
+        """
         graph, found = solution.graph, solution.covariances
         assert found is not None
         rows = np.arange(graph.first_row[bubble], graph.first_row[bubble + 1])
@@ -83,7 +92,9 @@ class _Path:
         return float(self.t_s[-1] - self.t_s[0])
 
     def spectrum(self, values: Array) -> tuple[Array, Array]:
-        """Return frequencies (F,) and power (F, ...) of values (n, ...) less their lines."""
+        """Return frequencies (F,) and power (F, ...) of values (n, ...) after removing linear
+        trends.
+        """
         from scipy.signal import detrend
 
         step = float(np.median(np.diff(self.t_s)))
@@ -134,7 +145,7 @@ def _of_axis(solution: Solution, paths: Sequence[_Path], axis: int) -> Iterator[
 
 
 def grade_of(value: float, sd: float) -> Grade:
-    """Return the grade of a quantity from its size and its standard deviation."""
+    """Return the grade for the ratio of a value to its standard deviation."""
     ratio = abs(value) / sd if sd > 0 else np.inf
     return Grade.GOOD if ratio >= GOOD else Grade.LIMITED if ratio >= LIMITED else Grade.NO
 
@@ -144,7 +155,7 @@ def _rms(values: Array) -> float:
 
 
 def _mean_velocity(path: _Path, axis: int) -> tuple[float, float]:
-    """Return the displacement from the first to the last frame over the time, mm/s."""
+    """Return the mean velocity from the first to the last frame, mm/s, with its sd."""
     place, error = path.place[:, axis], path.errors[:, axis]
     variance = np.mean(((error[-1] - error[0]) / path.span_s) ** 2)
     sd = np.sqrt(variance + path.mean_speed_variance[axis])
@@ -152,7 +163,7 @@ def _mean_velocity(path: _Path, axis: int) -> tuple[float, float]:
 
 
 def _clear_hz(path: _Path, axis: int) -> float:
-    """Return frequency up to which the path's power is above that of its errors; 0 if nowhere."""
+    """Return the frequency up to which the path's power is 9 times its errors', or 0."""
     frequency, power = path.spectrum(path.place[:, axis])
     noise = path.spectrum(path.errors[:, axis])[1].mean(-1)
     three = np.ones(3) / 3
@@ -163,7 +174,7 @@ def _clear_hz(path: _Path, axis: int) -> float:
 
 
 def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
-    """Return the RMS of the path about its line and of its errors up to a frequency, mm."""
+    """Return the RMS (mm) of the path about a line, and of its errors, up to a frequency."""
     frequency, power = path.spectrum(path.place[:, axis])
     noise = path.spectrum(path.errors[:, axis])[1].mean(-1)
     band = frequency <= (below_hz or np.inf)
@@ -171,7 +182,7 @@ def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
 
 
 def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Return frequency (Hz) and amplitude (mm) of the swing, each with its sd; None without one."""
+    """Return frequency (Hz) and amplitude (mm) of the zigzag with their sd, or None."""
     if path.span_s * _ZIGZAG_HZ[0] < _LEAST_PERIODS:
         return None
     place, error = path.place[:, axis], path.errors[:, axis]
@@ -190,7 +201,7 @@ def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, f
 
 
 def _swing(frequency: Array, band: Bools) -> Callable[[Array], Array]:
-    """Return the mean frequency and the amplitude of what a spectrum has in a band."""
+    """Return a function that computes mean frequency and amplitude of a spectrum in a band."""
 
     def measure(power: Array) -> Array:
         total = power[band].sum()

@@ -1,8 +1,9 @@
-"""Is anything left in the residuals? Autocorrelation of pixels, spectra of accelerometers.
+"""Tests the residuals: autocorrelation of the pixels' residuals, spectra of the accelerometers.
 
-The fit follows part of the noise: residuals are smaller than the noise, and one frame's are unlike
-the next one's. The pixels' residuals are compared with residuals drawn for a right model, in a
-stretch of the run. With A the whitened factors and e ~ N(0, I) these are (I - A (A^T A)^-1 A^T) e.
+Because the fit absorbs part of the noise, even a right model leaves residuals that are smaller than
+the noise and correlated in time. The pixels' residuals are therefore compared with residuals drawn
+for a right model, in a part of the run. With A the whitened factors and e ~ N(0, I) these are
+(I - A (A^T A)^-1 A^T) e.
 """
 
 from __future__ import annotations
@@ -37,12 +38,13 @@ residuals move by some hundredths of a standard deviation, their variance by les
 
 
 def pixel_whiteness(solution: Solution) -> dict[str, Any]:
-    """Return by camera the autocorrelation of pixel residuals beside the model's, and a test.
+    """Return by camera the autocorrelation of the pixel residuals, the expected one, and a test.
 
-    Residuals of one bubble are some frames apart, in sigmas, in a stretch of the run. ``expected``
-    and the test's covariance (Hotelling, Ann. Math. Stat. 2:360, 1931) are drawn from the model.
-    ``verdict``: "as expected", or "correlated" where p is below 0.001. Empty for few frames, or too
-    much that moves.
+    ``autocorrelation`` is that of a bubble's whitened residuals at lags of 1 to 10 frames.
+    ``expected`` and the covariance of the test (Hotelling, Ann. Math. Stat. 2:360, 1931) come from
+    random draws of the model. ``verdict`` is "correlated" where p is below 0.001, else "as
+    expected". The result is empty for few frames, and for more bubbles at once than the draws can
+    hold.
     """
     obs, kept = solution.graph.problem.observations, solution.weights[0] > 0.5
     if not kept.any():
@@ -65,7 +67,7 @@ def pixel_whiteness(solution: Solution) -> dict[str, Any]:
 
 
 def _compared(seen: Array, model: Array) -> dict[str, Any]:
-    """Return mean products by lag: (LAGS + 1,) of the residuals, (draws, ...) of the drawn ones."""
+    """Compare mean products by lag: (LAGS + 1,) of the residuals, (K, LAGS + 1) of K draws."""
     from scipy.stats import f as fisher
 
     rho, drawn = seen[1:] / seen[0], model[:, 1:] / model[:, :1]
@@ -87,7 +89,12 @@ def _compared(seen: Array, model: Array) -> dict[str, Any]:
 
 
 def _lagged(residuals: Array, item: Ints, frame: Ints) -> Array | None:
-    """Return mean products (K, LAGS + 1) of residuals (m, 2, K) by lag; None for too few."""
+    """Return mean products (K, LAGS + 1) by lag of K sets of residuals (m, 2, K).
+
+    item, frame : (m,) bubble and frame of each residual.
+
+    Returns None if a lag has less than 25 pairs.
+    """
     if not len(item):
         return None
     items, row = np.unique(item, return_inverse=True)
@@ -107,9 +114,10 @@ def _lagged(residuals: Array, item: Ints, frame: Ints) -> Array | None:
 
 
 def accelerometer_spectra(solution: Solution) -> dict[str, Any]:
-    """Return one-sided densities, (m/s^2)^2/Hz, by sensor: of readings, residuals and noise.
+    """Return power spectral densities by sensor, one-sided, (m/s^2)^2/Hz.
 
-    They are summed over the directions in which the mount's motion is modelled.
+    ``reading``, ``residual`` and ``noise`` are sums over the directions in which the motion of the
+    sensor's mount is modelled.
     """
     graph, state = solution.graph, solution.state
     out: dict[str, Any] = {}
@@ -132,7 +140,7 @@ def accelerometer_spectra(solution: Solution) -> dict[str, Any]:
 
 
 def _density(values: Array, rate_hz: float) -> tuple[Array, Array]:
-    """Return Welch's estimate, columns summed, averaged into bands where there are many bins."""
+    """Return Welch's estimate, summed over columns and averaged in up to 120 bands."""
     from scipy.signal import welch
 
     length = min(len(values), _LONGEST_SEGMENT)
@@ -146,10 +154,12 @@ def _density(values: Array, rate_hz: float) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Some frames with what moves in them; the rest is held.
+    """Consecutive frames whose states are drawn, while all other states are held fixed.
 
-    column : of each key of shake and bubbles its first, -1 where it is held. inner : (first, last)
-    frames far enough from those that are held.
+    graph : layout of the whole run.
+    column : (keys,) first column of each state of shake and bubbles; -1 if it is fixed.
+    size : number of columns.
+    inner : first and last frame that are far enough from fixed states.
     """
 
     graph: GraphLayout
@@ -158,7 +168,9 @@ class Stretch:
     inner: tuple[int, int]
 
     def columns(self, linear: LinearFactors) -> Ints:
-        """Return (M, keys) first column of each block of the factors, -1 where it is held."""
+        """Return for each block of the factors its first column (M, keys), -1 if its state is
+        fixed.
+        """
         count = len(linear.rhs)
         moving = len(self.column)
         out = np.full((count, len(linear.keys)), -1)
@@ -170,7 +182,10 @@ class Stretch:
 
 
 def stretch_of(graph: GraphLayout, middle: int) -> Stretch | None:
-    """Return 200 frames about a frame, down to 40 where much moves; None if those are too many."""
+    """Return a stretch of 200 frames about a middle frame, down to 40 frames with many bubbles.
+
+    Returns None if even 40 frames have too many states.
+    """
     (nodes, shake), (_, bubble) = graph.counts()[:2]
     when = np.r_[np.arange(nodes), graph.node_of_row]
     sizes = np.repeat([shake, bubble], [nodes, graph.rows])
@@ -197,13 +212,13 @@ def stretch_of(graph: GraphLayout, middle: int) -> Stretch | None:
 def drawn_residuals(
     solution: Solution, stretch: Stretch, draws: int, rng: Generator
 ) -> list[tuple[Ints, Array]]:
-    """Return for each camera random residuals of its pixels, as they are if the model is right.
+    """Draw random pixel residuals for each camera as a right model leaves them.
 
-    draws : the number of random draws.
+    draws : the number K of random draws.
 
-    Returns for each camera the indices (m,) of its pixels of bubbles among the observations of
-    the problem, and their residuals (m, 2, draws) in standard deviations. They are the pixels in
-    the inner part of the stretch that the fit has not rejected.
+    Returns for each camera the indices (m,) of its detections of bubbles among the observations of
+    the problem, and their whitened residuals (m, 2, K). They are the detections in the inner part
+    of the stretch that the fit has not rejected.
 
     Raises numpy.linalg.LinAlgError if a matrix is singular in floating point.
     """
@@ -229,10 +244,12 @@ def drawn_residuals(
 
 @dataclass(frozen=True)
 class _Part:
-    """Factors (m,) of one kind that reach into a stretch, with blocks (m, rows, columns).
+    """Factors (m,) of one kind that involve a stretch.
 
-    Blocks are zero where the key is held. column : (m, columns) of the stretch. of_bubbles : images
-    of them.
+    which : (m,) indices of the factors.
+    block : (m, rows, columns) derivatives, 0 where the state is fixed.
+    column : (m, columns) columns of the stretch.
+    of_bubbles : whether they are detections of bubbles.
     """
 
     which: Ints
@@ -259,7 +276,7 @@ class _Part:
 
 
 def _fitted(stretch: Stretch, parts: Sequence[_Part], noise: Sequence[Array]) -> Array:
-    """Return (columns, draws) least-squares solutions of the stretch for each draw of the noise."""
+    """Return least-squares solutions (columns, K) of the stretch for K draws of noise."""
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
     places, values = [np.zeros(0, np.int64)], [np.zeros(0)]

@@ -9,7 +9,7 @@ error of runs that are smoothed without knowing the spectrum (docs/decisions/038
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -449,11 +449,14 @@ def plan_table(expected: dict[str, Expected]) -> pd.DataFrame:
 def plan_words(
     rig: RigDescription,
     calibration: Calibration,
-    planned: Experiment,
+    chosen: dict[str, Experiment],
     expected: dict[str, Expected],
 ) -> list[str]:
-    """Return the plan in words: the calibration's share, a table of the variants, and advice."""
-    first, *_ = expected.values()
+    """Return the plan in words: the calibration's share, a table of the variants, and advice.
+
+    chosen, expected : the variants, the planned run first, and what each is expected to reach.
+    """
+    planned, first = next(iter(chosen.values())), next(iter(expected.values()))
     share = uncertainty_map(calibration).calibration_mm2
     um = 1e3 * np.sqrt(np.trace(share, axis1=1, axis2=2) / 3)
     sensors = ", ".join(rig.accelerometers) or "none"
@@ -474,17 +477,21 @@ def plan_words(
         speed = "".join(f"{v:7.2g}" for v in one.velocity_mm_s)
         lines.append(f"{name:30}{place} {speed}  {one.verdict}")
     known = "".join(f"{v:7.3g}" for v in first.known_um)
-    lines += [f"{'(as planned, shake known)':30}{known}", "", _advice(expected)]
+    lines += [f"{'(as planned, shake known)':30}{known}", "", _advice(chosen, expected)]
     return lines
 
 
-def _advice(expected: dict[str, Expected]) -> str:
-    """Return the sentence that says what to add."""
-    first, *_ = expected.values()
-    if first.verdict is Verdict.RESOLVED:
+def _advice(chosen: dict[str, Experiment], expected: dict[str, Expected]) -> str:
+    """Return the sentence that names the variants with fewest additions that are RESOLVED."""
+    planned = asdict(next(iter(chosen.values())))
+    additions = {
+        name: sum(planned[key] != value for key, value in asdict(chosen[name]).items())
+        for name, one in expected.items()
+        if one.verdict is Verdict.RESOLVED
+    }
+    enough = [name for name, count in additions.items() if count == min(additions.values())]
+    if enough and not additions[enough[0]]:
         return "The plan separates the bubbles' motion from the shake."
-    enough = [name for name, one in expected.items() if one.verdict is Verdict.RESOLVED]
-    enough = [name for name in enough if not name.startswith("both")] or enough
     if not enough:
         return (
             "None of these additions separates the bubbles' motion from the shake: record for "

@@ -74,7 +74,7 @@ def plan(
         for number, (name, one) in enumerate(chosen.items()):
             stage("variants", number, len(chosen))
             expected[name] = expect(rig, known, one)
-    for line in plan_words(rig, known, planned, expected):
+    for line in plan_words(rig, known, chosen, expected):
         say(line)
     if out is not None:
         write_table(plan_table(expected), out)

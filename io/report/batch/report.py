@@ -22,12 +22,12 @@ from telerig.io.report.page.figures import (
     draw_curves,
     drawing,
 )
-from telerig.io.report.page.number_format import ABSENT, is_number, number
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
 from telerig.io.results.batch import verdict_counts, verdict_of
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import read_object
 from telerig.io.results.smoothing import Verdict
+from telerig.number_format import ABSENT, is_number, number
 from telerig.short_text import counted
 
 Job = Mapping[str, Any]

@@ -23,12 +23,12 @@ from telerig.io.report.calibration.rig import dots_are_drawn, next_pictures, rig
 from telerig.io.report.calibration.target import target_pictures
 from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
 from telerig.io.report.page.figures import Picture
-from telerig.io.report.page.number_format import ABSENT, flat_rows
 from telerig.io.report.page.page import drawn_over_cores, render_page
 from telerig.io.results.calibration import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
 from telerig.io.results.telecentricity_words import telecentricity_words
+from telerig.number_format import ABSENT, flat_rows
 
 _COLOURS = {
     Status.GOOD: "good",

@@ -19,8 +19,8 @@ from telerig.io.report.page.figures import (
     drawing,
     image_axes,
 )
-from telerig.io.report.page.number_format import short_names
 from telerig.io.report.page.page import Trace, lines, scene_text, xyz
+from telerig.number_format import short_names
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -58,7 +59,19 @@ def _environment() -> Environment:
     from jinja2 import Environment, FunctionLoader
 
     loader = FunctionLoader(_package_file)
-    return Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
+    out = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
+    out.globals["glossary"] = glossary
+    return out
+
+
+@cache
+def glossary() -> dict[str, str]:
+    """Return the definitions of docs/glossary.md by term, without markup."""
+    text = re.sub("[*`]", "", _package_file("glossary.md").replace("**", "\0"))
+    return {
+        term: " ".join(words.split())
+        for term, words in re.findall("^\0(.+)\0: ((?:.+\n)+)", text, re.MULTILINE)
+    }
 
 
 @cache

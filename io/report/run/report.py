@@ -10,7 +10,6 @@ from typing import Any
 
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.page.contact_sheet import BUDGET_BYTES, picture_sheet
-from telerig.io.report.page.number_format import flat_rows
 from telerig.io.report.page.page import drawn_over_cores, plotly_javascript, render_page
 from telerig.io.report.run.smoothing.figures import PLACES, smoothing_drawings
 from telerig.io.report.run.smoothing.results import SmoothingResults, read_smoothing_results
@@ -38,6 +37,7 @@ from telerig.io.report.run.tracking.scene import scene_widening, track_plans, tr
 from telerig.io.report.run.tracking.two_rays import two_rays
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
+from telerig.number_format import flat_rows
 from telerig.rig.camera import Camera
 
 PAGE_BYTES = 7_600_000

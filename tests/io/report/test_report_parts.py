@@ -17,9 +17,10 @@ from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
 from telerig.io.report.calibration.target import target_shape
 from telerig.io.report.overlays import GREEN, RED, draw_overlay
-from telerig.io.report.page.number_format import nice_below, number, short_names, with_sd
+from telerig.io.report.page import page
 from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Target
 from telerig.io.results.tracking import TrackingFile
+from telerig.number_format import nice_below, number, short_names, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -221,3 +222,13 @@ def test_records_take_numpy_scalars_and_write_nan_as_null(tmp_path: Path) -> Non
     read = TrackingFile.read(file)
     assert read.frames == 3 and read.pairs is not None and read.pairs.scatter_px is None
     assert read.rig_change is not None and read.rig_change.moved
+
+
+@pytest.mark.parametrize("smoothing", [False, True])
+@pytest.mark.parametrize("kind", ["calibration", "track", "batch", "validation"])
+def test_every_term_of_a_page_is_in_the_glossary(kind: str, smoothing: bool) -> None:
+    template = page._environment().get_template(f"template_{kind}.html")
+    line = next(x for x in page._package_file(template.name or "").splitlines() if "set terms" in x)
+    environment = page._environment()
+    terms = environment.from_string(line).make_module({"smoothing": smoothing}).terms
+    assert all(page.glossary()[term] for term in terms)

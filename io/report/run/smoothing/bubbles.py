@@ -8,11 +8,11 @@ import numpy as np
 
 from telerig.io.report import plot
 from telerig.io.report.page.figures import Curve, Picture, draw_curves, drawing
-from telerig.io.report.page.number_format import number, with_sd
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.smoothing.results import SmoothingResults, column
 from telerig.io.report.run.tracking.results import median
 from telerig.io.report.run.tracking.scene import track_colour
+from telerig.number_format import number, with_sd
 
 MOST_ROWS = 40
 _MOST_LINES = 12

@@ -23,7 +23,6 @@ from telerig.io.report.page.figures import (
     draw_curves,
     drawing,
 )
-from telerig.io.report.page.number_format import is_number, number
 from telerig.io.report.run.smoothing.bubbles import BUBBLE_PICTURES
 from telerig.io.report.run.smoothing.results import (
     AXES,
@@ -39,6 +38,7 @@ from telerig.io.report.run.smoothing.results import (
 )
 from telerig.io.report.run.tracking.results import median, rms
 from telerig.io.report.run.tracking.scene import track_colour
+from telerig.number_format import is_number, number
 
 PLACES = ("bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")
 """Sections that hold drawings."""

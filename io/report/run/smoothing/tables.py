@@ -8,16 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from telerig.io.report.page.number_format import (
-    ABSENT,
-    flat_rows,
-    is_number,
-    name_with_unit,
-    number,
-    sentence,
-    share,
-    with_sd,
-)
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.smoothing.bubbles import (
     bubble_words,
@@ -48,6 +38,16 @@ from telerig.io.results.verdict_words import (
     words_of_contradiction,
     words_of_refusals,
     words_of_use,
+)
+from telerig.number_format import (
+    ABSENT,
+    flat_rows,
+    is_number,
+    name_with_unit,
+    number,
+    sentence,
+    share,
+    with_sd,
 )
 
 

@@ -18,7 +18,6 @@ from telerig.io.report.page.figures import (
     image_axes,
     image_height_in,
 )
-from telerig.io.report.page.number_format import number, share
 from telerig.io.report.run.tracking.results import (
     TrackResults,
     learnt_sd_mm,
@@ -28,6 +27,7 @@ from telerig.io.report.run.tracking.results import (
     rms,
 )
 from telerig.io.report.run.tracking.scene import draw_tracks, thinned
+from telerig.number_format import number, share
 from telerig.statistics import robust_sd
 
 _MOST_POINTS = 8_000

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.io.report.page.number_format import ABSENT, number, sentence, share
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.tracking.results import (
     NORMAL_MEDIAN,
@@ -23,6 +22,7 @@ from telerig.io.report.run.tracking.results import (
     track_lengths,
 )
 from telerig.io.results.tracking import share_words
+from telerig.number_format import ABSENT, number, sentence, share
 
 MOST_EVENTS = 60
 _MISS_TOO_LARGE = 3.0

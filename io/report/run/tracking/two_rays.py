@@ -17,8 +17,8 @@ from telerig.io.report.page.figures import (
     camera_colour,
     drawing,
 )
-from telerig.io.report.page.number_format import nice_below
 from telerig.io.report.run.tracking.results import TrackResults, pair_pixels, paired_rows
+from telerig.number_format import nice_below
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
 

@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them: digits that mean something, units, nothing for nothing."""
+"""Numbers as texts: significant digits, standard deviations, units."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def is_number(value: Any) -> bool:
-    """True for a finite int or float (files write null for what is not finite)."""
+    """Return whether a value is a finite int or float; files write null for other numbers."""
     plain = isinstance(value, int | float) and not isinstance(value, bool)
     return plain and math.isfinite(value)
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """``value`` to so many significant digits (a whole number to all of its digits)."""
+    """Return a number with so many significant digits; an int with all of its digits."""
     if not is_number(value):
         return ABSENT
     if value == 0:
@@ -31,7 +31,7 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def with_sd(value: Any, sd: Any) -> str:
-    """``value`` and its standard deviation, both cut where the deviation has two digits."""
+    """Return a value and its standard deviation, rounded to two digits of the latter."""
     if not is_number(value):
         return ABSENT
     if not is_number(sd) or sd <= 0:
@@ -47,7 +47,7 @@ def with_sd(value: Any, sd: Any) -> str:
 
 
 def share(part: Any, whole: Any) -> str:
-    """``part`` of ``whole`` in per cent; 100 % only when nothing is missing."""
+    """Return a part in per cent of the whole; 100 % only if they are equal."""
     if not is_number(part) or not is_number(whole) or whole <= 0:
         return ABSENT
     percent = 100 * part / whole
@@ -55,7 +55,7 @@ def share(part: Any, whole: Any) -> str:
 
 
 def sentence(text: str) -> str:
-    """``text`` with a capital and a full stop."""
+    """Return a text with a capital letter and a full stop."""
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
 
@@ -63,13 +63,16 @@ UNITS = {
     "_mm_s2": "mm/s²", "_mm_s": "mm/s", "_mm": "mm", "_um": "µm", "_m_s2": "m/s²", "_hz": "Hz",
     "_s": "s", "_px": "px", "_rad": "rad", "_nats": "log-likelihood ratio (nats)",
 }  # fmt: skip
-"""What stands for the end of a name in the files. Longer ends come first."""
+"""Units by the end of a name in the files. Longer ends come first."""
 
 
 def name_with_unit(
     name: str, shown: Mapping[str, tuple[str, float]] | None = None
 ) -> tuple[str, float]:
-    """Return a name in words, with its unit or the one ``shown`` for it, and the factor to it."""
+    """Return a name in words with its unit, and the factor from the stored to the shown unit.
+
+    shown : {unit of the file: (unit to show, factor)}.
+    """
     end = next((end for end in UNITS if name.endswith(end) and name != end), "")
     unit, factor = (shown or {}).get(UNITS.get(end, ""), (UNITS.get(end, ""), 1.0))
     words = name.removesuffix(end).replace("_", " ").replace(".", ": ")
@@ -77,7 +80,7 @@ def name_with_unit(
 
 
 def nice_below(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above ``value`` (1 for 0)."""
+    """Return the largest of 1, 2, 5 times a power of ten up to a value; 1 for 0."""
     if not is_number(value) or value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
@@ -85,7 +88,7 @@ def nice_below(value: float) -> float:
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """The names without what they all begin with, digits kept: view00, view01 -> 00, 01."""
+    """Return names without their common beginning, as 00, 01 for view00, view01."""
     if len(names) < 2:
         return list(names)
     alike = [len(set(letters)) == 1 for letters in zip(*names)]
@@ -96,7 +99,7 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 
 def flat_rows(content: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Every leaf of nested mappings and lists as (dotted name, text)."""
+    """Yield the leaves of nested mappings and lists as (dotted name, text)."""
     if isinstance(content, Mapping):
         for key, value in content.items():
             yield from flat_rows(value, f"{path}.{key}" if path else str(key))

@@ -282,7 +282,7 @@ def run_case(case: Case, count: int, rng: np.random.Generator) -> Outcome:
 
 
 HEADER = (
-    "| mode | axis | ratio | mean of outlines, R | volume, R | mean of outlines, um | volume, um "
+    "| mode | axis | ratio | mean of outlines, R | volume, R | mean of outlines, µm | volume, µm "
     "| gain | in 68 % | in 95 % | zonal | d_eq, % |\n" + 12 * "|---" + "|"
 )
 

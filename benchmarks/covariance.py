@@ -271,7 +271,7 @@ def table(case: Case, samples: Samples) -> list[str]:
         f"{np.count_nonzero(samples.floors)} datasets.",
         f"- 3-D map, reported over observed: {v.space:.3f} +- {v.space_error:.3f} over all points, "
         f"{v.low:.3f} to {v.high:.3f} point by point.",
-        f"- 3-D error of the calibration: median {np.median(space):.3f} um RMS per axis, RMS "
+        f"- 3-D error of the calibration: median {np.median(space):.3f} µm RMS per axis, RMS "
         f"{_rms(space):.3f}, predicted {predicted:.3f}, Cramer-Rao bound {_rms(bound):.3f}; "
         f"**median over bound {np.median(space / bound):.2f}**, RMS over bound "
         f"{_rms(space) / _rms(bound):.2f}.",

@@ -1,9 +1,9 @@
-"""A camera that moves by 20 um and 50 urad after the calibration: what a run tells of it.
+"""A camera that moves by 20 µm and 50 µrad after the calibration: what a run tells of it.
 
 Usage: python benchmarks/drift.py [--seeds 24] [--graph 20] [--seed 0] [--out FILE.md]
 Runs of the simulator as tables: pixels of the projected centres with noise, cameras that shake, a
-calibration that is sure of its pose to 20 urad and 0.5 um and wrong by a draw from that. The
-movement is 20 um along the common perpendicular, and a rotation by 50 urad about a random axis
+calibration that is sure of its pose to 20 µrad and 0.5 µm and wrong by a draw from that. The
+movement is 20 µm along the common perpendicular, and a rotation by 50 µrad about a random axis
 across it. Every seed counts. `--graph`: seeds that are smoothed with and without --refine-rig, the
 modes of the shake given.
 """
@@ -187,7 +187,7 @@ def true_model() -> ShakeModel:
 
 
 def in_graph(case: Case, model: ShakeModel, seeds: range) -> tuple[Score, Array]:
-    """The score, and (seeds, 2) the constant error along y (um) without and with refinement."""
+    """The score, and (seeds, 2) the constant error along y (µm) without and with refinement."""
     score, bias = Score([], [], []), []
     for seed in seeds:
         run = drawn(case, True, np.random.default_rng(seed))
@@ -227,7 +227,7 @@ def main() -> None:
         print(line, flush=True)
         lines.append(line)
 
-    show("| run | offset, um | roll, urad | pitch, urad | NEES | largest, sd | called moved |")
+    show("| run | offset, µm | roll, µrad | pitch, µrad | NEES | largest, sd | called moved |")
     show("|---|---|---|---|---|---|---|")
     known = cases()
     chosen = options.only or list(known)
@@ -248,7 +248,7 @@ def main() -> None:
     show("")
     for name, bias in biases.items():
         rms = np.sqrt(np.mean(bias**2, 0))
-        show(f"Constant error of y in the trajectories of {name}, um RMS over seeds: "
+        show(f"Constant error of y in the trajectories of {name}, µm RMS over seeds: "
              f"{rms[0]:.1f} without, {rms[1]:.1f} with --refine-rig.")  # fmt: skip
     if options.out:
         options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")

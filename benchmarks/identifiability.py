@@ -85,8 +85,8 @@ WORDS = ("RESOLVED", "PARTIAL", "UNRESOLVED", "LABEL_AMBIGUOUS", "SHAKE_BELOW_NO
 
 def report(found: list[Outcome]) -> Iterable[str]:
     """The confusion table: a row for each scenario and information set."""
-    columns = ["case", "information", "runs", "as it must be", *WORDS, "q, vertical", "RMS um"]
-    columns += ["sd um", "RMS / table", "CPU s"]
+    columns = ["case", "information", "runs", "as it must be", *WORDS, "q, vertical", "RMS µm"]
+    columns += ["sd µm", "RMS / table", "CPU s"]
     yield "| " + " | ".join(columns) + " |\n|" + "---|" * len(columns) + "\n"
     for case, information in dict.fromkeys((o.case, o.information) for o in found):
         rows = [o for o in found if (o.case, o.information) == (case, information)]

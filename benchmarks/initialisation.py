@@ -4,7 +4,7 @@ Usage: python benchmarks/initialisation.py [--rigs 1000] [--seed ONE] [--out FIL
 
 Each rig is drawn anew: angle between the cameras 20-110 deg (every fifth: 110-160 deg with a
 two-sided plate), tilts of the plate 5-75 deg, scale 1-100 px/mm, 512-2048 px, 9-42 dots, 6-40
-views, dot noise 0.005-0.03 px, print errors of 20 um in and out of plane, k1 up to 2e-2 and kappa
+views, dot noise 0.005-0.03 px, print errors of 20 µm in and out of plane, k1 up to 2e-2 and kappa
 up to 1e-4 / mm in every camera (print errors and 1 / kappa in proportion to the field of view,
 which is 51 mm for the figures given), nominal rotation wrong by up to 8 deg. The start of
 `self_calibrate` (closed form, a short solve, the choice of the mirror solution), refined with the

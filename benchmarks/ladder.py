@@ -3,7 +3,7 @@
 Usage: python benchmarks/ladder.py [--first 200] [--seeds 100] [--weak-seeds 15] [--out FILE.md]
 
 A rig of seed s and a rung is drawn: 10 to 24 hand-held views, 15 to 100 dots, axes 50 to 100
-degrees apart, image noise 0.005 to 0.02 px, target printed to 20 um, image centres on the axes.
+degrees apart, image noise 0.005 to 0.02 px, target printed to 20 µm, image centres on the axes.
 Each parameter of the rung is between three times what is detectable (three standard deviations of
 the rung's own fit, so nine of them) and "big" (`BIG`), log-uniform; of a pair (p1 and p2, ...) the
 length, its direction at random. A second table has them between one and three times what is

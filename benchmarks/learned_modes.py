@@ -78,7 +78,7 @@ def _heights(
 
 
 def hidden_report(runs: int) -> Iterable[str]:
-    columns = ["hidden line mm", "prior", "runs", "RMS um", "sd um", "(e/sd)^2", "worst"]
+    columns = ["hidden line mm", "prior", "runs", "RMS µm", "sd µm", "(e/sd)^2", "worst"]
     yield "| " + " | ".join(columns) + " |\n|" + "---|" * len(columns) + "\n"
     for hidden_mm in HIDDEN_MM:
         rows = [row for k in range(runs) for row in hidden(hidden_mm, 100 + k)]
@@ -91,7 +91,7 @@ def hidden_report(runs: int) -> Iterable[str]:
 
 
 def corner_report(corners: Sequence[float], seeds: Sequence[int]) -> Iterable[str]:
-    columns = ["made with Hz", "seed", "found Hz", "stated, relative", "RMS um", "sd um"]
+    columns = ["made with Hz", "seed", "found Hz", "stated, relative", "RMS µm", "sd µm"]
     yield "| " + " | ".join(columns) + " |\n|" + "---|" * len(columns) + "\n"
     for corner in corners:
         case = replace(cases()["S4"], force_hz=corner)

@@ -7,7 +7,7 @@ from the same six hand-held views. Six more are held as advised, one by one, wit
 2 mm (standard deviations) of the advice; or six more are drawn at random. "true" is the 3-D RMS
 error per axis over the working volume, its common rigid motion removed, over six datasets with
 these views (target, known distance and image noise drawn anew); "sd" is what their calibrations
-state. The known distance on the target (0.3 um in 10 mm) limits both, whatever the views: "without
+state. The known distance on the target (0.3 µm in 10 mm) limits both, whatever the views: "without
 size" sets the common factor aside.
 """
 
@@ -46,7 +46,7 @@ ROWS = (
 
 @dataclass
 class Path3D:
-    """By number of added views: true RMS, the same without size, stated sd, the same (um).
+    """By number of added views: true RMS, the same without size, stated sd, the same (µm).
 
     reached, promised : sd after a view, and as promised before it.
     """
@@ -159,7 +159,7 @@ def rms(values: list[float]) -> float:
 
 def summary(paths: list[tuple[SimulationConfig, Path3D, Path3D]]) -> list[str]:
     advised, random = [a for _, a, _ in paths], [r for _, _, r in paths]
-    lines = ["| views | true, um | sd, um | true without size | sd without size |",
+    lines = ["| views | true, µm | sd, µm | true without size | sd without size |",
              "|---|---|---|---|---|"]  # fmt: skip
     for label, kind, added in ROWS:
         some = advised if kind == "advised" else random

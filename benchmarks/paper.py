@@ -106,12 +106,12 @@ def report(preset: str, table: pd.DataFrame) -> str:
         f"{table['images_failed'].sum()}",
         f"- dot error over its reported sd: {table['dot_error_sd'].mean():.3f} (1 is right)",
         f"- chi-square per degree of freedom: {table['chi2_dof'].mean():.3f}",
-        f"- 3-D error over the working volume, um RMS per axis: median "
+        f"- 3-D error over the working volume, µm RMS per axis: median "
         f"{table['rms_um'].median():.3f}, bound {table['bound_um'].median():.3f}; ratio median "
         f"{ratio.median():.3f}, root mean square {np.sqrt((ratio**2).mean()):.3f}, worst "
         f"{ratio.max():.3f}",
-        f"- dots held at nominal instead (print errors of 20 um): "
-        f"{table['held_rms_um'].median():.2f} um, {gain.median():.1f} times worse",
+        f"- dots held at nominal instead (print errors of 20 µm): "
+        f"{table['held_rms_um'].median():.2f} µm, {gain.median():.1f} times worse",
         f"- models chosen: {table['model'].value_counts().to_dict()}",
         f"- seconds per calibration: median {table['seconds'].median():.2f}",
         "",

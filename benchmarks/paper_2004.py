@@ -140,11 +140,11 @@ def table(found: list[Figures]) -> str:
     length = np.sqrt(3)
     rows = [
         ("dots, from images", "0.03 px", f"{mean('dots_px'):.4f} px", "RMS per coordinate"),
-        ("space, dots and points of 0.03 px", "5 um", f"{space(0.03, 0):.2f} um",
-         f"RMS length ({space(0.03, 0) / length:.2f} um per axis); {space(0.03, 1):.2f} um with "
+        ("space, dots and points of 0.03 px", "5 µm", f"{space(0.03, 0):.2f} µm",
+         f"RMS length ({space(0.03, 0) / length:.2f} µm per axis); {space(0.03, 1):.2f} µm with "
          "the cameras known"),
-        ("space, dots and points of 0.1 px", "10 um", f"{space(0.1, 0):.2f} um",
-         f"RMS length ({space(0.1, 0) / length:.2f} um per axis); {space(0.1, 1):.2f} um with "
+        ("space, dots and points of 0.1 px", "10 µm", f"{space(0.1, 0):.2f} µm",
+         f"RMS length ({space(0.1, 0) / length:.2f} µm per axis); {space(0.1, 1):.2f} µm with "
          "the cameras known"),
         ("bubble's centre, from images", "1.5 px", f"{mean('volume_px'):.3f} px",
          f"of volume, RMS per coordinate; {mean('centre_px'):.3f} px for the outline's centre"),

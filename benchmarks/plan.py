@@ -45,7 +45,7 @@ def planned(config: RunConfig) -> Experiment:
 
 
 def one_run(config: RunConfig, seed: int) -> tuple[np.ndarray, np.ndarray, str, str]:
-    """Mean square errors (3, 2) of position (um^2) and velocity, expected sds, both verdicts."""
+    """Mean square errors (3, 2) of position (µm^2) and velocity, expected sds, both verdicts."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "tank"
         data = telerig.simulate(config, rng=np.random.default_rng(seed), out=place, images=False)
@@ -104,7 +104,7 @@ def main() -> None:
 
 Printed by `benchmarks/plan.py`: expected standard deviation / RMS error of {options.seeds}
 simulated runs (root mean square over frames and runs, without the first and last tenth) = their
-ratio. Position um, velocity mm/s. Last: the expected verdict, and how many runs got it.
+ratio. Position µm, velocity mm/s. Last: the expected verdict, and how many runs got it.
 
 | scenario | sensors | x | y | z | vx | vy | vz | verdict |
 |---|---|---|---|---|---|---|---|---|

@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/print_errors.py [--seeds 60] [--out FILE.md]
 
-The preset `paper`: dots off by 20 um (standard deviation, each of x, y and out of the plane) that
+The preset `paper`: dots off by 20 µm (standard deviation, each of x, y and out of the plane) that
 nobody tells the estimator, pixel noise 0.01 px. The same tables are calibrated with the dots free
 in 3-D, free in the plane, and nominal; also with a stated tolerance that is wrong. 3-D error: RMS
 per axis over a cube of 30 mm, after the rotation and shift that fit best.
@@ -73,7 +73,7 @@ def main() -> None:
         "",
         *about,
         "",
-        "| dots off by um | stated um | 3-D error um: free in 3-D | in the plane | nominal | "
+        "| dots off by µm | stated µm | 3-D error µm: free in 3-D | in the plane | nominal | "
         "**gain of 3-D over nominal** | scatter px: 3-D | plane | nominal |",
         "|---" * 9 + "|",
     ]

@@ -88,7 +88,7 @@ def main() -> None:
             f"{len(found.dots)} dots numbered in {len(found.images)} images, "
             f"{time.perf_counter() - begun:.0f} s", "",
             "| dots | model | limit | kept | RMS px | floor px | angle deg | sd (formal) "
-            "| centres mm | out of plane um | verdict | s |",
+            "| centres mm | out of plane µm | verdict | s |",
             "|---|---|---|---|---|---|---|---|---|---|---|---|",
         ]  # fmt: skip
         for dots_free, model, limit in CASES:

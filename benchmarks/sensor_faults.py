@@ -269,7 +269,7 @@ def alarms(options: argparse.Namespace) -> pd.DataFrame:
 
 def alarm_report(table: pd.DataFrame) -> str:
     lines = [
-        "| scenario | configuration | clock | frames | runs | alarms | vertical um | possible "
+        "| scenario | configuration | clock | frames | runs | alarms | vertical µm | possible "
         "| ratio | NEES |",
         "|" + "---|" * 10,
     ]

@@ -164,7 +164,7 @@ def main() -> None:
     text = f"""# Faults in the data
 
 S2, {options.seeds} seeds from {options.seed};
-vertical RMS error of the middle 80 %, position um / velocity mm/s; its
+vertical RMS error of the middle 80 %, position µm / velocity mm/s; its
 ratio to the same without the fault, and the ratio that the posterior predicts (RMS of the stated
 standard deviations, exact for the true model); mean of (error / sd)^2; the largest error, over the
 seeds, of the accelerometers' delay and of the encoder's scale where the smoother estimates them.

@@ -39,7 +39,7 @@ INFORMATION = ("one", "five", "carriage", "arms", "references", "oracle")
 
 @dataclass(frozen=True)
 class Record:
-    """One smoothed run, all its bubbles, middle 80 %; vertical, um and mm/s unless named otherwise.
+    """One smoothed run, all its bubbles, middle 80 %; vertical, µm and mm/s unless named otherwise.
 
     square, velocity_square : mean of (error / sd)^2.  nees : of the 3-D position, per dimension.
     position_3d, naive_3d : RMS of the vector.
@@ -129,7 +129,7 @@ def smoothed(run: Run, information: str, model: str, seed: int) -> Record:
 
 
 def posteriors(case: Case, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
-    """The reference's sd (um, mm/s) of each set of information."""
+    """The reference's sd (µm, mm/s) of each set of information."""
     inner = middle(case.scenario.frames)
     runs = generate(case.scenario, 1, rng)
     out = {}
@@ -232,7 +232,7 @@ def report(table: pd.DataFrame, possible: Mapping[str, Any], options: argparse.N
         rig += ", each seed with a calibration of its own from dots with 0.3 px of noise"
     return f"""# Smoothing the scenarios
 
-{rig}; vertical axis, middle 80 %, position um / velocity mm/s.
+{rig}; vertical axis, middle 80 %, position µm / velocity mm/s.
 possible: the independent reference's posterior sd, true hyper-parameters. sd, RMS: of
 `telerig.smooth`. (e/sd)^2: mean, in brackets its distance from 1 in standard errors over the
 seeds. NEES 3-D: of the position, per dimension. naive / RMS: how much better than triangulating

@@ -83,7 +83,7 @@ def distance(found: tuple[float, float], text: str) -> float:
 
 
 def row(scenario: Scenario, runs: Runs) -> tuple[dict[str, tuple[float, float]], list[str]]:
-    """Posterior sd (um, mm/s) of each information set, and the lines of the check by runs."""
+    """Posterior sd (µm, mm/s) of each information set, and the lines of the check by runs."""
     inner = middle(scenario.frames)
     height, velocity = naive(runs)
     errors = height - runs.height[0], velocity - runs.velocity[0]
@@ -142,7 +142,7 @@ def main() -> None:
         checks += lines
     text = f"""# What is possible: exact posteriors of the scenarios
 
-Standard deviations in the middle 80 % of a run, position um / velocity mm/s, by the independent
+Standard deviations in the middle 80 % of a run, position µm / velocity mm/s, by the independent
 reference (`tests/support/shake_reference.py`) with true hyper-parameters; in brackets the
 table of the design. naive and rts (a smoother with the bubble's own priors and no shake) are RMS
 errors over {options.runs} runs, so they scatter; the design does not say how its RTS was tuned.

@@ -82,7 +82,7 @@ def tracked(
 def measured(
     frames: int, bubbles: int, track: int, seed: int = 1, across_um: int = 0
 ) -> dict[str, Any]:
-    """Processor seconds by phase, peak memory of this process in GB, errors and sd (um), NEES."""
+    """Processor seconds by phase, peak memory of this process in GB, errors and sd (µm), NEES."""
     rng = np.random.default_rng(seed)
     problem, lab = tracked(rng, frames, bubbles, track, 1e-3 * across_um)
     short = simulate(Case(replace(SCENARIOS["S2"], frames=60)), rng)
@@ -112,7 +112,7 @@ def measured(
 def across(millimetres: list[float], seeds: int) -> list[str]:
     """Rows of a table: errors and standard deviations where the rig shakes across, too."""
     lines = [
-        "| shake across, mm | bubbles | seed | RMS error x, y, z, um | sd, um | NEES x, y, z |",
+        "| shake across, mm | bubbles | seed | RMS error x, y, z, µm | sd, µm | NEES x, y, z |",
         "|---|---|---|---|---|---|",
     ]
     for mm in millimetres:
@@ -217,7 +217,7 @@ def growing(frames: list[int], bubbles: list[int], tracks: list[int]) -> list[st
         "CPU seconds of one thread; `benchmarks/smoothing_many.py`.",
         "",
         "| frames | bubbles in sight | frames a track | learning | smoothing | verdict | tables "
-        "| all | peak GB | first line, s | RMS error x, y, z, um | NEES |",
+        "| all | peak GB | first line, s | RMS error x, y, z, µm | NEES |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     found = {}

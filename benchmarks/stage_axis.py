@@ -1,7 +1,7 @@
 """Travel axis and encoder scale from `stage_axis/`: an encoder that reads 1 % too much.
 
 Usage: python benchmarks/stage_axis.py [--seeds 8] [--seed 0] [--out FILE.md]
-Whole way: simulated dataset without images (dots to 0.01 px, positions to 1 um, seven stops over
+Whole way: simulated dataset without images (dots to 0.01 px, positions to 1 µm, seven stops over
 about 30 mm), self-calibration, stage. Every seed counts.
 """
 
@@ -22,7 +22,7 @@ SCALE = 0.01
 
 
 def one(seed: int, stops: int) -> tuple[float, float, float, float, float]:
-    """Scale error and sd (ppm), axis error (urad) and its squared distance in sd, travel (mm)."""
+    """Scale error and sd (ppm), axis error (µrad) and its squared distance in sd, travel (mm)."""
     config = run_preset("rise", frames=2)
     stage = replace(config.stage, axis_views=stops, encoder_scale=SCALE)
     with tempfile.TemporaryDirectory() as place:
@@ -59,7 +59,7 @@ def main() -> None:
     text = f"""# Travel axis and encoder scale from stage_axis/
 
 The encoder reads 1 % too much; {options.stops} stops over
-{travel.min():.0f} to {travel.max():.0f} mm, positions to 1 um, dots to 0.01 px,
+{travel.min():.0f} to {travel.max():.0f} mm, positions to 1 µm, dots to 0.01 px,
 the rig self-calibrated from the same dataset's views.
 {len(rows)} seeds from {options.seed}.
 
@@ -67,7 +67,7 @@ the rig self-calibrated from the same dataset's views.
 |---|---|---|---|---|
 | encoder scale, ppm | {_rms(scale):.0f} | {np.abs(scale).max():.0f} | {_rms(sd):.0f} | \
 {np.mean((scale / sd) ** 2):.2f} |
-| travel axis, urad | {_rms(axis):.0f} | {axis.max():.0f} | | {np.mean(distance) / 2:.2f} |
+| travel axis, µrad | {_rms(axis):.0f} | {axis.max():.0f} | | {np.mean(distance) / 2:.2f} |
 """
     print(text)
     if options.out:

@@ -3,7 +3,7 @@
 Usage: python benchmarks/stress.py [--seeds 20] [--auto 10] [--images 3] [--only NAME] [--out FILE]
 
 Twenty datasets of every case, each with its own target, hand-held poses and noise, from tables of
-dots; the lens model is given, and is one that can describe the lens. Errors in um: 125 points in a
+dots; the lens model is given, and is one that can describe the lens. Errors in µm: 125 points in a
 cube of 30 mm, triangulated from their true pixels, RMS per axis after the rotation and shift that
 fit best. The bound is that of the true rig and of the sound dots. Most of it is the known distance
 on the target, one number per dataset, so that the ratio of 20 datasets scatters by up to 16 %
@@ -114,7 +114,7 @@ def partly_seen(marks: bool = False) -> SimulationConfig:
 
 @dataclass
 class Found:
-    """One row a dataset; um."""
+    """One row a dataset; µm."""
 
     rms_um: list[float] = field(default_factory=list)
     shape_um: list[float] = field(default_factory=list)
@@ -232,7 +232,7 @@ def _rms(values: Any) -> float:
 
 
 HEAD = [
-    "| case | model | median, um | RMS | bound | **RMS / bound** | without size | worst / bound | "
+    "| case | model | median, µm | RMS | bound | **RMS / bound** | without size | worst / bound | "
     "NEES | shown | wrong / missed | s |",
     "|---|---|---|---|---|---|---|---|---|---|---|---|",
 ]
@@ -286,7 +286,7 @@ def from_images(name: str, config: SimulationConfig, model: str, seed: int) -> s
 
 def images(seeds: int) -> list[str]:
     lines = [
-        "| from images | seed | model | RMS, um | predicted | NEES | dots found | verdict | s |",
+        "| from images | seed | model | RMS, µm | predicted | NEES | dots found | verdict | s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     settings = [

@@ -8,7 +8,7 @@ as `telerig calibrate` does (lens model chosen, cameras free), with all cameras 
 
 Error: 125 points in a cube of 30 mm, triangulated from their true pixels in all cameras used; RMS
 per axis after the similarity that fits best (the size comes from the target's known distance alone,
-whose 1 um in 31 mm would hide what the cameras do). It is the calibration's share alone.
+whose 1 µm in 31 mm would hide what the cameras do). It is the calibration's share alone.
 
 Bound: Cramer-Rao, from a dense Jacobian by central differences of the simulator's own projection at
 the truth: scales, poses of cameras, views, dots (with what print and the known distance say) and

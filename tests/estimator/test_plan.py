@@ -43,7 +43,7 @@ def tank(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def rig(tank: Path) -> RigDescription:
-    """An encoder of 1 um whose scale is exact."""
+    """An encoder of 1 µm whose scale is exact."""
     described = telerig.load_dataset(tank).rig
     assert described.stage is not None
     exact = replace(described.stage, position_sigma_mm=0.001, scale_sigma=0.0)

@@ -155,7 +155,7 @@ def test_output_is_compared() -> None:
         ("12 views", "13 views", True),
         ("12 views", "14 views", False),
         ("chi-square 0.98", "chi-square 1.2", False),
-        ("stated 161 um", "stated 155 um", False),
+        ("stated 161 µm", "stated 155 µm", False),
     ],
 )
 def test_numbers_of_the_tutorial_are_compared(page: str, printed: str, same: bool) -> None:

@@ -215,7 +215,7 @@ def test_the_start_does_not_need_the_nominal_scale(paper: Any) -> None:
 
 @pytest.mark.parametrize("dots_free", ["3d", "plane", "nominal"])
 def test_what_dots_may_do(dots_free: str, scene: Any) -> None:
-    """20 um off in the plane and out of it: held dots show in the residuals and in space."""
+    """20 µm off in the plane and out of it: held dots show in the residuals and in space."""
     made = scene("paper", 2)
     calibration = made.calibrate("radial", dots_free=dots_free)
     error = made.space_rms_um(calibration)

@@ -140,7 +140,7 @@ def test_outliers_and_a_wrong_reading() -> None:
 
 
 def test_a_stage_that_wanders_says_so() -> None:
-    """5 um across and 5 um in the reading, 1 um stated: the covariance grows to cover it."""
+    """5 µm across and 5 µm in the reading, 1 µm stated: the covariance grows to cover it."""
     rng = np.random.default_rng(6)
     scores, told = [], 0
     for _ in range(40):

@@ -20,7 +20,7 @@ from telerig.scripts.main import app
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seven stops over 30 mm, 1 um positions, an encoder that reads 1 % too much; calibrated."""
+    """Seven stops over 30 mm, 1 µm positions, an encoder that reads 1 % too much; calibrated."""
     folder = tmp_path_factory.mktemp("stage") / "data"
     command = ["simulate", "rise", "--no-images", "--stage-axis", "7", "--encoder-scale", "0.01"]
     for words in (

@@ -34,7 +34,7 @@ def test_a_rig_at_rest_has_not_moved(at_rest: list[Any]) -> None:
 
 
 def test_a_movement_is_found_with_its_size(scene: Any, at_rest: list[Any]) -> None:
-    """The second camera turned by 300 urad about the rig's z axis, and shifted by 12 um."""
+    """The second camera turned by 300 µrad about the rig's z axis, and shifted by 12 µm."""
     after = scene(
         "paper", 40, axis_gap_mm=0.312, mount_rotvec_deg=(0.4 + np.degrees(3e-4), -0.7, 0.5)
     ).calibrate()
@@ -107,7 +107,7 @@ def test_halves_agree_when_the_model_is_right(at_rest: list[Any]) -> None:
 
 
 def test_halves_know_that_the_targets_size_is_common_to_both(scene: Any) -> None:
-    """The pitch alone sets the scale: a print error of 20 um that no half can see as its own."""
+    """The pitch alone sets the scale: a print error of 20 µm that no half can see as its own."""
     ratio = []
     for seed in range(30, 34):
         made = scene("paper", seed)

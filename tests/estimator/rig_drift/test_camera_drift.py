@@ -176,7 +176,7 @@ def test_offset_roll_and_pitch_are_those_of_the_body() -> None:
 
 @pytest.mark.parametrize("shake_mm", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_coverage_with_and_without_shake(shake_mm: float) -> None:
-    """20 um and 50 urad come back with errors that their covariance says; 8 runs each."""
+    """20 µm and 50 µrad come back with errors that their covariance says; 8 runs each."""
     rng = np.random.default_rng(5)
     cameras = rig()
     prior = DriftPrior()
@@ -211,7 +211,7 @@ def test_no_movement_is_no_movement() -> None:
 
 
 def test_a_poor_calibration_is_not_a_movement() -> None:
-    """20 um off is nothing for a calibration that is sure to 30 um; a sure one has moved."""
+    """20 µm off is nothing for a calibration that is sure to 30 µm; a sure one has moved."""
     cameras = rig()
     rng = np.random.default_rng(7)
     tracks = Run().tracks(

@@ -27,7 +27,7 @@ def test_jumps_outside_the_frames_only_warn() -> None:
 
 
 def test_hard_but_real_motion_is_no_jump() -> None:
-    """Starts, stops and a stick-slip motion, with 1 um noise, at three rates."""
+    """Starts, stops and a stick-slip motion, with 1 µm noise, at three rates."""
     rng = np.random.default_rng(1)
     for rate in (50, 200, 1000):
         t = np.arange(0, 3, 1 / rate)
@@ -52,7 +52,7 @@ def test_a_rest_in_which_readings_repeat_is_no_measure_of_the_noise() -> None:
 
 
 def test_a_jump_is_found_under_a_hunting_servo() -> None:
-    """0.1 mm RMS at 15 Hz: jumps of 50 um at 1 kHz and 0.5 mm at 100 Hz stand out, none besides."""
+    """0.1 mm RMS at 15 Hz: jumps of 50 µm at 1 kHz and 0.5 mm at 100 Hz stand out, none besides."""
     for rate, size in ((1000, 0.05), (100, 0.5)):
         rng = np.random.default_rng(7)
         t = np.arange(0, 2, 1 / rate)

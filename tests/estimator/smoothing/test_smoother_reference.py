@@ -98,7 +98,7 @@ TABLE = [
     ("S3", "one", 104, 8.0),
     ("S3", "oracle", 12.8, 2.23),
 ]
-"""Scenario, information, posterior sd of position (um) and velocity (mm/s): exact figures."""
+"""Scenario, information, posterior sd of position (µm) and velocity (mm/s): exact figures."""
 
 
 @pytest.mark.parametrize(("name", "information", "um", "mm_s"), TABLE)

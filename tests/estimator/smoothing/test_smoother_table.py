@@ -118,7 +118,7 @@ def test_vertical_standard_deviations_are_those_of_the_table(
         variance = np.einsum("i,fij,j->f", row, found.bubbles[:FRAMES], row)
         return float(np.sqrt(variance[middle].mean()))
 
-    # the table is rounded to 0.5 um and 0.05 mm/s where it has two digits
+    # the table is rounded to 0.5 µm and 0.05 mm/s where it has two digits
     rounding = 0.5 if position_um == round(position_um) else 0.05
     assert 1e3 * rms(layout.position[1]) == pytest.approx(
         position_um, abs=0.01 * position_um + rounding

@@ -190,7 +190,7 @@ def test_an_encoder_that_jumps(size: float, run: Path) -> None:
 
 
 def test_a_counter_that_wraps_round(run: Path) -> None:
-    """A 16 bit counter of 1 um steps: 65.536 mm to and fro."""
+    """A 16 bit counter of 1 µm steps: 65.536 mm to and fro."""
     wrap = 65.536
     low = pd.read_csv(run / "stage.csv")["position_mm"].iloc[300] - wrap
 

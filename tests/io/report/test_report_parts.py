@@ -26,7 +26,7 @@ from telerig.rig.pose import Pose
 
 
 def _results() -> CalibrationResults:
-    """Two cameras at 90 degrees, a 3 x 5 grid with one dot 50 um high, three poses."""
+    """Two cameras at 90 degrees, a 3 x 5 grid with one dot 50 µm high, three poses."""
     turned = Pose.from_rotvec([0.0, np.pi / 2, 0.0], [0.0, 0.3, 0.0])
     left = Camera.create("left", (512, 400), 10.0, k1=0.002)
     right = Camera.create("right", (512, 512), 10.3, camera_from_rig=turned)

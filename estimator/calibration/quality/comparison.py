@@ -18,10 +18,10 @@ from scipy.special import chdtrc
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.number_format import number, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_shift, triangulate_any, working_volume
+from telerig.short_text import number, with_sd
 
 UNLIKELY = 1e-3
 """A difference counts as real if chance alone causes one as large with less than this

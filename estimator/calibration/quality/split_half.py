@@ -26,7 +26,7 @@ from telerig.estimator.calibration.solver.problem import Problem, cameras_from_s
 from telerig.estimator.calibration.solver.robust_least_squares import LEAST_DOTS, solve
 from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.calibration import State
-from telerig.number_format import number
+from telerig.short_text import number
 
 LEAST_VIEWS = 4
 """Least number of views in each half; fewer do not determine a rig."""

@@ -27,8 +27,7 @@ from telerig.io.results.batch import verdict_counts, verdict_of
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import read_object
 from telerig.io.results.smoothing import Verdict
-from telerig.number_format import ABSENT, is_number, number
-from telerig.short_text import counted
+from telerig.short_text import ABSENT, counted, is_number, number
 
 Job = Mapping[str, Any]
 

@@ -15,7 +15,7 @@ from telerig.io.report.page.figures import (
     drawing,
     png,
 )
-from telerig.number_format import number
+from telerig.short_text import number
 
 _MESH = 40
 _MOST_SHAPES = 1500

@@ -21,7 +21,7 @@ from telerig.io.report.page.figures import (
     image_axes,
     image_height_in,
 )
-from telerig.number_format import nice_below, number, short_names
+from telerig.short_text import nice_below, number, short_names
 
 MOST_ARROWS = 1200
 _ARROW_CELLS = 24

@@ -28,7 +28,7 @@ from telerig.io.results.calibration import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
 from telerig.io.results.telecentricity_words import telecentricity_words
-from telerig.number_format import ABSENT, flat_rows
+from telerig.short_text import ABSENT, flat_rows
 
 _COLOURS = {
     Status.GOOD: "good",

@@ -20,9 +20,9 @@ from telerig.io.report.page.figures import (
     image_axes,
 )
 from telerig.io.report.page.page import Trace, lines, scene_text, xyz
-from telerig.number_format import short_names
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
+from telerig.short_text import short_names
 
 _BEFORE, _BEHIND = 1.7, 1.2
 """How far a drawn field reaches before and behind the poses, in radii of the poses."""

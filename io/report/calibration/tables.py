@@ -12,10 +12,10 @@ from telerig.errors import GeometryError
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.results.calibration import CameraRecord, LadderStep
-from telerig.number_format import ABSENT, number, share, with_sd
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import LENS_PARAMETERS, PARAMETERS
+from telerig.short_text import ABSENT, number, share, with_sd
 
 WORST = 15
 _MANY_SD = 3.0

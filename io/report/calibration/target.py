@@ -10,7 +10,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.figures import WIDTH_IN, Picture, drawing
-from telerig.number_format import nice_below, number
+from telerig.short_text import nice_below, number
 
 _MOST_LABELS = 40
 _MOST_SHAPES = 1500

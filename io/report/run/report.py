@@ -37,8 +37,8 @@ from telerig.io.report.run.tracking.scene import scene_widening, track_plans, tr
 from telerig.io.report.run.tracking.two_rays import two_rays
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
-from telerig.number_format import flat_rows
 from telerig.rig.camera import Camera
+from telerig.short_text import flat_rows
 
 PAGE_BYTES = 7_600_000
 """Of all that is large; words and tables come on top."""

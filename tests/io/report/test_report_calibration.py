@@ -20,8 +20,8 @@ from telerig.io.report.calibration.report import contact_sheet, write_calibratio
 from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.tables import parameter_rows, pose_rows, worst_rows
 from telerig.io.report.page import contact_sheet as sheets
-from telerig.number_format import with_sd
 from telerig.rig.lens_parameters import PARAMETERS
+from telerig.short_text import with_sd
 
 SIGMA_PX, BUMP_MM = 0.01, 0.05
 SECTIONS = [

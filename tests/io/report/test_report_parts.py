@@ -20,9 +20,9 @@ from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page import page
 from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Target
 from telerig.io.results.tracking import TrackingFile
-from telerig.number_format import nice_below, number, short_names, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
+from telerig.short_text import nice_below, number, short_names, with_sd
 
 
 def _results() -> CalibrationResults:

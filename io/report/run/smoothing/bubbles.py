@@ -12,7 +12,7 @@ from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.smoothing.results import SmoothingResults, column
 from telerig.io.report.run.tracking.results import median
 from telerig.io.report.run.tracking.scene import track_colour
-from telerig.number_format import number, with_sd
+from telerig.short_text import number, with_sd
 
 MOST_ROWS = 40
 _MOST_LINES = 12

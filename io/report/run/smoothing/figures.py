@@ -38,7 +38,7 @@ from telerig.io.report.run.smoothing.results import (
 )
 from telerig.io.report.run.tracking.results import median, rms
 from telerig.io.report.run.tracking.scene import track_colour
-from telerig.number_format import is_number, number
+from telerig.short_text import is_number, number
 
 PLACES = ("bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")
 """Sections that hold drawings."""

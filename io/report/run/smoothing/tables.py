@@ -39,7 +39,7 @@ from telerig.io.results.verdict_words import (
     words_of_refusals,
     words_of_use,
 )
-from telerig.number_format import (
+from telerig.short_text import (
     ABSENT,
     flat_rows,
     is_number,

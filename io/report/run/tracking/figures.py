@@ -27,7 +27,7 @@ from telerig.io.report.run.tracking.results import (
     rms,
 )
 from telerig.io.report.run.tracking.scene import draw_tracks, thinned
-from telerig.number_format import number, share
+from telerig.short_text import number, share
 from telerig.statistics import robust_sd
 
 _MOST_POINTS = 8_000

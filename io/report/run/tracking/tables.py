@@ -22,7 +22,7 @@ from telerig.io.report.run.tracking.results import (
     track_lengths,
 )
 from telerig.io.results.tracking import share_words
-from telerig.number_format import ABSENT, number, sentence, share
+from telerig.short_text import ABSENT, number, sentence, share
 
 MOST_EVENTS = 60
 _MISS_TOO_LARGE = 3.0

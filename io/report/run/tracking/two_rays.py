@@ -18,9 +18,9 @@ from telerig.io.report.page.figures import (
     drawing,
 )
 from telerig.io.report.run.tracking.results import TrackResults, pair_pixels, paired_rows
-from telerig.number_format import nice_below
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
+from telerig.short_text import nice_below
 
 _LOOK_DOWN_DEG, _LOOK_DOWN_CLOSE_DEG = 25.0, 11.0
 _HEIGHT_IN = 2.5

@@ -24,8 +24,7 @@ def test_calibration() -> None:
     calibration = telerig.load_calibration(FOLDER / "calibration")
     assert calibration.verdict["status"] == "GOOD"
     assert [c.name for c in calibration.cameras] == ["left", "right"]
-    assert calibration.stage is not None
-    np.testing.assert_allclose(calibration.stage.axis, [0, -1, 0], atol=1e-4)
+    np.testing.assert_allclose(calibration.stage["axis"], [0, -1, 0], atol=1e-4)
 
 
 def test_run() -> None:

@@ -248,7 +248,7 @@ def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -
     ours, theirs = (_position_sd(one)[inner] for one in (free, known))
     eta = shake_share(solution, shake_of(solution))
     axes = [
-        axis_verdict(ours[:, i], theirs[:, i], eta[i], planned.shake_mm, ()).verdict
+        Verdict(str(axis_verdict(ours[:, i], theirs[:, i], eta[i], planned.shake_mm, ()).verdict))
         for i in range(3)
     ]
     return Expected(

@@ -21,6 +21,7 @@ from telerig.estimator.calibration.quality.checks import RECOMMENDED_VIEWS
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.factors.calibration import Observations, State, pixels, whitened_residuals
+from telerig.io.results.calibration import NextPose
 from telerig.rig.triangulation import aligned_shift, working_volume
 
 ENOUGH_SHARE = 0.05
@@ -32,21 +33,6 @@ _NOTABLE_SHARE = 0.5
 _SHOWN = 3
 _WHOLE_UM = 100.0
 _MANY_DOTS = 150
-
-
-@dataclass(frozen=True)
-class HeldPose:
-    """One way to hold the target.
-
-    rig_from_target : (4, 4) pose. after_um : standard deviation per axis of points in space, due to
-    the calibration, if a view in this pose were added. words : how to hold the target. reasons :
-    what this view adds.
-    """
-
-    rig_from_target: Array
-    after_um: float
-    words: str
-    reasons: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -64,7 +50,7 @@ class NextView:
 
     views: int
     before_um: float
-    poses: tuple[HeldPose, ...]
+    poses: tuple[NextPose, ...]
     size_um: float = 0.0
     marks: tuple[int, ...] = ()
 
@@ -120,10 +106,7 @@ class NextView:
             "before_um": self.before_um, "after_um": self.after_um, "enough": self.enough(),
             "size_um": self.size_um, "marks": list(self.marks),
             "poses": [
-                {
-                    "words": p.words, "reasons": list(p.reasons), "after_um": p.after_um,
-                    "rig_from_target": np.round(p.rig_from_target, 6).tolist(),
-                }
+                p.content() | {"rig_from_target": np.round(p.rig_from_target, 6).tolist()}
                 for p in self.poses
             ],
         }  # fmt: skip
@@ -150,11 +133,11 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
     gained_um = gain.before_um - gain.after_um(found, few)
     chosen = found.some(_preferred(problem, state, found, gained_um, few))
     poses = tuple(
-        HeldPose(
-            chosen.rig_from_target[i],
-            float(after_um),
-            hold_words(problem, state, chosen.some(slice(i, i + 1))),
-            reason_words(problem, state, chosen.some(slice(i, i + 1))),
+        NextPose(
+            words=hold_words(problem, state, chosen.some(slice(i, i + 1))),
+            reasons=reason_words(problem, state, chosen.some(slice(i, i + 1))),
+            after_um=float(after_um),
+            rig_from_target=chosen.rig_from_target[i],
         )
         for i, after_um in enumerate(gain.after_um(chosen, many))
     )

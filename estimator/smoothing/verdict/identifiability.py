@@ -9,7 +9,7 @@ line can be ambiguous: an oscillation of the bubbles as well as one of the rig
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.learning.learn import Learning, groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
-from telerig.estimator.smoothing.learning.spectral_lines import Attribution, attributions
+from telerig.estimator.smoothing.learning.spectral_lines import attributions
 from telerig.estimator.smoothing.problem.problem import (
     CarriageModel,
     Observations,
@@ -27,7 +27,7 @@ from telerig.estimator.smoothing.problem.problem import (
 from telerig.estimator.smoothing.problem.window import Window, cut_out
 from telerig.estimator.smoothing.verdict.evidence import Shake
 from telerig.factors.motion import start
-from telerig.io.results.smoothing import AXES, Flag, Verdict
+from telerig.io.results.smoothing import AXES, AttributedLine, AxisVerdict, Flag, Verdict
 
 RESOLVED_Q, PARTIAL_Q, RESOLVED_ETA = 1.25, 2.0, 0.99
 _MOST_FRAMES, _MOST_BUBBLES = 2000, 3
@@ -35,38 +35,15 @@ _EDGE = 0.1
 _SEEN = 0.25
 
 
-@dataclass(frozen=True)
-class AxisVerdict:
-    """Identifiability along one axis of the rig.
-
-    verdict, flags : see `telerig.io.results.smoothing`.
-    q : standard deviation of a position over the one with known shake, median over the states.
-    eta : 1 - posterior variance / prior variance of the shake; None without a shake in the model.
-    sigma_mm : median standard deviation of a position.
-    sigma_shake_known_mm : the same, if the shake were known.
-    shake_rms_mm : RMS of the shake of the camera that shakes most.
-    lines : spectral lines with their owner.
-    """
-
-    verdict: Verdict
-    flags: tuple[Flag, ...]
-    q: float
-    eta: float | None
-    sigma_mm: float
-    sigma_shake_known_mm: float
-    shake_rms_mm: float
-    lines: tuple[Attribution, ...] = ()
-
-    @property
-    def ambiguous_lines(self) -> tuple[Attribution, ...]:
-        """Lines attributed to the rig that could be an oscillation of the bubbles."""
-        return tuple(line for line in self.lines if line.owner == "rig" and line.ambiguous)
-
-
-def verdicts(solution: Solution, shake: Shake | None) -> dict[str, AxisVerdict]:
+def verdicts(
+    solution: Solution,
+    shake: Shake | None,
+    inflation: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> dict[str, AxisVerdict]:
     """Return the identifiability along "x", "y" and "z"; {} without bubbles or covariances.
 
     shake : sums over the run; None without a shake in the model.
+    inflation : factors of the standard deviations because of contradictions.
     """
     if solution.covariances is None or not solution.graph.problem.bubbles:
         return {}
@@ -80,17 +57,25 @@ def verdicts(solution: Solution, shake: Shake | None) -> dict[str, AxisVerdict]:
     out = {}
     for axis, name in enumerate(AXES):
         mine = tuple(line for part, line in lines if part[axis] > 0.7)
-        out[name] = axis_verdict(sigma[:, axis], known[:, axis], eta[axis], rms[axis], mine)
+        out[name] = axis_verdict(
+            sigma[:, axis], known[:, axis], eta[axis], rms[axis], mine, inflation[axis]
+        )
     return out
 
 
 def axis_verdict(
-    sigma: Array, known: Array, eta: float | None, rms: float, lines: tuple[Attribution, ...]
+    sigma: Array,
+    known: Array,
+    eta: float | None,
+    rms: float,
+    lines: tuple[AttributedLine, ...],
+    inflation: float = 1.0,
 ) -> AxisVerdict:
     """Return the identifiability along one axis.
 
     sigma, known : (n,) standard deviations (mm) of positions, as they are and with known shake.
     eta, rms, lines : as in `AxisVerdict`.
+    inflation : factor of the standard deviations because of contradictions.
     """
     q, base = float(np.median(sigma / known)), float(np.median(known))
     verdict = Verdict.UNRESOLVED
@@ -98,13 +83,17 @@ def axis_verdict(
         verdict = Verdict.RESOLVED
     elif q <= PARTIAL_Q:
         verdict = Verdict.PARTIAL
-    found = AxisVerdict(verdict, (), q, eta, float(np.median(sigma)), base, float(rms), lines)
+    agree = inflation <= RESOLVED_Q
     flags = []
-    if any(line.rms_mm > base for line in found.ambiguous_lines):
+    if any(x.owner == "rig" and x.ambiguous and (x.rms_mm or 0.0) > base for x in lines):
         flags.append(Flag.LABEL_AMBIGUOUS)
-    if rms < base and q <= RESOLVED_Q:
+    if rms < base and q <= RESOLVED_Q and agree:
         flags.append(Flag.SHAKE_BELOW_NOISE)
-    return replace(found, flags=tuple(flags))
+    return AxisVerdict(
+        verdict=verdict if agree else Verdict.CONTRADICTED, flags=tuple(flags), q=q * inflation,
+        eta=eta, sigma_mm=float(np.median(sigma)) * inflation, sigma_shake_known_mm=base,
+        shake_rms_mm=float(rms), lines=lines,
+    )  # fmt: skip
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
@@ -187,15 +176,24 @@ def shake_rms(solution: Solution, shake: Shake | None) -> Array:
 
 def _lines(
     problem: SmoothingProblem, model: ShakeModel
-) -> list[tuple[Sequence[float], Attribution]]:
+) -> list[tuple[Sequence[float], AttributedLine]]:
     """Return spectral lines with direction and owner; none if accelerometers measure the shake."""
     if problem.arms_with_sensor:
         return []
     signals = [c for c in signals_of(problem) if c.samples]
-    out: list[tuple[Sequence[float], Attribution]] = []
+    out: list[tuple[Sequence[float], AttributedLine]] = []
     for group in groups_of(signals, Learning(), problem.up):
         found = attributions(group.fast, model, group.pattern, problem.up)
-        out += [(group.pattern, line) for line in found]
+        out += [
+            (
+                group.pattern,
+                AttributedLine(
+                    owner=line.owner, frequency_hz=line.frequency_hz, rms_mm=line.rms_mm,
+                    other_owner_costs_nats=line.log_likelihood_ratio, ambiguous=line.ambiguous,
+                ),
+            )
+            for line in found
+        ]  # fmt: skip
     return out
 
 

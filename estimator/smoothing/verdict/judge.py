@@ -6,7 +6,6 @@ would separate them.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,10 @@ from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.contradiction import contradictions
 from telerig.estimator.smoothing.verdict.evidence import Evidence
-from telerig.estimator.smoothing.verdict.identifiability import (
-    RESOLVED_Q,
-    AxisVerdict,
-    verdicts,
-)
-from telerig.estimator.smoothing.verdict.modes import ShakeMode, shake_modes
+from telerig.estimator.smoothing.verdict.identifiability import verdicts
+from telerig.estimator.smoothing.verdict.modes import shake_modes
 from telerig.estimator.smoothing.verdict.purposes import uses
-from telerig.io.results.smoothing import AXES, Flag, Mode, Remedy, Verdict
-from telerig.io.results.smoothing import AxisVerdict as AxisRecord
+from telerig.io.results.smoothing import AXES, AxisVerdict, Flag, Remedy, Verdict
 from telerig.io.results.verdict_words import (
     contradiction_words,
     mode_remedy,
@@ -52,8 +46,8 @@ def judge(
     draws = drawn(solution)
     evidence = evidence or Evidence.of(solution, draws)
     disagree = contradictions(solution, evidence)
-    found = verdicts(solution, evidence.shake) if problem.bubbles else {}
-    modes = [_mode_json(mode) for mode in shake_modes(solution)]
+    found = verdicts(solution, evidence.shake, disagree.inflation) if problem.bubbles else {}
+    modes = [mode.content() | {"remedy": mode_remedy(mode)} for mode in shake_modes(solution)]
     out: dict[str, Any] = {"modes": modes}
     if disagree.found:
         out |= {
@@ -64,14 +58,13 @@ def judge(
         }
     if not found:
         return out
-    found = {
-        name: _widened(axis, factor)
-        for (name, axis), factor in zip(found.items(), disagree.inflation)
-    }
     usable = [use.content() for use in uses(solution, draws, disagree.inflation)]
     vertical = AXES[int(np.abs(problem.up).argmax())]
-    axes = {name: _with_words(name, axis, vertical) for name, axis in found.items()}
-    worst = max((a.verdict for a in found.values()), key=list(Verdict).index)
+    axes = {
+        name: axis.content() | {"words": words_of_axis(name, axis, vertical=name == vertical)}
+        for name, axis in found.items()
+    }
+    worst = max((Verdict(axis["verdict"]) for axis in axes.values()), key=list(Verdict).index)
     sound = not disagree.found and worst != Verdict.RESOLVED
     remedies = remedies_of(problem) if sound else ()
     words = [contradiction_words(disagree.found)] if disagree.found else []
@@ -93,15 +86,6 @@ def judge(
     }
 
 
-def _widened(axis: AxisVerdict, factor: float) -> AxisVerdict:
-    """Return the verdict with sd enlarged by a factor; CONTRADICTED beyond 1.25."""
-    wide = replace(axis, q=axis.q * factor, sigma_mm=axis.sigma_mm * factor)
-    if factor <= RESOLVED_Q:
-        return wide
-    flags = tuple(flag for flag in axis.flags if flag != Flag.SHAKE_BELOW_NOISE)
-    return replace(wide, verdict=Verdict.CONTRADICTED, flags=flags)
-
-
 def _flags(found: dict[str, AxisVerdict]) -> list[Flag]:
     """Return the flags of the run: ambiguous if any axis is, below noise only if all are."""
     flags = []
@@ -110,45 +94,6 @@ def _flags(found: dict[str, AxisVerdict]) -> list[Flag]:
     if all(Flag.SHAKE_BELOW_NOISE in axis.flags for axis in found.values()):
         flags.append(Flag.SHAKE_BELOW_NOISE)
     return flags
-
-
-def _with_words(name: str, axis: AxisVerdict, vertical: str) -> dict[str, Any]:
-    content = _axis_json(axis)
-    stored = AxisRecord.model_validate(content)
-    return content | {"words": words_of_axis(name, stored, vertical=name == vertical)}
-
-
-def _axis_json(axis: AxisVerdict) -> dict[str, Any]:
-    lines = [
-        {
-            "owner": line.owner,
-            "frequency_hz": line.frequency_hz,
-            "rms_mm": line.rms_mm,
-            "other_owner_costs_nats": line.log_likelihood_ratio,
-            "ambiguous": line.ambiguous,
-        }
-        for line in axis.lines
-    ]
-    numbers = ("q", "eta", "sigma_mm", "sigma_shake_known_mm", "shake_rms_mm")
-    return {
-        "verdict": str(axis.verdict),
-        "flags": [str(flag) for flag in axis.flags],
-        **{name: getattr(axis, name) for name in numbers},
-        "lines": lines,
-    }
-
-
-def _mode_json(mode: ShakeMode) -> dict[str, Any]:
-    content = {
-        "where": mode.where,
-        "place": str(mode.place),
-        "camera": mode.camera,
-        "frequency_hz": mode.frequency_hz,
-        "damping": mode.damping,
-        "rms_mm": mode.rms_mm,
-        "source": mode.source,
-    }
-    return content | {"remedy": mode_remedy(Mode.model_validate(content))}
 
 
 def remedies_of(problem: SmoothingProblem) -> tuple[Remedy, ...]:

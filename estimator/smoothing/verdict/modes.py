@@ -10,7 +10,7 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
-from telerig.io.results.smoothing import Place
+from telerig.io.results.smoothing import Mode, Place
 
 _LOWEST_HZ = 2.0
 _MOST_PEAKS = 3
@@ -24,30 +24,7 @@ _ALIKE = 0.7
 _STRONGER = 2.0
 
 
-@dataclass(frozen=True)
-class ShakeMode:
-    """One vibration mode of the rig.
-
-    place : the part that vibrates.
-    camera : name of the camera, if the mode belongs to one arm or one view; else "".
-    frequency_hz, damping : natural frequency and damping ratio.
-    rms_mm : [x, y, z] in the rig frame.
-    source : "model", or "estimate" for a peak in the spectrum of the estimated offsets.
-    """
-
-    place: Place
-    camera: str
-    frequency_hz: float
-    damping: float
-    rms_mm: list[float]
-    source: str
-
-    @property
-    def where(self) -> str:
-        return f"{self.place} {self.camera}".strip()
-
-
-def shake_modes(solution: Solution) -> list[ShakeMode]:
+def shake_modes(solution: Solution) -> list[Mode]:
     """Return the model's modes, or peaks in the offsets' spectrum, the strongest first."""
     graph = solution.graph
     names = [c.name for c in graph.problem.cameras]
@@ -55,17 +32,27 @@ def shake_modes(solution: Solution) -> list[ShakeMode]:
     if graph.model.modes:
         rows = [_from_model(mode, names) for mode in graph.model.modes]
     rows += _from_carriage(solution)
-    return sorted(rows, key=lambda row: -max(row.rms_mm))
+    return sorted(rows, key=lambda row: -np.max(np.asarray(row.rms_mm, float)))
 
 
-def _from_model(mode: RigMode, names: Sequence[str]) -> ShakeMode:
+def _mode(
+    place: Place, camera: str, frequency_hz: float, damping: float, rms_mm: Sequence[float],
+    source: str,
+) -> Mode:  # fmt: skip
+    return Mode(
+        where=f"{place} {camera}".strip(), place=place, camera=camera, frequency_hz=frequency_hz,
+        damping=damping, rms_mm=tuple(rms_mm), source=source,
+    )  # fmt: skip
+
+
+def _from_model(mode: RigMode, names: Sequence[str]) -> Mode:
     common = mode.camera == CARRIAGE
     place, camera = (Place.COMMON, "") if common else (Place.ARM, names[mode.camera])
     rms = [float(r) for r in mode.rms_mm]
-    return ShakeMode(place, camera, float(mode.frequency_hz), float(mode.damping), rms, "model")
+    return _mode(place, camera, float(mode.frequency_hz), float(mode.damping), rms, "model")
 
 
-def _from_offsets(solution: Solution, names: Sequence[str]) -> list[ShakeMode]:
+def _from_offsets(solution: Solution, names: Sequence[str]) -> list[Mode]:
     """Return spectral lines of the cameras' offsets, with the part that vibrates.
 
     Along an axis that two cameras see, coherent lines are common-mode, others belong to one arm or
@@ -86,7 +73,7 @@ def _from_offsets(solution: Solution, names: Sequence[str]) -> list[ShakeMode]:
         return []
     seen = np.abs(rows).sum(-1) > 0
     shared = seen.sum(0) > 1
-    out: list[ShakeMode] = []
+    out: list[Mode] = []
     for line in _lines(spectra, spectra.own[:, shared].sum((0, 1)), noise):
         out += _owned(spectra, line, seen, shared, names)
     for camera, name in enumerate(names):
@@ -122,15 +109,15 @@ class _Line:
     def power(self, density: Array) -> Array:
         return np.asarray(density[..., self.near].sum(-1) * self.step_hz)
 
-    def row(self, place: Place, camera: str, rms_mm: Array) -> ShakeMode:
+    def row(self, place: Place, camera: str, rms_mm: Array) -> Mode:
         damping = self.half_hz / self.frequency_hz
         rms = rms_mm.tolist()
-        return ShakeMode(place, camera, self.frequency_hz, damping, rms, "estimate")
+        return _mode(place, camera, self.frequency_hz, damping, rms, "estimate")
 
 
 def _owned(
     spectra: _Spectra, line: _Line, seen: Bools, shared: Bools, names: Sequence[str]
-) -> list[ShakeMode]:
+) -> list[Mode]:
     """Return the line as one common mode, or as a mode of one or of all arms."""
     own, cross = line.power(spectra.own), line.power(spectra.cross)
     among = cross[:, :, shared].sum(-1)
@@ -144,8 +131,8 @@ def _owned(
     return [line.row(Place.ARM, names[c], np.sqrt(own[c]) * seen[c]) for c in arms]
 
 
-def _same_line(line: _Line, row: ShakeMode) -> bool:
-    reach = 2 * max(line.half_hz, row.damping * row.frequency_hz) + line.step_hz
+def _same_line(line: _Line, row: Mode) -> bool:
+    reach = 2 * max(line.half_hz, (row.damping or 0.0) * row.frequency_hz) + line.step_hz
     return bool(abs(line.frequency_hz - row.frequency_hz) <= reach)
 
 
@@ -197,7 +184,7 @@ def _half_width(total: Array, peak: int) -> int:
     return int(max(1, min(sides, default=1)))
 
 
-def _from_carriage(solution: Solution) -> list[ShakeMode]:
+def _from_carriage(solution: Solution) -> list[Mode]:
     """Return the servo's following error: the encoder's strongest line without its trend."""
     problem, noise = solution.graph.problem, solution.graph.model.encoder_sigma_mm
     if problem.stage is None:
@@ -214,4 +201,4 @@ def _from_carriage(solution: Solution) -> list[ShakeMode]:
         return []
     lines = _lines(spectra, spectra.own.sum((0, 1)), noise**2)
     rows = [line.row(Place.SERVO, "", np.sqrt(line.power(spectra.own[0]))) for line in lines]
-    return [row for row in rows if max(row.rms_mm) > _SIGNIFICANT * noise][:1]
+    return [row for row in rows if np.max(np.asarray(row.rms_mm)) > _SIGNIFICANT * noise][:1]

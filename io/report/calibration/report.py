@@ -28,7 +28,7 @@ from telerig.io.results.calibration import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
 from telerig.io.results.telecentricity_words import telecentricity_words
-from telerig.short_text import ABSENT, flat_rows
+from telerig.short_text import ABSENT, flat_rows, sentence
 
 _COLOURS = {
     Status.GOOD: "good",
@@ -81,7 +81,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "status": file.verdict.status,
         "colour": _COLOURS[file.verdict.status],
         "reasons": file.verdict.reasons,
-        "lenses": telecentricity_words(results.statistics),
+        "lenses": [sentence(words) for words in telecentricity_words(results.statistics)],
         "cameras": results.camera_names,
         "model": file.model.content(),
         "twin": file.twin.content(),
@@ -90,7 +90,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "weak": file.diagnostics.weak,
         "notes": file.notes,
         "absent": results.absent,
-        "trust_words": [words[0].upper() + words[1:] + "." for words in found if words],
+        "trust_words": [sentence(words) for words in found if words],
         "comparison": results.comparison.content(),
         "advice": file.diagnostics.next_view,
         "dots_drawn": dots_are_drawn(results),

@@ -270,10 +270,11 @@ def test_words_for_a_second_camera_anywhere_round_the_first(azimuth_deg: float) 
 
 
 def test_enough_is_said_with_its_reason() -> None:
-    from telerig.estimator.calibration.next_view import HeldPose
+    from telerig.io.results.calibration import NextPose
 
     def advice(views: int, before: float, after: float) -> NextView:
-        return NextView(views, before, (HeldPose(np.eye(4), after, "so", ("why",)),))
+        pose = NextPose(rig_from_target=np.eye(4), after_um=after, words="so", reasons=("why",))
+        return NextView(views, before, (pose,))
 
     assert advice(12, 0.36, 0.35).enough()
     assert advice(12, 0.36, 0.35).words().endswith("from 0.36 to 0.35 µm: these views are enough")

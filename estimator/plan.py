@@ -74,13 +74,13 @@ class Experiment:
     bubbles : number of bubbles in sight.
     diameter_mm : diameter of a bubble.
     sigma_px : standard deviation of the centre of a bubble's outline in px; None takes the one that
-    `centre_sigma_px` gives for the diameter.
+        `centre_sigma_px` gives for the diameter.
     rise_mm_s : rise velocity, with which the stage follows the bubbles.
     zigzag_hz, zigzag_mm : frequency and RMS of the path's zigzag across the vertical.
     shake_hz, shake_mm : frequency of the rig's shake, and its RMS along the vertical; the RMS
-    across the vertical is half of this.
-    marks : number of marks in each view that are fixed to the tank. mark_sigma_px : standard
-    deviation of a mark's centre.
+        across the vertical is half of this.
+    marks : number of marks in each view that are fixed to the tank.
+    mark_sigma_px : standard deviation of a mark's centre.
     arms : whether each camera's arm carries an accelerometer in addition to those of rig.toml.
     """
 
@@ -132,7 +132,7 @@ class Expected:
 
     verdict : the verdict on the worst axis.
     position_um, velocity_mm_s : (3,) standard deviations of positions and velocities along the
-    rig's axes.
+        rig's axes.
     known_um : (3,) standard deviations that positions would have if the shake were known.
     sigma_px : standard deviation of a bubble's centre in the images that was assumed.
     """

@@ -70,7 +70,9 @@ class Series:
 
     The unknowns are the errors of the calibration and the movement.
 
-    frame, bubble : (M,) indices. t_s : (M,) times. miss_mm : (M,) ray misses.
+    frame, bubble : (M,) indices.
+    t_s : (M,) times.
+    miss_mm : (M,) ray misses.
     relative : (M,) variance of each ray miss due to its pixels, divided by the median of these.
     by_unknowns : (M, K) derivative of the ray misses with respect to the unknowns, in mm.
     """
@@ -100,9 +102,9 @@ class Noise:
 
     white_mm : standard deviation of each pair's white noise.
     wander_mm, wander_s : RMS and correlation time of each bubble's Ornstein-Uhlenbeck process, the
-    wander of its outline's centre.
+        wander of its outline's centre.
     shake : RMS (mm), decay time (s) and frequency (Hz) of each oscillation that all pairs of a
-    frame share.
+        frame share.
     """
 
     white_mm: float
@@ -158,8 +160,8 @@ class Noise:
 class _Spectrum:
     """A tapered periodogram from bin `_FIRST_BIN` on, and what is needed for its expectation.
 
-    overlap : autocorrelation of the taper. common, single : shares of the shake's and of a single
-    bubble's variance in the series.
+    overlap : autocorrelation of the taper.
+    common, single : shares of the shake's and of a single bubble's variance in the series.
     """
 
     power: Array
@@ -359,11 +361,12 @@ class RigChange:
 
     camera : name of the second camera.
     tangent, covariance : (6,), (6, 6) movement as a tangent of the pose rig_from_<camera>, with the
-    components `POSE_COMPONENTS`; 0 in directions that ray misses do not identify.
+        components `POSE_COMPONENTS`; 0 in directions that ray misses do not identify.
     place_mm : (3,) mean position of the bubbles in the rig frame, to which the offset refers.
     values, sigmas, prior_sigmas : (3,) estimate, standard deviation and prior standard deviation of
-    the offset along the common perpendicular (mm), the roll and the pitch (rad).
-    chance : p-value of the hypothesis that nothing has moved. pairs : number of pairs used.
+        the offset along the common perpendicular (mm), the roll and the pitch (rad).
+    chance : p-value of the hypothesis that nothing has moved.
+    pairs : number of pairs used.
     refined : pose rig_from_<camera> that calibration and run give together, or None.
     """
 
@@ -446,8 +449,9 @@ def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
 class RayMisses:
     """M ray misses along the common perpendicular.
 
-    miss_mm : (M,). variance_mm2 : (M,) variances due to the pixels' noise. by_rig : (M, P)
-    derivatives with respect to the P parameters of the rig, see `rig_jacobian`.
+    miss_mm : (M,).
+    variance_mm2 : (M,) variances due to the pixels' noise.
+    by_rig : (M, P) derivatives with respect to the P parameters of the rig, see `rig_jacobian`.
     """
 
     miss_mm: Array

@@ -21,7 +21,9 @@ from telerig.rig.units import STANDARD_GRAVITY_M_S2
 class Liquid:
     """Properties of a liquid, and of the gas in it.
 
-    density, gas_density : kg/m^3; viscosity : dynamic, Pa s; surface_tension : N/m;
+    density, gas_density : kg/m^3
+    viscosity : dynamic, Pa s
+    surface_tension : N/m
     gravity : m/s^2.
     """
 

@@ -22,12 +22,12 @@ class Camera:
     """One camera of the rig.
 
     intrinsics : (20,) parameters of the lens and the sensor, in the order of
-    `telerig.rig.lens_parameters.PARAMETERS`.
+        `telerig.rig.lens_parameters.PARAMETERS`.
     rho_mm : half the image's diagonal in object space at the nominal scale, by which coordinates
-    are divided before the distortion.
+        are divided before the distortion.
     camera_from_rig : pose; the identity for the first camera, whose frame is the rig frame.
     wall : the window through which the camera looks, or None. With a window, all points are in the
-    water behind it.
+        water behind it.
     """
 
     name: str

@@ -32,8 +32,9 @@ class LensParameter:
     """One parameter of a camera, whose name ends with its unit.
 
     prior_sd : standard deviation of its weak prior, several times the values of usual telecentric
-    lenses, which only bounds a parameter that the data do not determine. term : the kind of its
-    term in the distortion; "" for none. optional : whether it is 0 in a file that does not name it.
+        lenses, which only bounds a parameter that the data do not determine.
+    term : the kind of its term in the distortion; "" for none.
+    optional : whether it is 0 in a file that does not name it.
     step : the change that moves a pixel at the image corner by about 1 px.
     """
 

@@ -90,14 +90,15 @@ class EllipsePair:
     """The elliptic silhouettes of one ellipsoid in two affine cameras, in mm.
 
     shared : (..., 3) unit vector perpendicular to both viewing directions; both cameras measure the
-    coordinate along it. sides : two arrays (..., 3) of unit vectors, perpendicular to ``shared``
-    and to the viewing direction of each camera.
+        coordinate along it.
+    sides : two arrays (..., 3) of unit vectors, perpendicular to ``shared`` and to the viewing
+        direction of each camera.
     moments_mm2 : two arrays (..., 2, 2), for each camera the matrix M of its ellipse x^T M^-1 x = 1
-    in the axes (shared, side).
+        in the axes (shared, side).
     rims : two arrays (..., 2, 2). In each camera the body's rim is the image of a great circle of
-    the unit sphere with the angle phi; the columns are two of its points as (cos phi, sin phi).
-    Column 0 is the point that reaches farthest along the shared coordinate. Column 1 lies a quarter
-    turn from it, on the positive side.
+        the unit sphere with the angle phi; the columns are two of its points as (cos phi, sin phi).
+        Column 0 is the point that reaches farthest along the shared coordinate. Column 1 lies a
+        quarter turn from it, on the positive side.
     """
 
     shared: Array

@@ -35,11 +35,11 @@ class Target:
     pitch_mm : (pitch_x, pitch_y), the distances between neighbouring columns and rows.
     marks : (row, column) of each mark; (0, dot) for the layout "points".
     print_sigma_mm, flatness_sigma_mm : standard deviations of a dot's true position from the
-    nominal one, in the plane and perpendicular to it.
+        nominal one, in the plane and perpendicular to it.
     scale_dots : ids of two dots whose distance ``scale_distance_mm`` +- ``scale_sigma_mm`` is
-    known; None if the nominal pitch sets the scale.
+        known; None if the nominal pitch sets the scale.
     two_sided : whether the plate may be seen from behind, through ``plate_thickness_mm`` of a
-    material with refractive index ``plate_index``.
+        material with refractive index ``plate_index``.
     """
 
     layout: Layout = "grid"

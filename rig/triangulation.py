@@ -43,14 +43,15 @@ _ROWS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 class Triangulation(ShortText):
     """Holds triangulated points with their covariance.
 
-    points_mm : (..., 3) in the rig frame. covariance_mm2 : (..., 3, 3), with the calibration's own
-    uncertainty if a calibration triangulates; measurement_covariance_mm2 : its part from the noise
-    of the pixels.
+    points_mm : (..., 3) in the rig frame.
+    covariance_mm2 : (..., 3, 3), with the calibration's own uncertainty if a calibration
+        triangulates
+    measurement_covariance_mm2 : its part from the noise of the pixels.
     ray_miss_mm : (...) signed distance from the first ray to the second, along first direction x
-    second direction. From `triangulate_views` it is (..., C), the distance of the point from the
-    ray of each of the C cameras, NaN for a camera that does not see the point.
+        second direction. From `triangulate_views` it is (..., C), the distance of the point from
+        the ray of each of the C cameras, NaN for a camera that does not see the point.
     seen_by : (...) number of cameras that saw each point; None if two cameras saw all points. A
-    point that fewer than two cameras saw is NaN.
+        point that fewer than two cameras saw is NaN.
     """
 
     points_mm: Array

@@ -37,10 +37,10 @@ Newton's method."""
 class Wall:
     """A plane window in the camera's frame.
 
-    normal : (3,) unit vector that points away from the camera (z > 0). distance_mm : from the
-    camera's origin to where its axis meets the near face. indices : refractive indices on the
-    camera's side, of the glass, and behind it. normal_sigma_rad : prior standard deviation of the
-    normal.
+    normal : (3,) unit vector that points away from the camera (z > 0).
+    distance_mm : from the camera's origin to where its axis meets the near face.
+    indices : refractive indices on the camera's side, of the glass, and behind it.
+    normal_sigma_rad : prior standard deviation of the normal.
     """
 
     normal: Array
@@ -102,7 +102,7 @@ class IdealPrediction:
     """Telecentric coordinates (..., 2) of points in water, in mm, and their derivatives.
 
     by_point : (..., 2, 3), by_kappa : (..., 2), by_wall : (..., 2, 3); the last with respect to the
-    two tangents of `Wall.turned` and to the distance.
+        two tangents of `Wall.turned` and to the distance.
     """
 
     value: Array
@@ -115,8 +115,12 @@ class IdealPrediction:
 class _Rays:
     """Rays in air and in the water, with the symbols of the module's docstring.
 
-    entry : (..., 3) H. direction : (..., 3) in air, not normalised. along : (...) n.d. tangential :
-    (..., 3) T. spread, slope : (...) A and dA / d(T.T). water : (...) m_w / sqrt(1 - m_w^2 T.T).
+    entry : (..., 3) H.
+    direction : (..., 3) in air, not normalised.
+    along : (...) n.d.
+    tangential : (..., 3) T.
+    spread, slope : (...) A and dA / d(T.T).
+    water : (...) m_w / sqrt(1 - m_w^2 T.T).
     reached : (..., 3) the point that the ray reaches in the water.
     """
 

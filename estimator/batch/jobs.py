@@ -36,7 +36,8 @@ class Job:
     shake, refine_rig, accept : options of a smoothing, see `telerig.smooth`.
     cluster : address of the Dask scheduler whose workers detect bubbles; "" for this computer.
     tracks : tracks.csv or its folder; "" for the run's results folder.
-    report : whether to write report.html. only_report : whether to write nothing else.
+    report : whether to write report.html.
+    only_report : whether to write nothing else.
     needs : names of the jobs that have to be done before.
     """
 

@@ -41,10 +41,10 @@ class NextView:
 
     views : number of views so far.
     before_um : standard deviation per axis of points over the working volume, due to the
-    calibration and without a rigid motion that is common to all points.
+        calibration and without a rigid motion that is common to all points.
     poses : ways to hold the target, the best first; none if two cameras see none of the candidates.
     size_um : the part of before_um that no view can lower, because the size of the target is not
-    known better.
+        known better.
     marks : ids of the target's marks.
     """
 
@@ -197,7 +197,8 @@ _EDGE_ON = 0.1
 class Candidates:
     """K poses of the target, each of which at least two of the C cameras see.
 
-    rig_from_target : (K, 4, 4). tilt : (K,) index of the direction of the plate's normal.
+    rig_from_target : (K, 4, 4).
+    tilt : (K,) index of the direction of the plate's normal.
     facing : (K, C) +1 if the side of negative z faces the camera, else -1.
     sees : (K, C) whether side and tilt let the camera see the target.
     pair : (K, 2) indices of the two cameras between which the plate is held.
@@ -425,7 +426,7 @@ class ViewGain:
     covariance : (P + 3 n, P + 3 n) of the P parameters of the cameras and of n dots.
     dots : (n,) sorted indices of these dots.
     root : (P, R); the trace of root^T C root is the summed variance of points in space if the
-    cameras' parameters have the covariance C.
+        cameras' parameters have the covariance C.
     whitener : (C,) for each camera the reciprocal of the standard deviation of a pixel, in 1/px.
     points_mm : the points over the working volume, (N, 3).
     """

@@ -57,11 +57,13 @@ incomplete."""
 class Fit:
     """A finished self-calibration of C cameras.
 
-    models : name of each camera's lens model. model_words : a phrase on how they were chosen.
+    models : name of each camera's lens model.
+    model_words : a phrase on how they were chosen.
     choice : the choice of the models; None if the user gave them.
     centre_held : (C, 4, 4) poses of the cameras from a second fit in which the image centres are
-    held in the middle of the images; None if they are held in this fit.
-    mirror : the solution of the mirror ambiguity that was kept. mirrored_cost : cost of the other.
+        held in the middle of the images; None if they are held in this fit.
+    mirror : the solution of the mirror ambiguity that was kept.
+    mirrored_cost : cost of the other.
     tilts_deg : by (view, camera) the angle between the target's normal and the optical axis.
     notes : sentences for the user.
     """

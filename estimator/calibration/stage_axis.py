@@ -47,14 +47,15 @@ class StageAxis:
     """The calibrated stage.
 
     axis_rig : (3,) unit vector of travel in rig axes, in the direction of increasing readings.
-    basis : (3, 2) two orthonormal vectors perpendicular to the axis. covariance : (2, 2) of the
-    axis's direction along these vectors, in rad^2.
+    basis : (3, 2) two orthonormal vectors perpendicular to the axis.
+    covariance : (2, 2) of the axis's direction along these vectors, in rad^2.
     scale, scale_sd : scale error of the encoder (reading = (1 + scale) travel), and its standard
-    deviation. joint_covariance : (3, 3) of the two components of the direction and the scale.
+        deviation.
+    joint_covariance : (3, 3) of the two components of the direction and the scale.
     rig_from_target : pose of the target at reading 0.
     chi2_dof : chi-square per degree of freedom of the dots; 1 is expected.
     position_sigma_mm, wander_sigma_mm : standard deviations of the carriage's position along and
-    across the axis: the given ones, or the observed ones if these are significantly larger.
+        across the axis: the given ones, or the observed ones if these are significantly larger.
     words : sentences for the user.
     """
 
@@ -406,9 +407,11 @@ _STATE, _RIG, _FIRST_ERROR = 0, 1, 2
 class Dots:
     """M measured dots of one target in V views.
 
-    reading_mm : (V,) encoder reading of each view. view, camera : (M,) indices. place_mm : (M, 3)
-    position of each dot in the target frame. uv_px : (M, 2) measured pixels. information :
-    (M, 2, 2) inverse covariances of the pixels (1/px^2).
+    reading_mm : (V,) encoder reading of each view.
+    view, camera : (M,) indices.
+    place_mm : (M, 3) position of each dot in the target frame.
+    uv_px : (M, 2) measured pixels.
+    information : (M, 2, 2) inverse covariances of the pixels (1/px^2).
     """
 
     views: tuple[str, ...]
@@ -424,8 +427,8 @@ class Dots:
 class State:
     """The unknowns of the fit.
 
-    rig_from_target : pose of the target at reading 0. slope : (3,) travel in rig axes per mm of the
-    encoder's reading.
+    rig_from_target : pose of the target at reading 0.
+    slope : (3,) travel in rig axes per mm of the encoder's reading.
     """
 
     rig_from_target: Pose

@@ -55,7 +55,8 @@ class WatchedFolder:
     An image counts as completely written when its size and its time of change are the same at two
     polls. If it changes later, its dots are detected again.
 
-    path : folder of the dataset. tell : function that gets messages for the user.
+    path : folder of the dataset.
+    tell : function that gets messages for the user.
     patience_s : if an image of a view is missing for longer than this, one message says so.
     """
 

@@ -36,8 +36,9 @@ class TargetDetection:
     """The target as it was found in one image.
 
     table : a row for each numbered dot, sorted by number: dot, row, column and the measured columns
-    of `locate_dots` up to chi2_dof. rejected : candidates that were left out (u_px, v_px, a_px,
-    b_px, angle_rad, reason). numbering : how the dots were numbered.
+        of `locate_dots` up to chi2_dof.
+    rejected : candidates that were left out (u_px, v_px, a_px, b_px, angle_rad, reason).
+    numbering : how the dots were numbered.
     """
 
     table: pd.DataFrame

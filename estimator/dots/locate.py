@@ -69,8 +69,10 @@ _MOVED_SD = 0.1
 class DotMeasurement:
     """What was measured in one image.
 
-    dots : as `locate_dots` returns them. rejected : the candidates that are no dots: u_px, v_px,
-    a_px, b_px, angle_rad, reason. noise : noise of the grey levels. polarity : of the dots.
+    dots : as `locate_dots` returns them.
+    rejected : the candidates that are no dots: u_px, v_px, a_px, b_px, angle_rad, reason.
+    noise : noise of the grey levels.
+    polarity : of the dots.
     """
 
     dots: pd.DataFrame

@@ -25,8 +25,9 @@ class TargetProposal:
 
     cameras : for each camera its name, (width, height) in px and scale in px/mm.
     pitch_px : distance of neighbouring dots in the first camera along the axis on which it is
-    larger, for a target that faces the camera.
-    lines : content of the table [target] of rig.toml. words : sentences for the user.
+        larger, for a target that faces the camera.
+    lines : content of the table [target] of rig.toml.
+    words : sentences for the user.
     """
 
     cameras: tuple[tuple[str, tuple[int, int], float], ...]

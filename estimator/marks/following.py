@@ -29,7 +29,7 @@ class TankView:
 
     axis_rig : (3,) direction of the stage's travel in rig axes.
     basis : (2, 3) unit vectors of the coordinates in rig axes, perpendicular to the ray of the
-    image's middle.
+        image's middle.
     origin : (3,) point of this ray in the rig frame, in mm.
     """
 
@@ -169,8 +169,8 @@ class _Shift:
 class Follower:
     """Follows the dots of the strip through the frames of one camera.
 
-    diameter_mm : diameter of a dot. margin_px : least distance of a whole dot's centre from the
-    border of the image.
+    diameter_mm : diameter of a dot.
+    margin_px : least distance of a whole dot's centre from the border of the image.
     """
 
     def __init__(
@@ -404,10 +404,12 @@ class StripInImages:
     """Where one camera sees the K dots of the strip in F frames, also those not measured.
 
     places_mm : (K, 2) on the tank, see `TankView`.
-    epochs : (K,) index of the part of the run in which each place is valid. epoch_starts : first
-    frame of each part.
-    shift_mm : (F, 2) shift of the whole strip in each frame. position_mm : (F,) of the stage.
-    line_mm : smallest and largest place of a dot across the travel. diameter_mm : of a dot.
+    epochs : (K,) index of the part of the run in which each place is valid.
+    epoch_starts : first frame of each part.
+    shift_mm : (F, 2) shift of the whole strip in each frame.
+    position_mm : (F,) of the stage.
+    line_mm : smallest and largest place of a dot across the travel.
+    diameter_mm : of a dot.
     """
 
     view: TankView

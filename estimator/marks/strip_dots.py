@@ -37,11 +37,12 @@ _RING_TAIL, _RING_STEP = 0.1, 0.25
 class DotLook:
     """The appearance of a strip's dots in one camera, and where in the image they may be.
 
-    windows : parts of the image through which the strip passes. diameter_px : nominal diameter.
-    The other numbers are medians over the dots. a_px, b_px : longer and shorter semi-axis.
+    windows : parts of the image through which the strip passes.
+    diameter_px : nominal diameter. The other numbers are medians over the dots.
+    a_px, b_px : longer and shorter semi-axis.
     contrast : difference of the grey levels of dot and screen, divided by the brighter one.
-    chi2_dof : chi-square per degree of freedom of the luminance fit. blur_px : standard deviation
-    of the blur.
+    chi2_dof : chi-square per degree of freedom of the luminance fit.
+    blur_px : standard deviation of the blur.
     """
 
     polarity: Polarity

@@ -22,8 +22,9 @@ class Oscillation:
 
     frequency_hz, s_frequency_hz : f and its standard deviation.
     major, minor : semi-axes of the ellipse that two components describe, in their unit. For one
-    component, major is the amplitude and minor is 0.
-    s_major, s_minor : standard deviations of the semi-axes. cosine, sine : (K,) c and s.
+        component, major is the amplitude and minor is 0.
+    s_major, s_minor : standard deviations of the semi-axes.
+    cosine, sine : (K,) c and s.
     """
 
     frequency_hz: float

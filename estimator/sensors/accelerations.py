@@ -24,7 +24,8 @@ _GAP = 2.5
 class Grid:
     """A regular grid of n times start_s + k step_s, and the width of a smoothing kernel.
 
-    count : n. knots : spacing of the kernel's knots in steps, at least 2.
+    count : n.
+    knots : spacing of the kernel's knots in steps, at least 2.
     """
 
     start_s: float
@@ -73,7 +74,8 @@ class Grid:
 class Accelerations:
     """Smoothed accelerations along D directions at the n times of a grid.
 
-    values : (n, D) in mm/s^2, 0 where they are not known. known : (n,).
+    values : (n, D) in mm/s^2, 0 where they are not known.
+    known : (n,).
     """
 
     grid: Grid

@@ -35,7 +35,8 @@ class EncoderFault:
     """A fault in an encoder's record: from the time t_s on, the readings are wrong by size_mm.
 
     kind : "jump" if the error persists, "spike" if it ends after ``readings`` readings, "wrap" if
-    the counter overflows. step_s : time between the readings before and after the fault.
+        the counter overflows.
+    step_s : time between the readings before and after the fault.
     """
 
     t_s: float

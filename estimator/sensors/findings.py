@@ -37,15 +37,16 @@ class Code(StrEnum):
 class Finding:
     """What a check found.
 
-    words : the fault, as a sentence without its place. where : file, sensor or row. todo : what the
-    user can do.
+    words : the fault, as a sentence without its place.
+    where : file, sensor or row.
+    todo : what the user can do.
     code : name of a fault that is refused unless the user accepts it; None for a warning.
     fix : the correction as data, or {}. For an accelerometer it is {"sensor": name} with one of
-    "unit": "g"; "axes": rows; "factor": number by which readings are multiplied; "add_m_s2":
-    [x, y, z]; "offset_s": s, which is added to its times. {"exchange": [name, name]} exchanges two
-    records. For the encoder it is {"encoder_factor": -1.0}, {"encoder_offset_s": s}, or
-    {"encoder_jumps": [[t_s, mm], ...]}, lengths that are subtracted from t_s on. For the frames it
-    is {"frame_time_factor": 0.001}.
+        "unit": "g"; "axes": rows; "factor": number by which readings are multiplied; "add_m_s2":
+        [x, y, z]; "offset_s": s, which is added to its times. {"exchange": [name, name]} exchanges
+        two records. For the encoder it is {"encoder_factor": -1.0}, {"encoder_offset_s": s}, or
+        {"encoder_jumps": [[t_s, mm], ...]}, lengths that are subtracted from t_s on. For the frames
+        it is {"frame_time_factor": 0.001}.
     """
 
     words: str

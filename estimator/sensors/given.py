@@ -37,17 +37,19 @@ class AccelerometerRecord(TypedDict, total=False):
 
     t_s : (N,) times of the samples in s, which increase.
     a_m_s2 : (N, 3) readings in m/s^2 along the sensor's own axes x, y, z. They contain gravity: a
-    sensor at rest reads +9.81 m/s^2 along the axis that points upwards.
+        sensor at rest reads +9.81 m/s^2 along the axis that points upwards.
     a, unit : in place of ``a_m_s2``, readings (N, 3) in "m/s^2", "g", "mg", "mm/s^2", "cm/s^2" or
-    "ft/s^2". Without a unit it follows from the size of gravity, with a warning.
+        "ft/s^2". Without a unit it follows from the size of gravity, with a warning.
     mounted_on : name of the camera whose arm carries the sensor, or "carriage" for the stage.
     axes : (3, 3) whose rows are the sensor's x, y, z axes in rig coordinates.
     noise_density_ug_sqrt_hz : of the data sheet, in micro-g per root hertz; otherwise it is
-    estimated from the record, with a warning. bias_sigma_m_s2 : of the constant error of each axis;
-    0.2 if missing. range_m_s2 : largest reading; samples that reach it are not used. Without it,
-    limits at which readings are clipped are looked for.
+        estimated from the record, with a warning.
+    bias_sigma_m_s2 : of the constant error of each axis; 0.2 if missing.
+    range_m_s2 : largest reading; samples that reach it are not used. Without it, limits at which
+        readings are clipped are looked for.
     clock : "frames" if ``t_s`` is the time of the frames, apart from a small delay; "unknown" (the
-    default) for a logger of its own, whose offset has to be found from the images.
+        default) for a logger of its own, whose offset has to be found from the images.
+
     What rig.toml states about a sensor of this name is used where a key is missing; ``t_s`` and the
     readings are always needed.
     """
@@ -78,11 +80,15 @@ _DESCRIBED = (
 class Sensor:
     """The record of one accelerometer as it was given.
 
-    where : file or argument, and sensor, for messages. t_s : (N,) times of the N samples.
-    reading_m_s2 : (N, 3). unit : unit in which the readings were given.
-    mounted_on : a camera's name, or "carriage". axes : (3, 3) whose rows are the sensor's axes as
-    unit vectors in rig axes. noise_density_ug_sqrt_hz, range_m_s2 : None if they are not stated.
-    kept : (N,) whether each sample can be used. unused_axes : indices of axes that are not used.
+    where : file or argument, and sensor, for messages.
+    t_s : (N,) times of the N samples.
+    reading_m_s2 : (N, 3).
+    unit : unit in which the readings were given.
+    mounted_on : a camera's name, or "carriage".
+    axes : (3, 3) whose rows are the sensor's axes as unit vectors in rig axes.
+    noise_density_ug_sqrt_hz, range_m_s2 : None if they are not stated.
+    kept : (N,) whether each sample can be used.
+    unused_axes : indices of axes that are not used.
     """
 
     name: str

@@ -58,8 +58,9 @@ _LEAST_UG_SQRT_HZ = 1.0
 class Clipping:
     """One axis of a sensor that is clipped.
 
-    axis : its index. value : limit in m/s^2 at which it is clipped. samples : (N,) which of the N
-    samples are clipped.
+    axis : its index.
+    value : limit in m/s^2 at which it is clipped.
+    samples : (N,) which of the N samples are clipped.
     """
 
     axis: int

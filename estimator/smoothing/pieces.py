@@ -135,10 +135,11 @@ def solved_pieces(
 class Constants:
     """Hold the information of each of P pieces of a run about the C constants of the run.
 
-    problem : that of the run. pieces : with their margins.
+    problem : that of the run.
+    pieces : with their margins.
     prior, prior_mean : (C,) information and means of the priors.
     information, side : (P, C, C) information matrix Lambda of each piece without its margins, and
-    (P, C) Lambda times its estimate.
+        (P, C) Lambda times its estimate.
     """
 
     problem: SmoothingProblem

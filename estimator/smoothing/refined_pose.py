@@ -39,8 +39,8 @@ _LEAST_WANDER_PX = 5e-3
 class Refinement:
     """What is needed to estimate a movement of the second camera together with the smoothing.
 
-    drift : (6, 6) prior covariance of the movement. tangent : (6,) the movement that the ray misses
-    alone give.
+    drift : (6, 6) prior covariance of the movement.
+    tangent : (6,) the movement that the ray misses alone give.
     wander_px, wander_s : RMS and correlation time of the wander of outlines' centres in an image.
     """
 

@@ -42,7 +42,6 @@ class Smoothing(ShortText):
 
     trajectories : table of positions and velocities of the bubbles; `docs/files.md` describes it.
     shake : table of the cameras' shake in each frame; `docs/files.md` describes it.
-
     verdict : the part of smoothing.json that states how far the data separate the bubbles' motion
         from the shake; empty if this was not judged.
     summary : the rest of smoothing.json.

@@ -150,7 +150,8 @@ class StoredTables:
 
     Their rows are by piece, then by bubble and frame.
 
-    folder : which holds results.h5.  keep : a temporary folder that lives as long as the tables.
+    folder : which holds results.h5.
+    keep : a temporary folder that lives as long as the tables.
     """
 
     folder: Path

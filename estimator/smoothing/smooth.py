@@ -228,7 +228,8 @@ def smooth(
 class _Done(NamedTuple):
     """verdict, evidence : of the run.  All others: of it, or of the piece in its middle.
 
-    deviations : of the bubbles' shapes; None without tracks.  swarm : what `swarm_numbers` returns.
+    deviations : of the bubbles' shapes; None without tracks.
+    swarm : what `swarm_numbers` returns.
     """
 
     verdict: dict[str, Any]

@@ -324,7 +324,7 @@ class Cluster:
     """Holds a group of tracks that compete for the same measurements (a conflict).
 
     branches : the hypotheses, best first. A track without competitors forms a group of its own,
-    with one hypothesis and no history.
+        with one hypothesis and no history.
     """
 
     branches: list[Branch]
@@ -351,9 +351,11 @@ class Cluster:
 class Broken:
     """A track that is cut, because its continuation through a conflict is not safe.
 
-    track : its best continuation. entries : all its measurements (frame, column) in the conflict.
-    kept : the safe ones at the beginning, which remain with the track. new : those at the end that
-    safely belong together and form a new track. The measurements in between belong to no track.
+    track : its best continuation.
+    entries : all its measurements (frame, column) in the conflict.
+    kept : the safe ones at the beginning, which remain with the track.
+    new : those at the end that safely belong together and form a new track. The measurements in
+        between belong to no track.
     """
 
     track: Track
@@ -366,8 +368,9 @@ class Broken:
 class Decision:
     """What was decided about a conflict in one frame.
 
-    still : the tracks that remain undecided; None if there are none. free : tracks that are
-    decided, with their measurements (frame, column). broken : tracks that are cut.
+    still : the tracks that remain undecided; None if there are none.
+    free : tracks that are decided, with their measurements (frame, column).
+    broken : tracks that are cut.
     runner_up_log_ratio : log-likelihood ratio of the best to the second-best hypothesis.
     """
 
@@ -532,8 +535,9 @@ class Scan:
 class Child:
     """One way to continue some hypotheses with the measurements of a frame.
 
-    score : log weight. parents : the hypotheses, one for each group of tracks. edges : for each
-    track the index of its pairing, -1 if it has no measurement in this frame.
+    score : log weight.
+    parents : the hypotheses, one for each group of tracks.
+    edges : for each track the index of its pairing, -1 if it has no measurement in this frame.
     """
 
     score: float

@@ -49,7 +49,8 @@ class Readings:
     """Measurements of K bubbles in F frames, in information form.
 
     information : (F, K, 3, 3) inverse covariance of each measured point (1/mm^2), 0 where a bubble
-    was not measured. pull : (F, K, 3) information @ point (1/mm).
+        was not measured.
+    pull : (F, K, 3) information @ point (1/mm).
     """
 
     information: Array
@@ -110,11 +111,11 @@ class Pairs:
     """M pairs of detections of one frame, each of which shows one bubble in both cameras.
 
     rows : (M, 2) row of the detection in the table of each camera.
-    confidence : (M,) probability that the pair is right. ambiguous : (M,) whether another pair is
-    nearly as probable.
+    confidence : (M,) probability that the pair is right.
+    ambiguous : (M,) whether another pair is nearly as probable.
     given : (M,) id that the user gave to the pair, -1 for none.
     points_mm, covariance_mm2, d_eq_mm : (M, 3), (M, 3, 3), (M,) position, its covariance, and the
-    equivalent diameter (NaN if it is unknown).
+        equivalent diameter (NaN if it is unknown).
     particle : (M,) id of the track, -1 for none; it is known when the frame is final.
     """
 
@@ -142,11 +143,13 @@ class Pairs:
 class Sight:
     """Hold the detections of one frame as arrays; most fields for both cameras.
 
-    pixels : centres and covariances with the share of the unknown shape. centre_px : (N, 5) the
-    columns CENTRE_PX. a_px, d_eq_px : (N,) major semi-axes and equivalent diameters. given : (N,)
-    ids given by the user, -1 for none. flags : (N,) texts.
-    possible : the pairs with given ids, then those of `candidates`, in space. left_px : (E, 4)
-    pixels in both cameras less those of the points.
+    pixels : centres and covariances with the share of the unknown shape.
+    centre_px : (N, 5) the columns CENTRE_PX.
+    a_px, d_eq_px : (N,) major semi-axes and equivalent diameters.
+    given : (N,) ids given by the user, -1 for none.
+    flags : (N,) texts.
+    possible : the pairs with given ids, then those of `candidates`, in space.
+    left_px : (E, 4) pixels in both cameras less those of the points.
     """
 
     pixels: tuple[Pixels, Pixels]
@@ -164,8 +167,10 @@ class Sight:
 class Single:
     """A bubble with a track that only one camera sees in a frame.
 
-    particle : id of the track. camera, row : the camera, and the row of its table of detections.
-    point_mm : (3,) approximate position in the rig frame. d_eq_mm : equivalent diameter.
+    particle : id of the track.
+    camera, row : the camera, and the row of its table of detections.
+    point_mm : (3,) approximate position in the rig frame.
+    d_eq_mm : equivalent diameter.
     """
 
     particle: int
@@ -179,12 +184,14 @@ class Single:
 class Frame:
     """One frame of a run while its tracks may still change.
 
-    tables : its detections in both cameras. sight : the same as arrays.
+    tables : its detections in both cameras.
+    sight : the same as arrays.
     offset_px : (2, 2) for each camera the shift of all detections, because the cameras shake.
-    pairs : the pairs of detections. unpaired : for each camera the rows of its table that are in no
-    pair.
+    pairs : the pairs of detections.
+    unpaired : for each camera the rows of its table that are in no pair.
     alone : tracks that only one camera continued, by index into the rows of ``unpaired``, those of
-    the first camera first. singles : the same with the final ids, after `take_final`.
+        the first camera first.
+    singles : the same with the final ids, after `take_final`.
     motion : motion of all bubbles since the frame before; None for the first frame.
     """
 

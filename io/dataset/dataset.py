@@ -37,7 +37,7 @@ class View:
 
     name : name of its image files without their extension, or the text in column view of dots.csv.
     image_paths : the image file of each camera, by the camera's name; empty if the dots are read
-    from dots.csv.
+        from dots.csv.
     """
 
     name: str
@@ -62,11 +62,12 @@ class Run:
 class Dataset(ShortText):
     """Hold what `load_dataset` found in a dataset folder.
 
-    path : the folder. rig : the content of rig.toml.
+    path : the folder.
+    rig : the content of rig.toml.
     views : the calibration views in natural order of their names (2 before 10).
     runs : the runs by name.
     source : "images" or "dots", from which the views are read; None if views were not required and
-    the folder has none, or both images and dots.
+        the folder has none, or both images and dots.
     notes : sentences that a user should read.
     table : the dots as `read_dots_csv` returns them; None for images.
     """

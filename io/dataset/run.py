@@ -41,17 +41,21 @@ RunSource = Literal["images", "detections"]
 class RunData:
     """Hold what `load_run` found in the folder of a run with F frames.
 
-    t_s : (F,) the middle of each frame's exposure in s. position_mm : (F,) the stage's position at
-    t_s, NaN outside the encoder's record; None without stage.csv.
-    image_sizes_px : (width, height) by camera. source : "images" or "detections".
-    rig : the content of rig.toml. stage, accelerometers, references, detections : the tables of
-    stage.csv, accelerometer.csv, references.csv and detections.csv. Each is None if there is no
-    such file. A large detections.csv is a `FrameTable`, which stays on disk.
+    t_s : (F,) the middle of each frame's exposure in s.
+    position_mm : (F,) the stage's position at t_s, NaN outside the encoder's record; None without
+        stage.csv.
+    image_sizes_px : (width, height) by camera.
+    source : "images" or "detections".
+    rig : the content of rig.toml.
+    stage, accelerometers, references, detections : the tables of stage.csv, accelerometer.csv,
+        references.csv and detections.csv. Each is None if there is no such file. A large
+        detections.csv is a `FrameTable`, which stays on disk.
     notes : sentences that a user should read. `image` adds one for each frame that it cannot read.
     skip_unreadable : whether `image` returns None for a frame that cannot be read. True: for every
-    frame; False: for none; None: only for the last frame of a recording.
-    sources : the opened frames by camera. positions : (F,) by camera, the position of each frame
-    among the camera's opened frames, -1 for a missing frame.
+        frame; False: for none; None: only for the last frame of a recording.
+    sources : the opened frames by camera.
+    positions : (F,) by camera, the position of each frame among the camera's opened frames, -1 for
+        a missing frame.
     """
 
     name: str

@@ -27,7 +27,8 @@ class Format:
 
     program : the program that uses the format.
     function : "module:name" of the function that reads or writes it, below ``telerig.io.exchange``.
-    description : for the help text. suffix : ending of an exported file; "" for a folder.
+    description : for the help text.
+    suffix : ending of an exported file; "" for a folder.
     options : the options of the command that the function takes.
     extra : name of the optional dependency that it needs, as in ``pip install 'telerig[tdms]'``.
     """

@@ -42,7 +42,7 @@ class Column:
     """Describe a column that a table may have; a blank cell is read as NaN or "".
 
     kind : "number" (float), "whole" (whole number), "text" or "name" (text that follows the rule of
-    `telerig.io.files.names`).
+        `telerig.io.files.names`).
     """
 
     name: str

@@ -27,10 +27,12 @@ file that follows it; None where the text is unusual."""
 class FrameTable:
     """A large CSV table, sorted by frame, which stays on disk and is read part by part.
 
-    read : function that returns the table of a part of the file. header : first line of the file.
+    read : function that returns the table of a part of the file.
+    header : first line of the file.
     offset : (B + 1,) bytes at which each of B blocks of rows begins, and the end of the last one.
     first, last, row : (B,) first and last frame of each block, and the number of its first row.
-    rows : number of rows. particles : the different values in the column ``particle``, as text.
+    rows : number of rows.
+    particles : the different values in the column ``particle``, as text.
     stop : only frames before this one belong to the table; None for all.
     """
 

@@ -32,10 +32,12 @@ _TODO = "save it with 8, 12 or 16 bits of grey per pixel in the camera's softwar
 class HighSpeedFrames:
     """Give access to the frames of a high-speed camera's file.
 
-    bits : per pixel in the file: 8, 10 (packed), 12 (packed) or 16. bottom_up : whether the last
-    row comes first. offsets : (frames,) byte at which each frame's pixels begin. first : number of
-    the first frame, counted from the trigger. t_s : (frames,) times in s, from 0. cut_short :
-    whether the file ends within its last frame.
+    bits : per pixel in the file: 8, 10 (packed), 12 (packed) or 16.
+    bottom_up : whether the last row comes first.
+    offsets : (frames,) byte at which each frame's pixels begin.
+    first : number of the first frame, counted from the trigger.
+    t_s : (frames,) times in s, from 0.
+    cut_short : whether the file ends within its last frame.
     """
 
     path: Path

@@ -57,10 +57,11 @@ class ClockFit:
 
     host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6), all times
     in s, and ``bend_s``, a correction at knots_s (from device_mean_s) where the rate changed.
-    sd_offset_us : standard deviation of the least delays in parts of the record. wander_us : range
-    of these least delays.
+
+    sd_offset_us : standard deviation of the least delays in parts of the record.
+    wander_us : range of these least delays.
     sd_drift_ppm : standard deviation of the drift, by a jackknife or by the scatter of the least
-    delays, whichever is larger; NaN for a drift that was taken from a longer record.
+        delays, whichever is larger; NaN for a drift that was taken from a longer record.
     delay_median_ms, delay_max_ms : delay of the readings beyond the least delay.
     """
 
@@ -89,9 +90,11 @@ class ClockFit:
 class ClockRecord:
     """Hold the times of a device's readings on the host's clock.
 
-    t_s : (readings,) times, NaN for a wrong time stamp. segment : (readings,) index of the fit that
-    was used, -1 for a wrong stamp. fits : one clock fit for each uninterrupted count.
-    wraps : how often the counter wrapped. wrong : number of wrong stamps.
+    t_s : (readings,) times, NaN for a wrong time stamp.
+    segment : (readings,) index of the fit that was used, -1 for a wrong stamp.
+    fits : one clock fit for each uninterrupted count.
+    wraps : how often the counter wrapped.
+    wrong : number of wrong stamps.
     """
 
     t_s: Array

@@ -43,8 +43,10 @@ RECEIVED, SENT, LOST, FOUND, END = 1, 2, 3, 4, 5
 class Entry:
     """Hold one entry of the raw log.
 
-    kind : see the kinds above. device : index of the device in the header. time_ns : the host's
-    monotonic time. data : the bytes.
+    kind : see the kinds above.
+    device : index of the device in the header.
+    time_ns : the host's monotonic time.
+    data : the bytes.
     """
 
     kind: int
@@ -194,8 +196,8 @@ class LogScan:
     """Hold what a first look at a raw log has found.
 
     damaged_bytes : number of bytes that belong to no undamaged entry of this recording. ordered :
-    whether each device's entries are in the order of time. end_ns : time of the closing entry, or
-    None.
+        whether each device's entries are in the order of time.
+    end_ns : time of the closing entry, or None.
     """
 
     header: LogHeader

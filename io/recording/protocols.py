@@ -44,10 +44,10 @@ class Readings:
     arrived_ns : (N,) the host's time at which the last byte of each reading arrived.
     values : the numbers (N,) of the readings, by the name of the quantity.
     spans : (N, 2) first byte and number of bytes of each reading, counted over all bytes of the
-    line.
+        line.
     malformed, malformed_spans : (M,), (M, 2) time of arrival in ns, and first byte and number of
-    bytes, of each stretch of bytes that is no reading. garbage : (M,) False for text that the
-    device may send between its readings.
+        bytes, of each stretch of bytes that is no reading.
+    garbage : (M,) False for text that the device may send between its readings.
     samples : the first malformed bytes, for messages.
     """
 

@@ -49,8 +49,10 @@ class Refused:
     """Hold the R lines of a device that were refused, so that they are in no table.
 
     spans : (R, 2) first byte and number of bytes, counted over all bytes of the device.
-    t_s : (R,) time in s, NaN if it is not known. arrived_s : (R,) time of arrival.
-    reason : (R,) why each line was refused. lines : the bytes of each line.
+    t_s : (R,) time in s, NaN if it is not known.
+    arrived_s : (R,) time of arrival.
+    reason : (R,) why each line was refused.
+    lines : the bytes of each line.
     """
 
     spans: Ints
@@ -64,18 +66,24 @@ class Refused:
 class DeviceRecord:
     """Hold the readings of one device, in the order of time.
 
-    t_s : (N,) times since the beginning of the recording, strictly increasing. arrived_s : (N,)
-    when the host received each reading. values : arrays (N,) by the name of the quantity, as sent.
-    malformed_s : times of arrival of bytes that are no reading. malformed_bytes : their number.
-    samples : some of them. partial_bytes : number of bytes of incomplete readings.
+    t_s : (N,) times since the beginning of the recording, strictly increasing.
+    arrived_s : (N,) when the host received each reading.
+    values : arrays (N,) by the name of the quantity, as sent.
+    malformed_s : times of arrival of bytes that are no reading.
+    malformed_bytes : their number.
+    samples : some of them.
+    partial_bytes : number of bytes of incomplete readings.
     away_s : for each time that the device was unplugged, when it was lost and when it was found
-    again (NaN for never).
-    clocks : the fits of the device's clock. wraps : how often its counter wrapped.
-    faults : number of readings that were left out, by the reason. refused : these readings.
+        again (NaN for never).
+    clocks : the fits of the device's clock.
+    wraps : how often its counter wrapped.
+    faults : number of readings that were left out, by the reason.
+    refused : these readings.
     time_from : what the times are derived from.
     half_width_s : for a polled device, half the time between question and answer.
     time_sd_s : standard deviation of the times, without the unknown least delay of the line; None
-    if the clock fits state it. error : why the readings cannot be used as described, or None.
+        if the clock fits state it.
+    error : why the readings cannot be used as described, or None.
     """
 
     device: DeviceDescription
@@ -101,8 +109,9 @@ class DeviceRecord:
 class Replay:
     """The content of a raw log.
 
-    records : the readings of each device. end_s : time of the last entry. ended : whether the
-    recording was ended properly; False if it was cut off.
+    records : the readings of each device.
+    end_s : time of the last entry.
+    ended : whether the recording was ended properly; False if it was cut off.
     damaged_bytes : number of bytes of the log that belong to no undamaged entry of this recording.
     """
 

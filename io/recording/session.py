@@ -52,7 +52,8 @@ class GarbageError(InputError):
 class DeviceStatus:
     """The status of a device for the screen.
 
-    readings, byte_count, malformed, unplugged : numbers so far; rate_hz : readings per second.
+    readings, byte_count, malformed, unplugged : numbers so far
+    rate_hz : readings per second.
     lost, gaps : number of missing readings, and of gaps, as the device's time stamps show.
     sample : malformed bytes, for messages.
     """

@@ -38,8 +38,9 @@ REFUSED_NAME = "refused.csv"
 class Recording:
     """What `write_tables` has written.
 
-    summary : the content of recording.json. rows : number of rows of each table. errors : for each
-    device with a fault, the error.
+    summary : the content of recording.json.
+    rows : number of rows of each table.
+    errors : for each device with a fault, the error.
     """
 
     folder: Path
@@ -263,9 +264,9 @@ def _rate_hz(t_s: Array) -> float | None:
 class FrameTimes:
     """The times of F frames.
 
-    t_s : (F,) times in s. missing : for each frame the names of the cameras that have no image of
-    it, joined by `|`. interpolated : (F,) whether no line reported the frame, so that its time is
-    interpolated.
+    t_s : (F,) times in s.
+    missing : for each frame the names of the cameras that have no image of it, joined by `|`.
+    interpolated : (F,) whether no line reported the frame, so that its time is interpolated.
     """
 
     t_s: Array

@@ -36,9 +36,10 @@ _SEGMENT = 20
 class Spread:
     """Hold the times of N readings of a device that sends no time stamps.
 
-    t_s : (N,) times in s, strictly increasing. sd_s : standard deviation of the times.
+    t_s : (N,) times in s, strictly increasing.
+    sd_s : standard deviation of the times.
     regular : whether the device samples regularly; if not, the readings of one arrival are spread
-    evenly over the time since the previous arrival.
+        evenly over the time since the previous arrival.
     """
 
     t_s: Array

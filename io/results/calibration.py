@@ -70,7 +70,7 @@ class PoseRecord(Part):
     """Hold a rigid transformation: a rotation matrix (3, 3) and a translation (3,) in mm.
 
     rotvec_deg : the same rotation as a rotation vector (3,) in degrees, for a human reader; None
-    where the file does not have it. `pose` does not use it.
+        where the file does not have it. `pose` does not use it.
     """
 
     rotation: Matrix3
@@ -183,10 +183,10 @@ class Mirror(Part):
     """Hold which of the two mirror-symmetric solutions was kept, and what decided between them.
 
     cost, other_cost : the cost of the kept and of the other solution, which the fit minimises; None
-    where it was not computed.
+        where it was not computed.
     decided_by, words : what decided, as a code and as a sentence.
     nominal_rotvec_deg : nominal rotation vector (3,) in degrees of the second of two cameras; for
-    more cameras, one by camera name. None where rig.toml states none.
+        more cameras, one by camera name. None where rig.toml states none.
     """
 
     cost: float | None = None
@@ -202,13 +202,15 @@ class LadderStep(Part):
     model, camera : the model's name, and the camera to whose model parameters were added.
     added : the names of the added parameters.
     taken : whether the model was accepted.
-    chi2_gain : decrease of chi-square. bic_gain : this decrease minus the penalty of the extended
-    Bayesian information criterion.
+    chi2_gain : decrease of chi-square.
+    bic_gain : this decrease minus the penalty of the extended Bayesian information criterion.
     p_value : probability of such a decrease of chi-square if the added parameters were 0.
-    parameters : number of free parameters. chi2_dof : chi-square per degree of freedom.
-    bic : the extended Bayesian information criterion. rms_px : RMS of the residuals in px.
+    parameters : number of free parameters.
+    chi2_dof : chi-square per degree of freedom.
+    bic : the extended Bayesian information criterion.
+    rms_px : RMS of the residuals in px.
     held_out, held_out_before : mean squared error of the prediction of views that were left out of
-    the fit, with this model and with the previous one.
+        the fit, with this model and with the previous one.
     """
 
     model: str = ""
@@ -241,14 +243,14 @@ class Stage(Part):
 
     axis : (3,) unit vector of the travel in the rig frame, towards increasing encoder readings.
     basis : (3, 2) two unit vectors perpendicular to the axis, along which its two tilts (rad) are
-    measured.
+        measured.
     axis_covariance_rad2 : (2, 2) covariance of the two tilts in rad^2; None where it is not known.
     encoder_scale : relative error of the encoder; 0.001 means that it reads 0.1 % too much.
     encoder_scale_sd : its standard deviation; None where it is not known.
     joint_covariance : (3, 3) covariance of both tilts (rad) and of the encoder scale.
     chi2_dof : chi-square per degree of freedom of the fit; None where there is none.
     position_sigma_mm, wander_sigma_mm : standard deviation in mm of the carriage's position along
-    the axis and perpendicular to it; None where the file does not state it.
+        the axis and perpendicular to it; None where the file does not state it.
     """
 
     axis: Vector3
@@ -266,7 +268,8 @@ class Stage(Part):
 class SplitHalves(Part):
     """Check the keys of the split-half check; each may be missing.
 
-    views : number of views in each half. points_mm, shift_um, sd_um : (points, 3) each.
+    views : number of views in each half.
+    points_mm, shift_um, sd_um : (points, 3) each.
     """
 
     words: str = ""
@@ -325,10 +328,12 @@ def _checked(part: type[Part]) -> AfterValidator:
 class Diagnostics(Part):
     """Hold further findings of a calibration, which the report shows.
 
-    gauge : how origin, axes and scale were chosen. weak : names of badly determined quantities.
+    gauge : how origin, axes and scale were chosen.
+    weak : names of badly determined quantities.
     dots_hull_px : by camera, the corners of the convex hull of the dots that were used, in px.
     tilts_deg : tilts in degrees by name; None where one is not known.
-    halves : the split-half check. structure : the structure in the residuals.
+    halves : the split-half check.
+    structure : the structure in the residuals.
     next_view : the recommended next view of the target.
     """
 

@@ -22,10 +22,10 @@ class Input(Part):
 
     sha256 : the hash of the file; None if there was no such file.
     tables : if only some tables of a TOML file count, their names; ``sha256`` is the hash of these
-    tables alone. Empty for a whole file.
-    cameras : for a folder of images, the cameras whose images count. files, bytes : number and
-    total size of these images. sampled : hash of parts of their content; None in results of older
-    versions.
+        tables alone. Empty for a whole file.
+    cameras : for a folder of images, the cameras whose images count.
+    files, bytes : number and total size of these images.
+    sampled : hash of parts of their content; None in results of older versions.
     """
 
     sha256: str | None = None

@@ -220,8 +220,10 @@ PACKAGES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "scikit-image",
 class RunFile(Record):
     """Hold the content of run.json: which command made a results folder, and from what.
 
-    command : the command's name. telerig : the version of telerig; None where it is not known.
-    seconds : duration in s of each step by name. options : the values of the command's options.
+    command : the command's name.
+    telerig : the version of telerig; None where it is not known.
+    seconds : duration in s of each step by name.
+    options : the values of the command's options.
     inputs_sha256 : the SHA-256 hash of each input file by its path relative to the dataset.
     tracks : the run.json of the tracking on which a smoothing is based; otherwise empty.
     """

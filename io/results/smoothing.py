@@ -94,10 +94,11 @@ class Place(StrEnum):
 class AttributedLine(Part):
     """Hold a spectral line and whose motion it is: the bubbles' or the rig's.
 
-    owner : to whom the line is attributed. frequency_hz : its frequency in Hz.
+    owner : to whom the line is attributed.
+    frequency_hz : its frequency in Hz.
     rms_mm : RMS of its displacement in mm; None where it is not known.
     other_owner_costs_nats : log-likelihood ratio of this attribution to the other one; None where
-    it was not computed.
+        it was not computed.
     ambiguous : whether the data cannot decide whose motion it is.
     """
 
@@ -153,7 +154,8 @@ class Contradiction(Part):
 class Use(Part):
     """Hold how well a run determines one quantity of the bubbles.
 
-    axis : axis of the rig. value : the median over the bubbles; None if there is none.
+    axis : axis of the rig.
+    value : the median over the bubbles; None if there is none.
     sd : standard deviation of the quantity for a typical bubble; None if it is not known.
     unit : unit of value and sd.
     below_hz : for a path, the frequency up to which ``sd`` holds; for an acceleration, the
@@ -175,7 +177,8 @@ class Use(Part):
 class Mode(Part):
     """Hold a vibration of the rig: one of the model, or a peak in the estimated shake's spectrum.
 
-    where : the part of the rig that vibrates. frequency_hz : its frequency in Hz.
+    where : the part of the rig that vibrates.
+    frequency_hz : its frequency in Hz.
     damping : damping ratio; None where it is not known.
     rms_mm : RMS of the displacement in mm, in total or for each axis; None where it is not known.
     source, remedy : the probable cause and what helps against it, in words.
@@ -216,12 +219,14 @@ class SmoothingFile(Record):
     usable_for : what this run is good for, by quantity and axis.
     words, remedy : the verdict as a sentence, and what to do about it.
     vertical, remedies : the axis nearest to the vertical, and the remedy as codes; "" and () in
-    older files.
-    frames, bubbles : how many were smoothed. modes : the vibrations of the rig.
+        older files.
+    frames, bubbles : how many were smoothed.
+    modes : the vibrations of the rig.
     log_evidence : logarithm of the model's probability density for the data; None if not computed.
     up, gravity_m_s2 : unit vector against gravity in rig axes, and gravity.
-    fluid : the keys of [fluid] in rig.toml; empty without one. bodies : how far the bubbles of the
-    run are from spheroids, and their outlines from ellipses. swarm : numbers per volume of liquid.
+    fluid : the keys of [fluid] in rig.toml; empty without one.
+    bodies : how far the bubbles of the run are from spheroids, and their outlines from ellipses.
+    swarm : numbers per volume of liquid.
     depth_axes : by camera, unit vector (3,) in rig axes along which that camera cannot measure.
     learning : from which part of a long run the modes were learned, and how well they fit the other
         parts.

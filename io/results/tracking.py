@@ -20,8 +20,8 @@ PIXEL = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 class WorstFrame(Part):
     """Hold a frame that a person should inspect, because its tracking is doubtful.
 
-    score : how doubtful the frame is; None if the file does not state it. why : the reason in
-    words.
+    score : how doubtful the frame is; None if the file does not state it.
+    why : the reason in words.
     """
 
     frame: int
@@ -33,12 +33,13 @@ class Pairs(Part):
     """Hold the statistics of the ray misses of all pairs of detections.
 
     The numbers are in px; None where they were not computed.
+
     bias_px : the systematic part of the ray miss: a constant, or the coefficients of a polynomial
-    in the position whose first one is the constant.
+        in the position whose first one is the constant.
     rms_px : four RMS values of the ray misses: as they are; minus the constant; minus the whole
-    systematic part; and minus the systematic part that all other pairs give.
+        systematic part; and minus the systematic part that all other pairs give.
     scatter_px : standard deviation of the scatter of single pairs beyond the noise of their
-    detections.
+        detections.
     frame_px : RMS of the shift that all pairs of a frame share, for example because of shake.
     calibration_problem : whether the ray misses indicate a wrong calibration.
     words : sentences for the user.
@@ -55,7 +56,8 @@ class Pairs(Part):
 class RigChange(Part):
     """Hold how far a camera has moved relative to the other one since the calibration.
 
-    camera : the camera that is described. moved : whether the movement is significant.
+    camera : the camera that is described.
+    moved : whether the movement is significant.
     offset_mm : its part along the common perpendicular in mm; None where it is not known.
     """
 
@@ -69,7 +71,8 @@ class TrackingFile(Record):
     """Hold the content of tracking.json, the result of tracking a run.
 
     frames, detections, points, tracks : their numbers; None where they were not counted.
-    events : number of events of each kind. pairs : statistics of the ray miss, or None.
+    events : number of events of each kind.
+    pairs : statistics of the ray miss, or None.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
     up : (3,) unit vector against gravity in the rig frame; None where it is not known.
     extrapolated : share of the points beyond the dots of the calibration; None if it is not known.

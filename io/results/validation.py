@@ -26,8 +26,8 @@ class Stillness(StrEnum):
 class Rest(StrEnum):
     """Name the measurements that a smoothing could use in addition to the withheld mark.
 
-    MARKS : the other marks and all sensors. SENSORS : only encoder and accelerometers, as in a run
-    without marks.
+    MARKS : the other marks and all sensors.
+    SENSORS : only encoder and accelerometers, as in a run without marks.
     """
 
     MARKS = "other marks"

@@ -70,10 +70,11 @@ class CameraDescription(Table):
 class StageDescription(Table):
     """What rig.toml states about the stage.
 
-    axis : (3,) nominal direction of travel. up : (3,) direction against gravity. Both are unit
-    vectors in the rig frame.
-    position_sigma_mm : standard deviation of an encoder reading. scale_sigma : standard deviation
-    of the encoder's relative scale error; None if the file does not state it.
+    axis : (3,) nominal direction of travel.
+    up : (3,) direction against gravity. Both are unit vectors in the rig frame.
+    position_sigma_mm : standard deviation of an encoder reading.
+    scale_sigma : standard deviation of the encoder's relative scale error; None if the file does
+        not state it.
     """
 
     axis: Direction
@@ -102,7 +103,7 @@ class AccelerometerDescription(Table):
     bias_sigma_m_s2 : prior standard deviation of the bias of each axis.
     range_m_s2 : reading at which the sensor is clipped; None if it is not stated.
     clock : "frames" if its times come from the clock of the frames, "unknown" if the offset of its
-    clock has to be found from the images.
+        clock has to be found from the images.
     """
 
     name: str
@@ -135,7 +136,7 @@ class FluidDescription(Table):
     """Describe the liquid in which the bubbles rise, and their gas.
 
     velocity_mm_s : the liquid's own velocity in the lab, along the axes of the rig frame, or one
-    number upwards; None when the file does not state it, which counts as a liquid at rest.
+        number upwards; None when the file does not state it, which counts as a liquid at rest.
     gas_density_kg_m3 : density of the gas, 0 when the file does not state it.
     """
 
@@ -169,10 +170,11 @@ class FieldDescription(Table):
 class WallDescription(Table):
     """Describe the plane glass between a camera and the water, in that camera's frame.
 
-    normal : (3,) unit vector that points away from the camera (z > 0). indices : refractive indices
-    on the camera's side, of the glass, and behind it. distance_mm : along the camera's axis from
-    its origin to the near face; None is allowed for kappa = 0, where only the image's place depends
-    on it. normal_sigma_deg : standard deviation of the normal's direction.
+    normal : (3,) unit vector that points away from the camera (z > 0).
+    indices : refractive indices on the camera's side, of the glass, and behind it.
+    distance_mm : along the camera's axis from its origin to the near face; None is allowed for
+        kappa = 0, where only the image's place depends on it.
+    normal_sigma_deg : standard deviation of the normal's direction.
     """
 
     camera: str
@@ -201,20 +203,22 @@ class DeviceDescription(Table):
     """One serial line: `[devices.<name>]`.
 
     kind : what it measures; an accelerometer is named as in `[accelerometers.<name>]`.
-    port : a device file, a port name or a pyserial URL. baud : ignored by USB-native devices.
-    protocol : format of the bytes that the device sends, see `docs/recording.md`. pattern : the
-    regular expression of the protocol "regex".
+    port : a device file, a port name or a pyserial URL.
+    baud : ignored by USB-native devices.
+    protocol : format of the bytes that the device sends, see `docs/recording.md`.
+    pattern : the regular expression of the protocol "regex".
     poll : text that is sent to ask for one reading, `poll_hz` times a second; None for a device
-    that sends readings by itself.
-    counts_per_mm : encoder counts (or microsteps) in 1 mm. unit_m_s2 : acceleration of one unit.
+        that sends readings by itself.
+    counts_per_mm : encoder counts (or microsteps) in 1 mm.
+    unit_m_s2 : acceleration of one unit.
     time_unit_s, time_bits : unit of the device's time stamps, and their number of bits: the stamps
-    wrap at 2**time_bits, or never for 0.
+        wrap at 2**time_bits, or never for 0.
     checksum : "xor" demands `*hh` at the end of a line, as in NMEA 0183.
     latency_s : least delay of the line, which is subtracted from all times; recorded times do not
-    show it. If frames are stamped at the beginning of their exposure, subtract half the exposure
-    from it.
-    axis : which of the positions that GRBL sends. cameras : the cameras whose frames the counter
-    counts.
+        show it. If frames are stamped at the beginning of their exposure, subtract half the
+        exposure from it.
+    axis : which of the positions that GRBL sends.
+    cameras : the cameras whose frames the counter counts.
     """
 
     name: str
@@ -249,11 +253,12 @@ class RigDescription:
     """Hold the whole content of `rig.toml`; the first camera's frame is the rig frame.
 
     cameras, accelerometers, walls, devices : the tables of the file by name. A device is a sensor
-    on a serial line.
+        on a serial line.
     rotvec_from_first_deg : by camera, the nominal rotation vector (3,) in degrees of
-    <camera>_from_<first>, for the cameras that the file states. It decides the mirror ambiguity.
+        <camera>_from_<first>, for the cameras that the file states. It decides the mirror
+        ambiguity.
     tracking : the two cameras whose images of bubbles are paired, in the rig's order; None when the
-    file does not state them, which means the first two.
+        file does not state them, which means the first two.
     stage, references : None when the file has no such table.
     bubbles : by camera, where in its images bubbles are looked for.
     fluid : the liquid of the tank; None when the file has no such table.

@@ -23,8 +23,10 @@ class LinePattern:
     """A regular expression that a user gave, matched in a time that grows linearly with the line.
 
     Python's own ``re`` may need years for one line (docs/decisions/023-linear-expressions.md).
-    names : the names of the groups, sorted. Raises ValueError for a text that is no regular
-    expression.
+
+    names : the names of the groups, sorted.
+
+    Raises ValueError for a text that is no regular expression.
     """
 
     def __init__(self, pattern: str) -> None:

@@ -29,7 +29,8 @@ MARKS_JITTER = 0.25
 class CameraConfig:
     """A true camera, and what `rig.toml` states about it.
 
-    scale_px_per_mm : true scale. nominal_scale_px_per_mm : the scale in `rig.toml`.
+    scale_px_per_mm : true scale.
+    nominal_scale_px_per_mm : the scale in `rig.toml`.
     centre_offset_px : offset of the optical axis from the image's centre.
     parameters : further true parameters by their names in `telerig.rig.lens_parameters.PARAMETERS`.
     nominal_telecentricity_per_mm : the value in `rig.toml`; None leaves the key out.
@@ -219,7 +220,7 @@ class FluidConfig:
     """The liquid, which is at rest. It is written into rig.toml and drives paths of "forces".
 
     law : the law of the terminal velocity (`telerig.rig.bubble_physics`) from which the drag
-    coefficient of each bubble follows. The coefficient depends only on the size of the bubble.
+        coefficient of each bubble follows. The coefficient depends only on the size of the bubble.
     """
 
     density_kg_m3: float = 998.2
@@ -232,16 +233,17 @@ class FluidConfig:
 class StageConfig:
     """The stage and how it shakes.
 
-    follow : speed of the stage divided by the bubbles' mean rise velocity. ramp_s : duration of the
-        start from rest at t = 0.
+    follow : speed of the stage divided by the bubbles' mean rise velocity.
+    ramp_s : duration of the start from rest at t = 0.
     servo_hz, servo_damping, servo_rms_mm : frequency, damping ratio and RMS of the servo's
         following error, which the encoder measures.
-    encoder_sigma_mm, encoder_rate_hz : noise and sampling rate of the encoder. encoder_scale : its
-        relative scale error; it reads 1 + encoder_scale times the travel.
+    encoder_sigma_mm, encoder_rate_hz : noise and sampling rate of the encoder.
+    encoder_scale : its relative scale error; it reads 1 + encoder_scale times the travel.
     axis_views, axis_travel_mm : number of views of a target at rest from different positions of the
         stage, 0 for none, and the travel that they span.
     shake_mm : amplitude A of the shake: the offset of every camera along the axis of travel has the
-        RMS A / sqrt(2). shake_lateral : RMS across the axis, divided by that along it.
+        RMS A / sqrt(2).
+    shake_lateral : RMS across the axis, divided by that along it.
     shake_hz, shake_common, shake_arm_ratio, shake_damping, force_hz : see
         `telerig.io.simulation.run.motion.rig_shake`.
     accelerometers : what carries an accelerometer: names of cameras, for their arms, or "carriage".
@@ -280,16 +282,16 @@ class StageConfig:
 class ImageConfig:
     """The images of a run.
 
-    screen : brightness of the backlit screen, as a share of full scale. screen_fixed_to : "rig" if
-        the screen moves with the stage, so that it stands still in the image; "lab" if it stands
-        still in the laboratory.
+    screen : brightness of the backlit screen, as a share of full scale.
+    screen_fixed_to : "rig" if the screen moves with the stage, so that it stands still in the
+        image; "lab" if it stands still in the laboratory.
     texture, gradient, vignetting : relative variations of its brightness: RMS of a random texture,
         change over half the diagonal, loss in the corners.
     exposure_s : exposure time, during which bubbles are smeared.
-    blur_px : standard deviation of the Gaussian blur in focus. defocus_px_per_mm : standard
-        deviation of a further blur per mm of depth, added in quadrature.
+    blur_px : standard deviation of the Gaussian blur in focus.
+    defocus_px_per_mm : standard deviation of a further blur per mm of depth, added in quadrature.
     window_dirt : number of specks in the area of an image that are fixed to the laboratory.
-        lens_dirt : number of specks that stand still in the image.
+    lens_dirt : number of specks that stand still in the image.
     flicker : relative standard deviation of the brightness from frame to frame.
     read_noise, shot_noise : standard deviations as shares of full scale, the latter at full scale.
     bit_depth, left_aligned : see `telerig.io.simulation.images.sensor.digitise`.
@@ -323,8 +325,8 @@ class TableConfig:
     sigma_px : standard deviation of a detection's pixel coordinates.
     centre : the point that is detected: "silhouette", the centroid of the silhouette's area, or
         "volume", the projected centre of volume.
-    missed : share of bubbles that are not detected. false_per_image : mean number of false
-        detections at random places.
+    missed : share of bubbles that are not detected.
+    false_per_image : mean number of false detections at random places.
     particle_ids : whether the table states which bubble each detection belongs to.
     noisy_axes : whether the semi-axes and angles have noise, too, as those of an outline whose
         centre has the noise ``sigma_px``.
@@ -346,8 +348,9 @@ class TableConfig:
 class StripConfig:
     """A strip of dots fixed to the tank for each camera, drawn into the images.
 
-    dots : number of dots in view at a time. diameter_mm : of a dot. transmission : share of light
-    that the ink lets through.
+    dots : number of dots in view at a time.
+    diameter_mm : of a dot.
+    transmission : share of light that the ink lets through.
     at, jitter : place of the strip and unevenness of the dots, as `MARKS_AT`, `MARKS_JITTER`.
     depth_mm : the depth of the strip is drawn between -depth_mm and depth_mm.
     """
@@ -364,8 +367,9 @@ class StripConfig:
 class RunConfig:
     """A run and its calibration.
 
-    frames, frame_rate_hz : number of frames, and their rate. bubbles : number of bubbles in view at
-    a time. bubble, motion, stage, image, table : the parts of the configuration.
+    frames, frame_rate_hz : number of frames, and their rate.
+    bubbles : number of bubbles in view at a time.
+    bubble, motion, stage, image, table : the parts of the configuration.
     strip : strip of dots that is drawn into the images; None for none.
     fluid : the liquid; None leaves it out of rig.toml.
     """

@@ -152,8 +152,10 @@ class Layers:
     """The background of a run as a sum of logarithms: one layer that is fixed in the image (rig),
     one that is fixed in the laboratory (lab), and the brightness of each frame.
 
-    rig : (H, W). lab : (Hl, Wl), or None if nothing moves through the image; its pixel (0, 0) is
-    seen at image pixel (0, 0) if the shift is ``lab_origin_px``. gains : (n,) of n frames.
+    rig : (H, W).
+    lab : (Hl, Wl), or None if nothing moves through the image; its pixel (0, 0) is seen at image
+        pixel (0, 0) if the shift is ``lab_origin_px``.
+    gains : (n,) of n frames.
     """
 
     rig: Float32
@@ -597,10 +599,11 @@ class Background:
 
     rig_level : (H, W) level of what is fixed in the image, in grey values.
     lab_factor : (Hl, Wl) factor of what is fixed in the laboratory, by which the level is
-    multiplied; None if there is none. Its pixel (0, 0) is seen at image pixel (0, 0) if the shift
-    is ``lab_origin_px``.
+        multiplied; None if there is none. Its pixel (0, 0) is seen at image pixel (0, 0) if the
+        shift is ``lab_origin_px``.
     covered : (H, W) True where a bubble hid the screen in all frames, so that the level there is
-    interpolated. frames : the frames from which the background was made.
+        interpolated.
+    frames : the frames from which the background was made.
     noise : relative standard deviation of a pixel at the median level.
     shift_px : (F, 2) travel of the rig as seen in the image, for every frame; None if it is 0.
     """

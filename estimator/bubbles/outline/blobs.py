@@ -43,10 +43,11 @@ _MAX_CUT_CENTRE_SHARE = 0.6
 class Blob:
     """One dark region of an image that was divided by its background.
 
-    contour_px : (n, 2) closed outline at half depth, to about 0.1 px. inner : grey level inside
-    (the background is 1). blur_px : standard deviation of the edge's blur.
-    box : (u, v, width, height) of the region. touches_border : whether it touches the image's
-    border.
+    contour_px : (n, 2) closed outline at half depth, to about 0.1 px.
+    inner : grey level inside (the background is 1).
+    blur_px : standard deviation of the edge's blur.
+    box : (u, v, width, height) of the region.
+    touches_border : whether it touches the image's border.
     """
 
     contour_px: Array
@@ -412,8 +413,10 @@ below which both halves have to be."""
 class Part:
     """One bubble in a dark region.
 
-    ellipse : (5,). blob : index of the region. shared : whether the region contains other bubbles,
-    too. merged : whether the region could not be divided into bubbles.
+    ellipse : (5,).
+    blob : index of the region.
+    shared : whether the region contains other bubbles, too.
+    merged : whether the region could not be divided into bubbles.
     """
 
     ellipse: Array

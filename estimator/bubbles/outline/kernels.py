@@ -57,7 +57,8 @@ _TILE = 4
 class Rims(NamedTuple):
     """Hold the outlines of B bubbles, and what is known of them before the fit.
 
-    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px).
+    ellipse : (B, 5) ellipses
+    harmonics : (B, 8) coefficients (px).
     sigma : (B,) standard deviation of the edges' blur, including the pixel (px).
     outer, inner : (B,) grey levels outside and inside the bubble, as shares of the background.
     expected_inner : (B,) prior mean of the grey level inside.
@@ -88,7 +89,8 @@ class Fits(NamedTuple):
     sigma, outer, inner : (B,) blur (px) and grey levels.
     covariance : (B, 16, 16) covariance of the parameters.
     moved_px : (B,) largest of the displacements (px).
-    used : (B,) number of pixels; chi2 : (B,) sum of their squared residuals over their variances.
+    used : (B,) number of pixels
+    chi2 : (B,) sum of their squared residuals over their variances.
     coverage : (B,) share of the outline at which pixels of the edge were used.
     near, near_square : (B,) number of the pixels within one sigma of the outline that no other
         bubble hides, outliers included, and the sum of their squared residuals.

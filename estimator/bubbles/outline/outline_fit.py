@@ -168,7 +168,8 @@ _MEAN_SLOPE = 0.35
 class Start:
     """Hold the start values of the fits of B outlines.
 
-    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px).
+    ellipse : (B, 5) ellipses
+    harmonics : (B, 8) coefficients (px).
     blur_px : (B,) standard deviation of the optical blur (px).
     inner : (B,) grey level inside the bubble, as a share of the background.
     sigma_outer, sigma_inner : (B,) standard deviation of a pixel's noise outside and inside the
@@ -193,7 +194,8 @@ class Start:
 class RimState:
     """Hold the outlines of B bubbles during a fit.
 
-    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px).
+    ellipse : (B, 5) ellipses
+    harmonics : (B, 8) coefficients (px).
     sigma : (B,) standard deviation of the edges' blur, including the pixel (px).
     outer, inner : (B,) grey levels outside and inside the bubble, as shares of the background.
     """

@@ -48,7 +48,8 @@ class Rims:
     """Hold N candidate bubbles with what is seen of their rims.
 
     ellipse : (N, 5) ellipses.
-    points : (N, RAYS, 2) places on the rims (px); used : (N, RAYS) those the ellipse was fitted to.
+    points : (N, RAYS, 2) places on the rims (px)
+    used : (N, RAYS) those the ellipse was fitted to.
     places : (N, RAYS, 2) where the gradient near the ellipse points outwards best (px).
     strong : (N, RAYS) whether a rim is seen there.
     inside : (N,) share of the rim that lies within the image.
@@ -56,7 +57,8 @@ class Rims:
     depth : (N,) how much darker the ring is than what surrounds it, as a share of the latter.
     heart : (N,) how much brighter the middle is than the ring, as the same share.
     unevenness : (N,) departures of the ring's level, as a share of what it is darker.
-    inner, outer : (N,) grey levels within the rim and outside. blur_px : (N,) blur of the edge.
+    inner, outer : (N,) grey levels within the rim and outside.
+    blur_px : (N,) blur of the edge.
     """
 
     ellipse: Array

@@ -71,12 +71,14 @@ _SCALE = INDEX["scale_px_per_mm"]
 class FittedModel:
     """A fitted lens model of all cameras.
 
-    lenses : for each camera the groups of parameters that are free. parameters : number of free
-    intrinsics. cost : half the sum of squared whitened residuals, including those of the priors.
-    rows : number of measured coordinates. rms_px : RMS residual per coordinate.
+    lenses : for each camera the groups of parameters that are free.
+    parameters : number of free intrinsics.
+    cost : half the sum of squared whitened residuals, including those of the priors.
+    rows : number of measured coordinates.
+    rms_px : RMS residual per coordinate.
     per_view : (V,) for each of the V views the mean squared whitened residual when a fit without
-    this view predicts it; NaN if too few views would remain for the fit, infinite if the model was
-    not cross-validated.
+        this view predicts it; NaN if too few views would remain for the fit, infinite if the model
+        was not cross-validated.
     """
 
     lenses: Lenses
@@ -104,9 +106,12 @@ class Step:
     that was considered and not added.
 
     camera, added : index of the camera and names of the added parameters; -1 and () for the first
-    step, the simplest model. lenses : the model of all cameras with these parameters.
-    gain : decrease of chi-square, in units of the residuals' variance. bic_gain : the same minus
-    the penalty of the information criterion. taken : whether the group was added. words : why not.
+        step, the simplest model.
+    lenses : the model of all cameras with these parameters.
+    gain : decrease of chi-square, in units of the residuals' variance.
+    bic_gain : the same minus the penalty of the information criterion.
+    taken : whether the group was added.
+    words : why not.
     fit : None if the gain was predicted without a fit.
     undetermined : whether the views do not determine the added parameters.
     """
@@ -134,8 +139,8 @@ class Step:
 class Choice:
     """The chosen lens model.
 
-    steps : those that led to the model, then those that were not taken. words : reasons of the
-    choice, for the user.
+    steps : those that led to the model, then those that were not taken.
+    words : reasons of the choice, for the user.
     """
 
     steps: tuple[Step, ...]

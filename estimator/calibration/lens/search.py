@@ -57,11 +57,15 @@ class QuadraticCost:
     Its K coordinates are the free intrinsics of all cameras, in units of `parameter_unit`, and two
     sums of intrinsics for each camera, which describe the homography of a tilted sensor.
 
-    names : (camera, parameter) of each coordinate. offset : (K,) coordinates of the minimum,
-    relative to nominal. covariance : (K, K). prior : (K,) standard deviations of the priors.
-    least : chi-square at the minimum. variance : variance of the residuals relative to the stated
-    noise, by which every chi-square here is divided.
-    penalty : penalty of each free parameter. group_penalty : further penalty of each group.
+    names : (camera, parameter) of each coordinate.
+    offset : (K,) coordinates of the minimum, relative to nominal.
+    covariance : (K, K).
+    prior : (K,) standard deviations of the priors.
+    least : chi-square at the minimum.
+    variance : variance of the residuals relative to the stated noise, by which every chi-square
+        here is divided.
+    penalty : penalty of each free parameter.
+    group_penalty : further penalty of each group.
     """
 
     names: tuple[tuple[int, str], ...]

@@ -55,8 +55,8 @@ the dots' spread."""
 class Note:
     """A sentence for the user.
 
-    code : short name of its subject. affects_verdict : whether the verdict is not GOOD because of
-    it.
+    code : short name of its subject.
+    affects_verdict : whether the verdict is not GOOD because of it.
     """
 
     code: str
@@ -69,7 +69,8 @@ class PreCheck:
     """The result of the checks before a calibration.
 
     tilts_deg : by (index of the view, index of the camera) the angle between the target's normal
-    and the optical axis. notes : sentences for the user.
+        and the optical axis.
+    notes : sentences for the user.
     """
 
     tilts_deg: dict[tuple[int, int], float]

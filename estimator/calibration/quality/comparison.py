@@ -38,8 +38,8 @@ _LEAST_CHANCE = 1e-12
 class Rig:
     """The part of a calibration that is compared.
 
-    free : for each camera the names of its free intrinsics. covariance : (P, P) of the free
-    intrinsics and then of the poses of all cameras but the first.
+    free : for each camera the names of its free intrinsics.
+    covariance : (P, P) of the free intrinsics and then of the poses of all cameras but the first.
     """
 
     cameras: tuple[Camera, ...]
@@ -51,7 +51,8 @@ class Rig:
 class Change:
     """The change of one quantity from the first calibration to the second.
 
-    unit : "urad", "um" or "ppm". sd : standard deviation of the change that both covariances give.
+    unit : "urad", "um" or "ppm".
+    sd : standard deviation of the change that both covariances give.
     """
 
     quantity: str
@@ -98,7 +99,8 @@ class RigComparison:
 
     cameras : their names.
     changes : for each camera but the first, the changes of its rotation about x, y and z and of its
-    offset along the common perpendicular, relative to the first; then the C changes of the scales.
+        offset along the common perpendicular, relative to the first; then the C changes of the
+        scales.
     field : the differences of points in space.
     p_moved : probability that errors alone cause changes of the poses as large as these.
     exchanged : whether two cameras have exchanged their scales.

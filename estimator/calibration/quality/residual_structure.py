@@ -29,8 +29,8 @@ class ResidualTest:
 
     name : "region", "direction", "neighbours" or "view".
     size : size of the effect: for "region" the RMS of the mean residuals in parts of the image, in
-    standard deviations of a residual; for "direction" the relative difference of the variances; for
-    "neighbours" a correlation; for "view" the ratio to the other views.
+        standard deviations of a residual; for "direction" the relative difference of the variances;
+        for "neighbours" a correlation; for "view" the ratio to the other views.
     p_value : probability that chance alone gives an effect at least as large.
     words : the finding and its possible causes, for the user.
     """

@@ -27,7 +27,8 @@ class SpaceError:
     """Errors of N triangulated points, after the rigid motion that fits them best to the truth.
 
     rms_um, predicted_um : RMS error per axis, and its prediction by the calibration's covariance.
-    errors_mm : (N, 3) estimated minus true. covariance_mm2 : (3N, 3N) predicted covariance.
+    errors_mm : (N, 3) estimated minus true.
+    covariance_mm2 : (3N, 3N) predicted covariance.
     """
 
     rms_um: float
@@ -40,7 +41,8 @@ class SpaceError:
 class Comparison:
     """A calibration compared with the truth of the simulator.
 
-    table : text with one line per quantity. verdict : a sentence that begins with PASSED or FAILED.
+    table : text with one line per quantity.
+    verdict : a sentence that begins with PASSED or FAILED.
     space : errors of points in space.
     """
 

@@ -18,8 +18,9 @@ class UncertaintyMap:
 
     points_mm : (N, 3) in the rig frame.
     calibration_mm2 : (N, 3, 3) due to errors of the calibration, which are common to all points of
-    a run. measurement_mm2 : (N, 3, 3) due to noise of the pixels with the standard deviation
-    sigma_px, which is independent for each point.
+        a run.
+    measurement_mm2 : (N, 3, 3) due to noise of the pixels with the standard deviation sigma_px,
+        which is independent for each point.
     """
 
     points_mm: Array

@@ -45,19 +45,22 @@ _AT_ONCE = 8192
 class Calibration(ShortText):
     """Hold a calibrated rig. The rig frame is the first camera's frame.
 
-    dot_ids : (N,) numbers of the target's N dots. target_points_mm : (N, 3) their estimated
-    positions in the target's frame. target_poses : by name of a view, the pose rig_from_target.
+    dot_ids : (N,) numbers of the target's N dots.
+    target_points_mm : (N, 3) their estimated positions in the target's frame.
+    target_poses : by name of a view, the pose rig_from_target.
     covariance : (P, P) of the rig block: the free intrinsics of each camera, then the small
-    rotation (rad) and translation (mm) of the pose of each camera but the first. covariance_names :
-    of these P parameters, with units. free : for each camera, the names of its free intrinsics.
+        rotation (rad) and translation (mm) of the pose of each camera but the first.
+        covariance_names : of these P parameters, with units.
+    free : for each camera, the names of its free intrinsics.
     verdict : "status" (a word) and "reasons" (sentences). statistics, twin, model, diagnostics :
-    the parts of `calibration.json` with these names (`docs/files.md`); "twin" is the mirror
-    ambiguity.
-    notes : sentences for the user. stage : `StageAxis.as_dict`; empty if it is not known.
+        the parts of `calibration.json` with these names (`docs/files.md`); "twin" is the mirror
+        ambiguity.
+    notes : sentences for the user.
+    stage : `StageAxis.as_dict`; empty if it is not known.
     medium : "air" or "water", in which the target was. With refractive windows, points that are
-    projected or triangulated lie in the water behind them.
+        projected or triangulated lie in the water behind them.
     joint_names, joint_covariance : of all parameters of the estimate, including the dots and the
-    views' poses; empty if they were not loaded.
+        views' poses; empty if they were not loaded.
     dots, residuals : the tables of `dots.csv` and `residuals.csv`; None after loading.
     """
 

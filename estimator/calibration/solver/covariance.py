@@ -29,14 +29,15 @@ class JointCovariance:
 
     The first K parameters are those of cameras and views. Poses are in GTSAM's tangent space
     (rotation, translation) at ``rig_from_...``, with right perturbation.
+
     names : names of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
     matrix : (D, D) covariance; if there are more than `FULL_COVARIANCE_UP_TO` parameters, only of
-    cameras and views (D = K).
-    dots : (N, 3, 3) covariance of each dot. cross : (K, N, 3) covariances of cameras and views with
-    each dot.
+        cameras and views (D = K).
+    dots : (N, 3, 3) covariance of each dot.
+    cross : (K, N, 3) covariances of cameras and views with each dot.
     rig : number P of the cameras' parameters, which come first.
     leverage : (M, 2, 2) J C J^T of each used measurement, with J its derivatives and C the
-    covariance of all parameters: the share of its noise that the fit absorbs.
+        covariance of all parameters: the share of its noise that the fit absorbs.
     units : (K + 3 N,) size of each parameter's unit in the solver, in physical units.
     """
 

@@ -33,7 +33,8 @@ LEAST_PIVOT = 1e-10
 class _Images:
     """Where one camera's M measurements stand in P factors, one for a view and a group of dots.
 
-    view, group : (P,). place : (M,) factor times G, plus the number of the dot in its group of G.
+    view, group : (P,).
+    place : (M,) factor times G, plus the number of the dot in its group of G.
     """
 
     view: Ints
@@ -47,9 +48,10 @@ class GraphLayout:
     All groups have the same size, so the last one may contain dots that do not exist and on which
     no measurement depends.
 
-    size : number W of all scalar parameters. places : for each variable the indices of its scalars.
+    size : number W of all scalar parameters.
+    places : for each variable the indices of its scalars.
     families : for each set of variables of equal size, their keys (M,) and the indices (M, size) of
-    their scalars.
+        their scalars.
     order : keys of the variables in the order of elimination.
     """
 
@@ -98,8 +100,10 @@ class GraphEquations:
     """The Gaussian factor graph of a problem, linearised at one state.
 
     J are the derivatives of the whitened residuals r with respect to the W scalar parameters.
-    square, right : (W,) diagonal of J^T J, and -J^T r. untouched : (W,) whether no measurement and
-    no prior depends on the parameter. cost : half the sum of squared residuals.
+
+    square, right : (W,) diagonal of J^T J, and -J^T r.
+    untouched : (W,) whether no measurement and no prior depends on the parameter.
+    cost : half the sum of squared residuals.
     """
 
     def __init__(self, layout: GraphLayout, state: State) -> None:

@@ -74,18 +74,22 @@ class Problem:
     """The measurements, priors and free parameters of one self-calibration.
 
     There are C cameras, V views, N dots and M measured dots. The first camera is the rig frame.
+
     nominal_mm, dot_sigma_mm : (N, 3) nominal position of each dot in the target's frame, and the
-    prior standard deviations of the true one.
-    view, camera, dot : (M,) indices of each measurement. uv_px : (M, 2) measured pixels.
-    covariance_px2 : (M, 2, 2), without weights. weight : (M,) from 0 to 1.
+        prior standard deviations of the true one.
+    view, camera, dot : (M,) indices of each measurement.
+    uv_px : (M, 2) measured pixels.
+    covariance_px2 : (M, 2, 2), without weights.
+    weight : (M,) from 0 to 1.
     free : for each camera the names of its free intrinsics.
     scale : ((dot index, dot index), distance_mm, sigma_mm) of two dots whose distance is known;
-    None if the nominal positions set the scale.
-    plate_shift : (V, C) as in `Observations`. solver : "gtsam", "schur" or "auto". outlier_sd :
-    number of standard deviations beyond which a dot is left out.
+        None if the nominal positions set the scale.
+    plate_shift : (V, C) as in `Observations`.
+    solver : "gtsam", "schur" or "auto".
+    outlier_sd : number of standard deviations beyond which a dot is left out.
     hold_scales : if all lenses have perspective, whether their scales are held at nominal. Each
-    camera's origin is then at the depth at which its scale is the nominal one, and not where the
-    optical axes come closest.
+        camera's origin is then at the depth at which its scale is the nominal one, and not where
+        the optical axes come closest.
     """
 
     cameras: tuple[Camera, ...]
@@ -412,14 +416,14 @@ class Priors:
     """Whitened residuals of all priors, and their derivatives.
 
     cameras : for each camera the residuals (r,) of the weak priors and of the depth gauge, and
-    their derivatives (r, S) with respect to its S parameters: the free intrinsics and, except for
-    the first camera, the pose.
+        their derivatives (r, S) with respect to its S parameters: the free intrinsics and, except
+        for the first camera, the pose.
     views : the residuals (V, 3) of the weak priors on the target's position in each view, and their
-    derivatives (V, 3, 6) with respect to its pose.
+        derivatives (V, 3, 6) with respect to its pose.
     dots : the residuals (N, 3) of the dots' nominal positions, and the diagonal (N, 3) of their
-    derivatives.
+        derivatives.
     distance : for a known distance the indices of the two dots, the residual, and its derivative
-    (3,) with respect to the first dot; None if no distance is known.
+        (3,) with respect to the first dot; None if no distance is known.
     """
 
     cameras: list[tuple[Array, Array]]
@@ -438,10 +442,11 @@ class Priors:
 class System:
     """Computes the residuals of a problem as functions of the state.
 
-    images : for each camera its measurements, sorted by view and dot. rows : for each camera the
-    indices of these measurements in `Problem.observations`.
+    images : for each camera its measurements, sorted by view and dot.
+    rows : for each camera the indices of these measurements in `Problem.observations`.
     camera_places : for each camera the indices of its S parameters among all D parameters.
-    views_at, dots_at : index of the first parameter of the views and of the dots. size : D.
+    views_at, dots_at : index of the first parameter of the views and of the dots.
+    size : D.
     """
 
     def __init__(self, problem: Problem) -> None:

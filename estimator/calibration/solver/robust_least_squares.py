@@ -45,8 +45,10 @@ Equations = GraphEquations | NormalEquations
 class Solution:
     """The result of a least-squares solution.
 
-    state : the minimum. cost : half the sum of squared whitened residuals, including those of the
-    priors. iterations : number of steps. equations : the equations, linearised at the minimum.
+    state : the minimum.
+    cost : half the sum of squared whitened residuals, including those of the priors.
+    iterations : number of steps.
+    equations : the equations, linearised at the minimum.
     """
 
     state: State

@@ -44,10 +44,11 @@ def undetermined() -> CalibrationError:
 class Posterior:
     """The covariance of K parameters of cameras and views and of N dots: the inverse of J^T J.
 
-    common : (K, K) of cameras and views. cross : (K, N, 3) of cameras and views with each dot.
-    dots : (N, 3, 3) of each dot. whole : (K + 3 N, K + 3 N) of all parameters, or None if it was
-    not asked for. untouched : (K + 3 N,) whether no measurement depends on the parameter; its
-    variance is 1 here.
+    common : (K, K) of cameras and views.
+    cross : (K, N, 3) of cameras and views with each dot.
+    dots : (N, 3, 3) of each dot.
+    whole : (K + 3 N, K + 3 N) of all parameters, or None if it was not asked for.
+    untouched : (K + 3 N,) whether no measurement depends on the parameter; its variance is 1 here.
     """
 
     common: Array
@@ -72,8 +73,11 @@ class Posterior:
 class NormalEquations:
     """J^T J and -J^T r in blocks, for K parameters of cameras and views and N dots.
 
-    common : (K, K). dots : (3, 3, N). cross : (K, 3, N). right : (K + 3 N,) -J^T r. cost : half the
-    sum of squared residuals.
+    common : (K, K).
+    dots : (3, 3, N).
+    cross : (K, 3, N).
+    right : (K + 3 N,) -J^T r.
+    cost : half the sum of squared residuals.
     """
 
     def __init__(self, system: System, state: State) -> None:
@@ -241,9 +245,10 @@ class SchurComplement:
 
     The letters W, F, S, K, E and D are those of the equations at the top of this module.
 
-    kept, eliminated : indices (m,) and (B, n) of the parameters. root : (B, n, n) inverse of W.
-    coupling : (m, n B) F, with columns sorted by component and then by block. factor : lower
-    Cholesky factor of S, in Fortran order.
+    kept, eliminated : indices (m,) and (B, n) of the parameters.
+    root : (B, n, n) inverse of W.
+    coupling : (m, n B) F, with columns sorted by component and then by block.
+    factor : lower Cholesky factor of S, in Fortran order.
     """
 
     kept: Ints

@@ -33,7 +33,8 @@ _MIRROR = np.outer(_FLIP, _FLIP)
 class ImageMap:
     """The map from the target's plane to one image, about the point that is seen in its centre.
 
-    jacobian : (2, 2) px/mm. offset_px : (2,) offset of the target's origin from the image centre.
+    jacobian : (2, 2) px/mm.
+    offset_px : (2,) offset of the target's origin from the image centre.
     perspective : (2,) relative change of the scale per mm along the target's x and y.
     misfit : RMS distance of the dots from the map, divided by the dots' spread.
     """

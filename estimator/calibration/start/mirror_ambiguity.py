@@ -50,8 +50,8 @@ BY_PLATE = "refraction in the plate"
 class MirrorChoice:
     """Holds which of the two mirror-image solutions is kept.
 
-    state : the kept solution. decided_by, words : what decided, as a short phrase and as a sentence
-    for calibration.json.
+    state : the kept solution.
+    decided_by, words : what decided, as a short phrase and as a sentence for calibration.json.
     """
 
     state: State

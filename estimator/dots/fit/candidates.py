@@ -45,7 +45,7 @@ class Candidate:
 
     label : value of its pixels in ``Candidates.labels``.
     centre_px, shape_px : (2,), (3,) of the ellipse with the same second moments, see
-    ``blurred_ellipse``.
+        ``blurred_ellipse``.
     holes : outlines (N, 2) of the holes in the region, in px.
     reason : why the region cannot be a dot; None if it may be one.
     """
@@ -88,9 +88,10 @@ class Candidates:
 class EdgeMap:
     """The edges of an image; all arrays have its shape (rows, columns).
 
-    smooth : smoothed grey levels. threshold : the grey level that separates dots from background
-    at each pixel. flat : whether there is no edge near the pixel. has_edges : whether the image has
-    any edge.
+    smooth : smoothed grey levels.
+    threshold : the grey level that separates dots from background at each pixel.
+    flat : whether there is no edge near the pixel.
+    has_edges : whether the image has any edge.
     """
 
     smooth: Float32

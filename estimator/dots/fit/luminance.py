@@ -64,9 +64,9 @@ class Prior:
     u_per_px, v_per_px : relative gradient of the contrast, (dC/du)/C and (dC/dv)/C.
     sigma_per_px : standard deviation of both.
     tie_to_background : whether the background's relative gradient is taken instead, because the
-    same light falls on both.
-    edge_px : standard deviation of the edge's Gaussian blur. edge_spread_px : standard deviation of
-    this number; infinite if it is unknown.
+        same light falls on both.
+    edge_px : standard deviation of the edge's Gaussian blur.
+    edge_spread_px : standard deviation of this number; infinite if it is unknown.
     """
 
     u_per_px: float = 0.0
@@ -81,8 +81,9 @@ class Prior:
 class Window:
     """The part of an image to which one dot is fitted.
 
-    grey : (V, U) grey levels. first_u, first_v : the image's pixel at grey[0, 0]. mask : (V, U)
-    whether a pixel is used in the fit.
+    grey : (V, U) grey levels.
+    first_u, first_v : the image's pixel at grey[0, 0].
+    mask : (V, U) whether a pixel is used in the fit.
     """
 
     grey: Array
@@ -95,8 +96,10 @@ class Window:
 class Start:
     """Start values of a fit.
 
-    centre_px : (2,). shape_px : (3,), see ``blurred_ellipse``. sigma_px : standard deviation of the
-    edge's blur. previous : an earlier fit, whose grey levels are the start values of the levels.
+    centre_px : (2,).
+    shape_px : (3,), see ``blurred_ellipse``.
+    sigma_px : standard deviation of the edge's blur.
+    previous : an earlier fit, whose grey levels are the start values of the levels.
     """
 
     centre_px: Array
@@ -109,13 +112,16 @@ class Start:
 class DotFit:
     """One fitted dot.
 
-    centre_px : (2,). shape_px : (3,), see ``blurred_ellipse``. sigma_px : standard deviation of the
-    edge's blur.
-    levels : (6,) grey levels: background B0 + B1 x + B2 y and contrast C + C1 x + C2 y, where
-    (x, y) is the offset from origin_px (2,), the middle of the window, divided by radius_px.
-    covariance_px2 : (2, 2) of the centre. contrast_sigma : standard deviation of C.
-    chi2_dof : chi-square per degree of freedom. pixels : number of pixels in the mask. dropped :
-    how many of these were left out as outliers or as clipped.
+    centre_px : (2,).
+    shape_px : (3,), see ``blurred_ellipse``.
+    sigma_px : standard deviation of the edge's blur.
+    levels : (6,) grey levels: background B0 + B1 x + B2 y and contrast C + C1 x + C2 y, where (x,
+        y) is the offset from origin_px (2,), the middle of the window, divided by radius_px.
+    covariance_px2 : (2, 2) of the centre.
+    contrast_sigma : standard deviation of C.
+    chi2_dof : chi-square per degree of freedom.
+    pixels : number of pixels in the mask.
+    dropped : how many of these were left out as outliers or as clipped.
     edge_residual : RMS residual near the edge, divided by C.
     inner_chi2 : mean squared whitened residual of the inner_pixels pixels that the dot covers.
     """
@@ -186,12 +192,15 @@ _prior_values = attrgetter(*(f.name for f in fields(Prior)))
 class Pixels:
     """The pixels of D fits, padded to the largest number P of pixels in one fit.
 
-    x, y : (D, P) offsets in px from the middle of the window. grey : (D, P) grey levels.
-    there : (D, P) False for padding. counts : (D,) number of pixels of each fit.
+    x, y : (D, P) offsets in px from the middle of the window.
+    grey : (D, P) grey levels.
+    there : (D, P) False for padding.
+    counts : (D,) number of pixels of each fit.
     columns, rows : (D, U), (D, V) offsets in px of the windows' columns and rows; those of smaller
-    windows are continued.
+        windows are continued.
     cell : (D, P) index of each pixel in the grid of rows and columns, row by row.
-    origin : (D, 2) middle of the window in px. radius : (D,) radius of the dot in px.
+    origin : (D, 2) middle of the window in px.
+    radius : (D,) radius of the dot in px.
     prior : (D,) with the fields of `Prior`.
     """
 

@@ -35,7 +35,8 @@ _REFINED = 12
 class PointMatch:
     """One assignment of the target's points to the dots of an image.
 
-    dot : (n,) indices of the matched dots. point : (n,) index of the target's point for each.
+    dot : (n,) indices of the matched dots.
+    point : (n,) index of the target's point for each.
     handedness : +1, or -1 when the image is mirrored.
     """
 

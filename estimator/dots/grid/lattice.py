@@ -145,7 +145,8 @@ class Lattice:
     basis_px : (n, 2, 2) local pitch vectors; basis_px[k, axis] is the step in (u, v).
     shape : (n, 2, 2) each dot's shape matrix in units of the local pitch vectors; for a round dot
         of radius r on perpendicular pitches p it is diag(r^2 / p1^2, r^2 / p2^2).
-    unplaced : (m,) positions of the other dots; reasons : why, one each.
+    unplaced : (m,) positions of the other dots
+    reasons : why, one each.
     """
 
     index: Ints

@@ -52,8 +52,9 @@ round it for a clear decision."""
 class MarkEvidence:
     """What an image shows about where the marks are on the lattice of its dots.
 
-    gain : (H, W) log-likelihood ratio of a mark to a plain dot at each place; that of the place
-    (i, j) is gain[i + 1, j + 1]. seen : (k, 2) places that look like marks.
+    gain : (H, W) log-likelihood ratio of a mark to a plain dot at each place; that of the place (i,
+        j) is gain[i + 1, j + 1].
+    seen : (k, 2) places that look like marks.
     """
 
     gain: Array
@@ -245,7 +246,8 @@ class Placements:
     In each, the dot at a place of the lattice has (column, row) = turn @ place - shift on the
     target.
 
-    turn : (K, 2, 2), with determinant -1 where the image is mirrored. shift : (K, 2).
+    turn : (K, 2, 2), with determinant -1 where the image is mirrored.
+    shift : (K, 2).
     score : (K,) log-likelihoods.
     """
 
@@ -400,14 +402,16 @@ class Numbering:
     """Which dot of the target each located dot is.
 
     table : one row for each of n numbered dots: dot (id), row, column, and index, the row of the
-    given table of dots. unplaced : the other dots: index, and reason why they have no number.
+        given table of dots.
+    unplaced : the other dots: index, and reason why they have no number.
     handedness : +1, -1 if the image shows the target mirrored, 0 if the image does not reveal it;
-    for a target that equals its mirror image, +1 is assumed.
+        for a target that equals its mirror image, +1 is assumed.
     equivalents : (K, n) ids of the n dots under each of the K numberings that fit equally well; row
-    0 is that of the table, -1 means that the target has no dot there.
+        0 is that of the table, -1 means that the target has no dot there.
     equivalent_handedness : (K,) handedness under each of these numberings.
     ambiguous : whether these numberings differ by more than rotations that leave the target
-    unchanged. marks_found : ids of the marks that the image shows.
+        unchanged.
+    marks_found : ids of the marks that the image shows.
     """
 
     table: pd.DataFrame

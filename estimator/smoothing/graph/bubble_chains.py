@@ -26,8 +26,9 @@ class Places:
     A row is one bubble in one frame. The rows are sorted by age, the number of frames since the
     bubble's first one, and within an age by the bubble, the longest track first.
 
-    order : (K,) indices of the bubbles, the longest track first. ends : for each age the index
-    after its last row. active : for each age the number of bubbles that reach it.
+    order : (K,) indices of the bubbles, the longest track first.
+    ends : for each age the index after its last row.
+    active : for each age the number of bubbles that reach it.
     place_of_row : (rows,) place of each row of the graph in this order.
     """
 
@@ -61,8 +62,10 @@ class BubbleChains:
     Elimination gives R x_i = d - S (x_i+1, U) for the state x_i of a bubble in one frame, the next
     one x_i+1 and its mean velocity U.
 
-    own : (rows, D, D) R^-1 R^-T. gain : (rows, D, D + 3) R^-1 S. mean : (K, 3, 3) covariances of
-    the mean velocities of K bubbles. Rows and bubbles are in the order of ``places``.
+    own : (rows, D, D) R^-1 R^-T.
+    gain : (rows, D, D + 3) R^-1 S.
+    mean : (K, 3, 3) covariances of the mean velocities of K bubbles. Rows and bubbles are in the
+        order of ``places``.
     log_det : logarithm of the determinant of the square root of the information.
     """
 

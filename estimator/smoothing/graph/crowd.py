@@ -80,11 +80,13 @@ class EliminatedCrowd:
     The graph is approximated by one with a single bubble, the mean of all bubbles. It serves as the
     preconditioner of a conjugate-gradient solution of the whole graph.
 
-    chains : the bubbles, eliminated for a fixed rig. mean : the graph with the mean bubble.
+    chains : the bubbles, eliminated for a fixed rig.
+    mean : the graph with the mean bubble.
     mean_chains : the mean bubble, eliminated for a fixed rig.
     rig : the factors without bubbles, with the keys of ``mean``.
     images_by_rig, images_by_bubble : the derivatives of the bubbles' pixels with respect to the
-    rig, with the keys of ``mean``, and to the bubbles, with rows of ``chains`` in place of keys.
+        rig, with the keys of ``mean``, and to the bubbles, with rows of ``chains`` in place of
+        keys.
     starts : first column of each key of ``mean``, and of each row.
     steps : number of conjugate-gradient steps that were needed.
     """

@@ -275,8 +275,10 @@ def _ordering(graph: GraphLayout) -> tuple[Ints, Ints]:
 class Clique:
     """Conditionals that are eliminated one after the other and end in the same separator.
 
-    fronts : their own keys, in the order of elimination.  separator : keys.
-    root : (n, n) upper triangular R.  right : (n, m) S, columns as in the separator.
+    fronts : their own keys, in the order of elimination.
+    separator : keys.
+    root : (n, n) upper triangular R.
+    right : (n, m) S, columns as in the separator.
     side : (n,) d.
     """
 

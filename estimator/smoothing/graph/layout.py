@@ -54,8 +54,8 @@ _FEW_KINDS, _AT_ONCE = 16, 4096
 class ShakeLayout:
     """The meaning of the D states of carriage and cameras at one time.
 
-    components : independent processes, whose states stand one after the other. labels : their
-        names.
+    components : independent processes, whose states stand one after the other.
+    labels : their names.
     position, velocity, acceleration, jerk : (D,) rows that give the motion of the carriage along
         the travel axis from the states.
     offset, offset_velocity, offset_acceleration, offset_jerk : (C + 1, 3, D) rows that give the
@@ -336,7 +336,7 @@ class Families(NamedTuple, Generic[T]):
     """One value for each kind of variable, in the order of their keys.
 
     constants : that of the encoder's and the calibration's constants, which share one key, because
-    a factor of GTSAM has three keys at most.
+        a factor of GTSAM has three keys at most.
     """
 
     shake: T
@@ -353,14 +353,16 @@ class State:
     """The values of all variables of a smoothing.
 
     shake : (N, Ds) states of carriage and cameras at N nodes; the carriage is in units of the
-    encoder's reading.
+        encoder's reading.
     bubbles : (rows, Db) states of the bubbles, a row for each frame of a bubble, one bubble after
-    the other. means : (K, 3) mean velocities of K bubbles.
+        the other.
+    means : (K, 3) mean velocities of K bubbles.
     sensors : (A, 3 or 4) biases of A accelerometers, and their scale errors if these are estimated.
     encoder : (0 to 2,) scale error and delay of the encoder, as far as they are estimated.
-    calibration : (r,) error along r directions. marks : (Q, 3) positions of Q marks.
+    calibration : (r,) error along r directions.
+    marks : (Q, 3) positions of Q marks.
     clocks : (G, 0 or 1) delay of G accelerometers' clocks beyond that at which the nodes are
-    placed.
+        placed.
     """
 
     shake: Array
@@ -385,12 +387,14 @@ class State:
 class GraphLayout:
     """The fixed part of one linearisation: the states' meaning, the nodes and the keys' order.
 
-    shake, bubble : meaning of the states. nodes : times of the states of carriage and cameras.
-    nominal_mm : (N,) prior mean of the carriage's position. delays_s : (A,) delays of the
-    accelerometers at which the nodes are placed.
+    shake, bubble : meaning of the states.
+    nodes : times of the states of carriage and cameras.
+    nominal_mm : (N,) prior mean of the carriage's position.
+    delays_s : (A,) delays of the accelerometers at which the nodes are placed.
     clock_of : (A,) index of each accelerometer's clock; sensors with the same times share one.
-    first_row : (K + 1,) first row of each bubble. node_of_row, bubble_of_row, frame_of_row : node,
-    bubble and frame of each row. moving_rows : the rows that have a row after them.
+    first_row : (K + 1,) first row of each bubble.
+    node_of_row, bubble_of_row, frame_of_row : node, bubble and frame of each row.
+    moving_rows : the rows that have a row after them.
     shake_motion, bubble_motion : the whitened steps of both kinds of states.
     """
 

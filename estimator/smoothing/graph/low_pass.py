@@ -44,8 +44,9 @@ _EXCLUDED, _HALVINGS, _SHORTEST_S = 0.5, 6, 1e-5
 class Series(NamedTuple):
     """A bubble's positions along a direction, mm.
 
-    step : (N - 1,) which length each step has.  values : (N, 1 + K), for the rig's mean and for K
-    draws of its errors.  variance : (N,) as stated, infinite where not both cameras saw it.
+    step : (N - 1,) which length each step has.
+    values : (N, 1 + K), for the rig's mean and for K draws of its errors.
+    variance : (N,) as stated, infinite where not both cameras saw it.
     """
 
     step: Ints

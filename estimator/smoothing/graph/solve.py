@@ -112,9 +112,11 @@ class Covariances:
 class Accelerations:
     """Hold the bubbles' velocities and accelerations in the laboratory frame (rig axes).
 
-    velocity_mm_s : (rows, 3).  velocity_covariance : (rows, 3, 3), rows as in the graph.
+    velocity_mm_s : (rows, 3).
+    velocity_covariance : (rows, 3, 3), rows as in the graph.
     displacement_variance_mm2 : (bubbles, 3) of the way from the first frame to the last one.
-    value_mm_s2 : (rows, 3).  covariance : (rows, 3, 3) in mm^2/s^4.
+    value_mm_s2 : (rows, 3).
+    covariance : (rows, 3, 3) in mm^2/s^4.
     bandwidth_hz : (3,) along each axis the frequency up to which accelerations are followed by at
         least half; 0 where the images say no more than the prior.
     low_passes : the filters that were used, for the accelerations and for the velocities.
@@ -143,7 +145,8 @@ class Accelerations:
 class Solution:
     """Hold the posterior of a smoothing problem.
 
-    graph : layout of the variables.  state : their estimates.
+    graph : layout of the variables.
+    state : their estimates.
     covariances : None if they were not asked for.
     weights : (M,) weights of the bubbles' pixels and (R,) of the marks' pixels; 0 for outliers.
     residuals : whitened residuals (M, 2) of the bubbles' pixels and (R, 2) of the marks' pixels.

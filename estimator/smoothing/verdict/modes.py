@@ -89,7 +89,9 @@ def _from_offsets(solution: Solution, names: Sequence[str]) -> list[Mode]:
 class _Spectra:
     """Spectral densities of (C, n, 3) series.
 
-    frequency_hz : (F,).  own : (C, 3, F) power.  cross : (C, C, 3, F) real part of cross spectra.
+    frequency_hz : (F,).
+    own : (C, 3, F) power.
+    cross : (C, C, 3, F) real part of cross spectra.
     """
 
     frequency_hz: Array

@@ -70,7 +70,8 @@ p2 are exchanged, and the power of length in HALCON's unit of it."""
 class HalconCamera:
     """Hold one camera's parameters in HALCON's names, order and units (m, px, degrees).
 
-    kind : HALCON's camera type. camera_from_rig : pose of the camera, here in mm.
+    kind : HALCON's camera type.
+    camera_from_rig : pose of the camera, here in mm.
     misfit : difference of the pixels from those of telerig's camera, over the working volume.
     notes : what was fitted or left out.
     """

@@ -37,11 +37,12 @@ _POINTS_PER_EDGE = 25
 class Matrices:
     """Hold the matrices of one camera, which map (x, y, z, 1) in mm in the rig frame to pixels.
 
-    undistorted : (3, 4) matrix of the camera without distortion; undistorted_misfit : the effect of
-    the distortion that is left out.
-    affine : (3, 4) matrix with last row 0 0 0 1 that fits best; affine_misfit : its error.
-    camera_matrix, distortion : (3, 3), (12,) arguments of cv2.undistortPoints, with
-    P = camera_matrix; None if OpenCV's model cannot express this camera's skew or sensor tilt.
+    undistorted : (3, 4) matrix of the camera without distortion
+    undistorted_misfit : the effect of the distortion that is left out.
+    affine : (3, 4) matrix with last row 0 0 0 1 that fits best
+    affine_misfit : its error.
+    camera_matrix, distortion : (3, 3), (12,) arguments of cv2.undistortPoints, with P =
+        camera_matrix; None if OpenCV's model cannot express this camera's skew or sensor tilt.
     """
 
     camera: str

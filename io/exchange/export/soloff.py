@@ -39,7 +39,8 @@ class Soloff:
     """Hold the polynomial that was fitted to one camera over a volume.
 
     coefficients : (19, 2), or (20, 2) with the term `CUBIC_Z` last; the columns give u and v in px
-    for x, y, z in mm in the rig frame. misfit : at points that were not used in the fit.
+        for x, y, z in mm in the rig frame.
+    misfit : at points that were not used in the fit.
     """
 
     camera: str

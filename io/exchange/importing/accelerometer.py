@@ -47,13 +47,14 @@ _SEEN_CELLS = 200
 class Layout:
     """State where in a file the readings are, and what they mean; None uses what the file states.
 
-    channels : names, or numbers from 0, of the channels x, y, z. time : name or number of the
-    channel that holds the times.
-    time_unit : one of `TIME_UNITS`. rate_hz : sampling rate, for a file without times.
+    channels : names, or numbers from 0, of the channels x, y, z.
+    time : name or number of the channel that holds the times.
+    time_unit : one of `TIME_UNITS`.
+    rate_hz : sampling rate, for a file without times.
     start_s : time in s that is added to all times, to bring the sensor's clock to that of the run.
-    unit : unit of the readings, one of `ACCELERATION_UNITS`. scale_m_s2 : instead of a unit, the
-    acceleration in m/s^2 of a reading of 1, as one number or three (WAV files: of full scale;
-    volts: 9.80665 divided by the sensitivity in V per g).
+    unit : unit of the readings, one of `ACCELERATION_UNITS`.
+    scale_m_s2 : instead of a unit, the acceleration in m/s^2 of a reading of 1, as one number or
+        three (WAV files: of full scale; volts: 9.80665 divided by the sensitivity in V per g).
     group : name of the group in a TDMS file.
     """
 

@@ -36,7 +36,10 @@ class Pinhole:
     """One pinhole camera: pixel = camera_matrix (rotation X + translation_mm), homogeneous.
 
     X is a point in mm in the world of the program that made the file.
-    where : the file, for errors. camera_matrix, rotation : (3, 3). translation_mm : (3,).
+
+    where : the file, for errors.
+    camera_matrix, rotation : (3, 3).
+    translation_mm : (3,).
     distortion : up to 14 coefficients in OpenCV's order.
     """
 
@@ -61,7 +64,8 @@ class ImportedCameras(NamedTuple):
     """Cameras that were imported from another program.
 
     rig_from_world : pose for points in the other program's world; its rotation has the determinant
-    -1 if that world is mirrored. notes : sentences for the user on what is not exact.
+        -1 if that world is mirrored.
+    notes : sentences for the user on what is not exact.
     """
 
     cameras: tuple[Camera, ...]

@@ -14,10 +14,11 @@ from telerig.errors import InputError
 class Recording:
     """Hold the channels of a sensor's file before they are converted.
 
-    where : the file, for errors. channels : raw values (samples,) by the channel's name; text if a
-    channel has no numbers. units : units by the channel's name, for channels that state a unit
-    apart from their name.
-    rate_hz : sampling rate that the file states, or None. offset_s : time of the first sample.
+    where : the file, for errors.
+    channels : raw values (samples,) by the channel's name; text if a channel has no numbers.
+    units : units by the channel's name, for channels that state a unit apart from their name.
+    rate_hz : sampling rate that the file states, or None.
+    offset_s : time of the first sample.
     lines : (samples,) line of the file, from 1, in which each sample is; None for binary files.
     notes : sentences for the user.
     """

@@ -59,7 +59,8 @@ class Faults:
 class SimulatedDevice:
     """One device; with the protocol "regex" its lines carry no stamps.
 
-    drift_ppm : how much faster its clock runs than the host's. start_ticks : of its counter.
+    drift_ppm : how much faster its clock runs than the host's.
+    start_ticks : of its counter.
 
     jitter_s : readings wait in the adapter for a random time up to this, then arrive together.
     """
@@ -184,7 +185,8 @@ _BUFFER_S = 0.25
 class Truth:
     """What a simulated device did. start_ns : the host's time of its reading 0.
 
-    sent : number of readings made. spoilt : indices of the readings that a fault damaged.
+    sent : number of readings made.
+    spoilt : indices of the readings that a fault damaged.
     overrun : indices of those for which the port's buffer was full (the host reads too slowly).
     away_s : (from, to) of each unplug, in seconds of the host's time from the start.
     """

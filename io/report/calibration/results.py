@@ -42,10 +42,13 @@ _FILES = (
 class CalibrationResults:
     """A results folder in memory; what optional files are missing is in ``absent``.
 
-    views : rig_from_target by view. row_column : (N, 2) of the dots, NaN where no residual names
-    it. residuals : with ``kept`` and ``length_px``, and ``whitened_u``, ``whitened_v`` when
-    dots.csv states covariances. component : place in ``joint``, the whole covariance, by name.
-    overlays : picture by (camera, view). dot_example, uncertainty : arrays, or empty.
+    views : rig_from_target by view.
+    row_column : (N, 2) of the dots, NaN where no residual names it.
+    residuals : with ``kept`` and ``length_px``, and ``whitened_u``, ``whitened_v`` when dots.csv
+        states covariances.
+    component : place in ``joint``, the whole covariance, by name.
+    overlays : picture by (camera, view).
+    dot_example, uncertainty : arrays, or empty.
     """
 
     file: CalibrationFile

@@ -20,9 +20,10 @@ _MOST_SHAPES = 1500
 class TargetShape:
     """Dots against the best perfect target.
 
-    place_mm : (N, 2) where the best target has them. off_um, sd_um : (N, 3) estimated minus best.
-    stretch : per mille, along two principal directions, or None. in_plane : False when only
-    flatness is known.
+    place_mm : (N, 2) where the best target has them.
+    off_um, sd_um : (N, 3) estimated minus best.
+    stretch : per mille, along two principal directions, or None.
+    in_plane : False when only flatness is known.
     """
 
     place_mm: Array

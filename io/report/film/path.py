@@ -69,9 +69,13 @@ def write_path_film(
 class FilmPath:
     """Paths in the film's axes: right and forward (away from the viewer) at angle 0, and up.
 
-    points_mm, sd_mm : (N, 3), by particle and frame. particle : (N,). new : (N,), rows before which
-    the line is interrupted. bodies : (B,) rows whose bubble is drawn. quadrics_mm2 : (B, 3, 3), Q
-    of the ellipsoid x^T Q^-1 x = 1. names : of the axes. notes : for the viewer.
+    points_mm, sd_mm : (N, 3), by particle and frame.
+    particle : (N,).
+    new : (N,), rows before which the line is interrupted.
+    bodies : (B,) rows whose bubble is drawn.
+    quadrics_mm2 : (B, 3, 3), Q of the ellipsoid x^T Q^-1 x = 1.
+    names : of the axes.
+    notes : for the viewer.
     """
 
     points_mm: Array
@@ -182,8 +186,10 @@ def _apart(kept: pd.DataFrame, sizes: pd.DataFrame) -> list[int]:
 class Panel:
     """Where a drawing stands and how it is scaled, in px at 100 dpi.
 
-    low_mm, high_mm : (3,) the box. stretch : how much wider than high a mm is drawn. band : how
-    much the +-2 sd band is widened, 0 without one. words : above it.
+    low_mm, high_mm : (3,) the box.
+    stretch : how much wider than high a mm is drawn.
+    band : how much the +-2 sd band is widened, 0 without one.
+    words : above it.
     """
 
     low_mm: Array

@@ -23,7 +23,9 @@ _TRIES = 2000
 class TrueTarget:
     """The true target with N dots.
 
-    ids : (N,). points_mm : (N, 3) true centres in the target's frame. diameter_mm : (N,).
+    ids : (N,).
+    points_mm : (N, 3) true centres in the target's frame.
+    diameter_mm : (N,).
     plate : the plate as it is rendered.
     scale_distance_mm : the known distance of two dots, as it was measured; None if there is none.
     """

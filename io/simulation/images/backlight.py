@@ -17,8 +17,9 @@ _SPECK_REACH = 3.5
 class Screen:
     """Describe a smooth bright field that is known everywhere, so that it can move in the image.
 
-    level : grey level at the image's middle as a fraction of full scale. gradient : (2,) relative
-    change over half the image's diagonal, along u and v. vignetting : relative loss in the corners.
+    level : grey level at the image's middle as a fraction of full scale.
+    gradient : (2,) relative change over half the image's diagonal, along u and v.
+    vignetting : relative loss in the corners.
     waves_per_px : (waves, 2) angular wave numbers of the texture in rad/px.
     amplitude, phase_rad : (waves,) relative amplitude and phase in rad of each wave.
     """
@@ -78,7 +79,8 @@ def random_screen(
 class Specks:
     """Specks of dirt, which absorb light with a Gaussian profile.
 
-    uv_px : (specks, 2) places. sigma_px : (specks,) standard deviation of the profile.
+    uv_px : (specks, 2) places.
+    sigma_px : (specks,) standard deviation of the profile.
     depth : (specks,) share of light that is absorbed in the middle.
     """
 

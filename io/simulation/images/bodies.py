@@ -31,8 +31,9 @@ class Bodies:
     """Deformed ellipsoids, with coordinates either in the rig or in the laboratory frame.
 
     origin_mm : (..., 3) centre of the ellipsoid that was deformed by the modes. It is not the
-    centre of volume.
-    rotation : (..., 3, 3) frame_from_body; semi_axes_mm : (..., 3) along the body's axes.
+        centre of volume.
+    rotation : (..., 3, 3) frame_from_body
+    semi_axes_mm : (..., 3) along the body's axes.
     modes : (..., 21) relative amplitudes in the order of `MODES`.
     """
 

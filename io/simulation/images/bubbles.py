@@ -34,10 +34,11 @@ class Look:
 
     rim : transmission of the dark part.
     heart : transmission of the bright middle; if it equals rim, there is no bright middle. It falls
-    to half at heart_radius, with the exponent heart_sharpness (2.5 as in real images; from 20 on
-    the middle is a disc with a sharp edge). heart_offset : (2,) place of the bright middle.
+        to half at heart_radius, with the exponent heart_sharpness (2.5 as in real images; from 20
+        on the middle is a disc with a sharp edge).
+    heart_offset : (2,) place of the bright middle.
     ring : transmission of a faint ring at ring_radius, of the width ring_width; it is up to twice
-    as bright at the bottom and fades towards the top.
+        as bright at the bottom and fades towards the top.
     """
 
     rim: float = 0.1
@@ -84,8 +85,9 @@ def _square(du: Array, dv: Array, metric: Array) -> Float32:
 class Silhouette:
     """A bubble as a camera sees it.
 
-    outline_px : (N, 2). blur_px : standard deviation of the blur. smear_px : motion during the
-    exposure.
+    outline_px : (N, 2).
+    blur_px : standard deviation of the blur.
+    smear_px : motion during the exposure.
     """
 
     outline_px: Array

@@ -30,10 +30,11 @@ _RIM = 24
 class Light:
     """Describe smooth light that multiplies an image, and a glare that is added to it.
 
-    gain : factor at the image's centre. gradient : (2,) relative change over half the diagonal,
-    along u and v. vignetting : relative loss in the corners.
+    gain : factor at the image's centre.
+    gradient : (2,) relative change over half the diagonal, along u and v.
+    vignetting : relative loss in the corners.
     glare : (u_px, v_px, radius_px, strength) of a Gaussian spot; the strength is a fraction of full
-    scale.
+        scale.
     """
 
     gain: float = 1.0

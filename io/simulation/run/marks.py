@@ -22,7 +22,8 @@ _OUTLINE_POINTS = 128
 class Strip:
     """The dots of a strip that is fixed to the tank, for one camera.
 
-    lab_mm : (K, 3) places in the laboratory frame; the dots face the camera. look : appearance.
+    lab_mm : (K, 3) places in the laboratory frame; the dots face the camera.
+    look : appearance.
     """
 
     camera: Camera

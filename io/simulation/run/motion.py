@@ -286,11 +286,12 @@ def added_mass_along(aspect: float) -> float:
 class Forces:
     """The forces on each of B bubbles, divided by the mass of the displaced liquid.
 
-    drag_1_mm : (B,) drag divided by the squared speed. added_mass : (B,) coefficient.
+    drag_1_mm : (B,) drag divided by the squared speed.
+    added_mass : (B,) coefficient.
     lift_mm_s2, lift_hz, lift_rad : (B,) amplitude, frequency and phase of an oscillating lift.
     lift_azimuth : (B, 2) horizontal unit vector along which it acts.
     noise_mm_s2, noise_tau_s : RMS along both horizontal axes, and correlation time, of a random
-    lift (Ornstein-Uhlenbeck process).
+        lift (Ornstein-Uhlenbeck process).
     """
 
     drag_1_mm: Array

@@ -50,7 +50,8 @@ class Carriage:
     """The motion of the stage on a fine time grid, from the first frame to one after the last.
 
     t_s, position_mm, velocity_mm_s, acceleration_mm_s2 : (N,) at the N samples of the grid.
-    shake : of each of C cameras, with arrays (C, N, 3). stride : number of samples per frame.
+    shake : of each of C cameras, with arrays (C, N, 3).
+    stride : number of samples per frame.
     frames : which of the N samples are frames.
     """
 

@@ -20,13 +20,15 @@ _EDGE_PX = 0.5
 class CameraView:
     """M bubbles in or near one image.
 
-    particle : (M,) ids. outline_px : (M, N, 2) outlines of N points. centre_px : (M, 2) projected
-    centres of volume.
+    particle : (M,) ids.
+    outline_px : (M, N, 2) outlines of N points.
+    centre_px : (M, 2) projected centres of volume.
     silhouette_px, area_px2, second_px2 : (M, 2), (M,), (M, 2, 2) centroid, area and central second
-    moments of each silhouette.
-    smear_px : (M, 2) motion during the exposure. blur_px : (M,) standard deviation of the blur.
+        moments of each silhouette.
+    smear_px : (M, 2) motion during the exposure.
+    blur_px : (M,) standard deviation of the blur.
     visible, whole, overlap : (M,) whether a part of the silhouette is in the image, whether all of
-    it is, and whether another outline crosses it.
+        it is, and whether another outline crosses it.
     """
 
     particle: Ints

@@ -45,8 +45,10 @@ _ALONG = 0.9
 class SmoothingResults:
     """The smoothing in memory.
 
-    file : smoothing.json. cameras : names, in the rig's order. trajectories,
-    shake : the tables, by bubble and frame. up : (3,) unit vector in rig axes.
+    file : smoothing.json.
+    cameras : names, in the rig's order.
+    trajectories, shake : the tables, by bubble and frame.
+    up : (3,) unit vector in rig axes.
     bubble_frames, bubble_summary : bubbles.csv and bubble_summary.csv, empty where they are not.
     """
 

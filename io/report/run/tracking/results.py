@@ -44,9 +44,10 @@ UP = (0.0, -1.0, 0.0)
 class TrackResults:
     """A results folder in memory.
 
-    file : tracking.json. cameras : names, in the rig's order.
-    tracks, detections, events, references : the tables; rows of detections.csv that only say why
-        a frame has no bubble are left out (tracking.json counts them).
+    file : tracking.json.
+    cameras : names, in the rig's order.
+    tracks, detections, events, references : the tables; rows of detections.csv that only say why a
+        frame has no bubble are left out (tracking.json counts them).
     up : (3,) unit vector in the rig frame.
     pictures : (camera or "camera, binary", frame as six digits) -> file.
     absent : what optional files are missing, in words.

@@ -32,9 +32,10 @@ _LEAST_MISS_MM = 1e-7
 class RayPair:
     """Two rays and where they come closest, in the rig frame.
 
-    directions : (2, 3), of unit length. closest_mm : (2, 3), the point of
-    each ray that is nearest to the other. middle_mm : (3,), half way. miss_mm : signed, from the
-    first ray to the second along first direction x second direction.
+    directions : (2, 3), of unit length.
+    closest_mm : (2, 3), the point of each ray that is nearest to the other.
+    middle_mm : (3,), half way.
+    miss_mm : signed, from the first ray to the second along first direction x second direction.
     """
 
     directions: Array

@@ -165,7 +165,7 @@ def _at_once(
 
 
 def _earlier(path: Path, dataset: Path) -> Calibration:
-    """The calibration to compare with, checked to be of this rig before anything is solved."""
+    """Return the calibration to compare with. Raises InputError if it is of another rig."""
     from telerig.estimator.calibration.quality.comparison import check_same_rig
     from telerig.estimator.calibration.result.calibration import load_calibration
     from telerig.io.dataset.dataset import load_dataset
@@ -180,7 +180,7 @@ def _earlier(path: Path, dataset: Path) -> Calibration:
 def _watched(
     dataset: Path, source: str | None, until_um: float | None, poll: float, settings: dict[str, Any]
 ) -> tuple[Dataset, CalibrationRun]:
-    """The images that arrived, and their calibration."""
+    """Return the dataset with the images that arrived, and their calibration."""
     from telerig.estimator.calibration.watch import watch
     from telerig.io.dataset.dataset import load_dataset
 

@@ -57,7 +57,7 @@ def say_written(folder: Path, report: bool) -> None:
 
 @contextmanager
 def errors_in_words() -> Iterator[None]:
-    """Turn telerig's errors, Ctrl-C and faults of telerig into a message and an exit code.
+    """Decorate a command: errors and Ctrl-C become a message and an exit code.
 
     Every command is decorated with this function.
     """

@@ -62,7 +62,7 @@ def demo(
 
 
 def _config() -> RunConfig:
-    """The run of 2004, with an accelerometer on each camera's arm."""
+    """Return the run of the paper of 2004, with an accelerometer on each camera's arm."""
     from telerig.io.simulation.presets import run_preset
 
     config = run_preset("rise")

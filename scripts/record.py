@@ -130,7 +130,7 @@ def _recorded(
 
 
 def _description(file: Path) -> RigDescription:
-    """The content of a rig.toml that names devices."""
+    """Return the content of a rig.toml that names devices."""
     from telerig.io.rig_file.rig_file import read_rig_toml
 
     description = read_rig_toml(file)
@@ -145,7 +145,7 @@ def _description(file: Path) -> RigDescription:
 
 
 def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
-    """The rig's devices, with the ports that the command line gives."""
+    """Return the rig's devices with the ports from the command line."""
     from telerig.errors import suggestion
 
     given: dict[str, str] = {}
@@ -173,7 +173,7 @@ def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
 
 @contextmanager
 def _display(quiet: bool) -> Iterator[Callable[[Status], None]]:
-    """A callback for the status: a table on a terminal, plain lines elsewhere."""
+    """Return a callback for the status: a table on a terminal, plain lines elsewhere."""
     if quiet:
         yield lambda _: None
     elif sys.stderr.isatty():
@@ -225,7 +225,7 @@ def _plain_lines() -> Callable[[Status], None]:
 
 
 def recording_words(done: Recording) -> str:
-    """The summary of a recording, a line or more for each device."""
+    """Return the summary of a recording, one or more lines per device."""
     s = done.summary
     lines = [f"{s['seconds']:.1f} s recorded"]
     if not s["closed"]:

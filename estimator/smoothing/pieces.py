@@ -234,7 +234,7 @@ class Constants:
         return replace(problem, known=tuple(known))
 
     def _shares(self, number: int) -> dict[int, float]:
-        """Of each piece, the share of its own frames that one is solved with."""
+        """Return for each piece the share of its own frames that one is solved with."""
         low, high = self.pieces[number].low, self.pieces[number].high
         both = np.array([min(high, p.end) - max(low, p.first) for p in self.pieces])
         length = np.array([p.end - p.first for p in self.pieces])
@@ -275,7 +275,7 @@ def _conditional(
 
 
 def _root(information: Array) -> Array:
-    """(n, n) R with R^T R."""
+    """Return R (n, n) with R^T R the given matrix."""
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     return np.asarray(np.sqrt(values.clip(0))[:, None] * vectors.T)
 

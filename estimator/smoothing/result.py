@@ -228,7 +228,7 @@ def bubble_summary(
 
 
 def _surroundings(smoothing: Smoothing, fluid: Any) -> tuple[Array, float, Any]:
-    """The direction up (3,), gravity in m/s^2, and the liquid: the given one or that of the run."""
+    """Return up (3,), gravity in m/s^2, and the liquid: the given one or the run's."""
     if not isinstance(smoothing, Smoothing):
         raise InputError(
             f"tables of bubbles are made from a Smoothing, not from {type(smoothing).__name__}",

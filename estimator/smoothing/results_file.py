@@ -100,7 +100,7 @@ class ResultsFile:
 
 
 def _factor(column: str, inflation: Sequence[float]) -> float:
-    """The factor for a column of a table: that of its axis for a standard deviation, else 1."""
+    """Return the factor of a column: that of its axis for an sd, else 1."""
     for axis, factor in zip(AXES, inflation):
         if column[:1] == "s" and column.endswith((f"{axis}_mm", f"{axis}_mm_s", f"{axis}_mm_s2")):
             return float(factor)

@@ -101,7 +101,7 @@ def smooth_run(
 
 
 def run_sources(run: RunData) -> list[Path | Source]:
-    """The inputs of the run's folder whose change makes its smoothing stale."""
+    """Return the inputs in the run's folder whose change makes its smoothing stale."""
     rig = run.path.parent.parent / "rig.toml"
     names = ("frames.csv", "run.toml", "stage.csv", "accelerometer.csv", "references.csv")
     return [
@@ -123,7 +123,7 @@ def _check_cameras(tracks: Tracks | StoredTracks | Any, calibration: Calibration
 
 
 def _moved(tracks: Tracks | StoredTracks | Any) -> list[str]:
-    """What `telerig track` found of a movement of the cameras, for trajectories that keep it."""
+    """Return a warning if tracking found a movement of the cameras."""
     change = getattr(tracks, "summary", {}).get("rig_change") or {}
     if not change.get("moved"):
         return []
@@ -136,7 +136,7 @@ def _moved(tracks: Tracks | StoredTracks | Any) -> list[str]:
 
 
 def read_tracks(path: Path, run: Path) -> tuple[Tracks | StoredTracks | Any, Path]:
-    """What `telerig track` wrote, or a bare table of tracks; and the file it came from."""
+    """Return the tracks of a results folder or of a single table, and their file."""
     if path.is_dir():
         if not (path / "tracks.csv").is_file():
             raise InputError(
@@ -164,7 +164,7 @@ def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list
 
 
 def _report(staged: Path, folder: Path, tracked: Path) -> None:
-    """The run's page, smoothing first; it needs the tracks beside it."""
+    """Write the run's page, which also needs the tracks."""
     from telerig.io.report.run.report import write_track_report
 
     borrowed = []

@@ -283,7 +283,7 @@ class _Run:
         return _Done(verdict, evidence, solution, tables, deviations, swarm)
 
     def _bodies(self, tracks: Any) -> tuple[pd.DataFrame | None, Deviations | None]:
-        """The bubbles' bodies, and their deviations from them; None without tracks."""
+        """Return the bubbles' bodies, and their deviations; None without tracks."""
         if self.tracked is None:
             return None, None
         from telerig.estimator.physics.bodies import bodies_table
@@ -293,7 +293,7 @@ class _Run:
     def _swarm(
         self, solution: Solution, paths: pd.DataFrame, bodies: pd.DataFrame | None, span: Span
     ) -> dict[str, Any] | None:
-        """Numbers of the swarm in some frames, of which there are the rows of the tables."""
+        """Return numbers of the swarm in some frames."""
         if bodies is None:
             return None
         from telerig.estimator.physics.swarm import swarm_numbers
@@ -372,7 +372,7 @@ class _Run:
     def _tables(
         self, piece: Piece, window: Window, solution: Solution, span: Span
     ) -> tuple[pd.DataFrame, pd.DataFrame]:
-        """Rows of the trajectories and of the shake in a piece's own frames."""
+        """Return rows of the trajectories and of the shake in a piece's own frames."""
         table = None
         if self.tracked is not None:
             table = self.tracked.between(piece.low, piece.high)
@@ -387,7 +387,7 @@ class _Run:
 
 
 def _with_accelerations(solution: Solution, low_passes: LowPasses | None = None) -> Solution:
-    """The solution with accelerations, where there are bubbles and covariances.
+    """Return the solution with accelerations if it has bubbles and covariances.
 
     low_passes : of the bubbles' forces; None to learn them.
     """
@@ -397,7 +397,7 @@ def _with_accelerations(solution: Solution, low_passes: LowPasses | None = None)
 
 
 def _beside(paths: pd.DataFrame, bodies: pd.DataFrame | None) -> pd.DataFrame | None:
-    """The bodies in the rows of the trajectories, NaN where there are none."""
+    """Return the bodies in the rows of the trajectories, NaN where there are none."""
     if bodies is None:
         return None
     keys = ["frame", "particle"]
@@ -462,7 +462,7 @@ def _check_kinds(tracks: Any, calibration: Any, rig: Any) -> None:
 
 
 def _cameras_of(table: Any, calibration: Calibration, stage: Any, rig: Any) -> list[str]:
-    """Names of the cameras whose pixels a table of tracks has; without one, those of the run."""
+    """Return the cameras with pixels in a table of tracks, or those of the run."""
     known = [camera.name for camera in calibration.cameras]
     if table is not None:
         return [name for name in known if f"{name}_u_px" in table.columns]

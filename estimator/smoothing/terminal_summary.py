@@ -60,7 +60,7 @@ def smoothing_words(found: Smoothing) -> str:
 
 
 def _encoder_words(found: Smoothing) -> list[str]:
-    """The encoder's scale, and its part of the positions' standard deviation where that is much."""
+    """Return a sentence on the encoder's scale and its effect on the positions' sd."""
     encoder, travel = found.summary["encoder"], found.summary["travel"]
     if not encoder:
         return []

@@ -283,7 +283,7 @@ def moved(mark: Seen, motion: Motion, cameras: Sequence[Camera]) -> Seen:
 
 
 def _nearest(origin: Array, direction: Array) -> Array:
-    """The points of rays that are nearest to the origin of the rig frame; all (N, 3)."""
+    """Return the points (N, 3) of rays nearest to the origin of the rig frame."""
     return np.asarray(origin - (origin * direction).sum(-1, keepdims=True) * direction)
 
 
@@ -329,7 +329,7 @@ def track_of(mark: Seen, calibration: Calibration, t_s: Array) -> Tracks:
 
 
 def _without(run: RunData, mark: Seen, rest: Rest) -> RunData:
-    """The run without this mark, or without all marks."""
+    """Return the run without a mark, or without all marks."""
     if rest is Rest.SENSORS or run.references is None:
         return replace(run, references=None)
     others = run.references[run.references["mark"].astype(str) != mark.mark]
@@ -391,7 +391,7 @@ def _rms(values: Array) -> float:
 
 
 def _nees(off: Array, covariance: Array) -> float:
-    """Mean of e' C^-1 e per dimension; off (N, D), covariance (N, D, D)."""
+    """Return the mean of e' C^-1 e per dimension; off (N, D), covariance (N, D, D)."""
     whole = np.linalg.solve(covariance, off[..., None])[..., 0]
     return float(np.mean((off * whole).sum(-1)) / off.shape[1])
 

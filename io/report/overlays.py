@@ -74,7 +74,7 @@ def draw_overlay(
 def overlay_jpeg(
     image: NDArray[Any], accepted: pd.DataFrame, rejected: pd.DataFrame, *, max_width_px: int
 ) -> bytes:
-    """`draw_overlay` as a JPEG file's content."""
+    """Return the JPEG file that `draw_overlay` draws."""
     import cv2
 
     picture = draw_overlay(image, accepted, rejected, max_width_px=max_width_px)
@@ -181,7 +181,7 @@ def _grey_picture(image: NDArray[Any], factor: float, least_contrast: float = 0.
 
 
 def shrunk(image: NDArray[Any], factor: float) -> NDArray[np.float32]:
-    """(h, w) the image by a factor of at most 1; what is not finite becomes 0."""
+    """Return the image scaled by a factor of at most 1; values that are not finite become 0."""
     import cv2
 
     grey = np.nan_to_num(image.astype(np.float32))
@@ -192,13 +192,13 @@ def shrunk(image: NDArray[Any], factor: float) -> NDArray[np.float32]:
 
 
 def in_grey(grey: NDArray[np.float32], low: float, high: float) -> Picture:
-    """(h, w, 3) 8-bit RGB, black at ``low`` and white at ``high``."""
+    """Return 8-bit RGB (h, w, 3), black at ``low`` and white at ``high``."""
     stretched = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255)
     return np.repeat(stretched.astype(np.uint8)[..., None], 3, axis=2)
 
 
 def draw_line(picture: Picture, points: Array, colour: Colour, *, closed: bool) -> None:
-    """A line through (N, 2) pixels of the picture, pixel (0, 0) the centre of the first one."""
+    """Draw a line through (N, 2) pixels; pixel (0, 0) is the centre of the first one."""
     import cv2
 
     if len(points) > 1:
@@ -230,7 +230,7 @@ def write_label(
 def _write_beside(
     picture: Picture, points: Array, label: str, colour: Colour, taken: Bools
 ) -> None:
-    """In the middle of a large outline, else at one of its four sides, if there is room."""
+    """Write a label inside a large outline, else at one of its sides with room."""
     if not label or not len(points):
         return
     low, high = points.min(axis=0), points.max(axis=0)
@@ -243,7 +243,7 @@ def _write_beside(
 
 
 def _legend(lines: list[str], width_px: int) -> Picture:
-    """The lines in dark ink on white, wrapped to the width. OpenCV's letters are ASCII only."""
+    """Return wrapped lines of text as a picture. OpenCV's letters are ASCII only."""
     import cv2
 
     letters = max(8, int((width_px - 8) / (18.5 * _SCALE)))
@@ -257,7 +257,7 @@ def _legend(lines: list[str], width_px: int) -> Picture:
 
 
 def _ellipses(table: pd.DataFrame, least_px: float) -> list[Array]:
-    """The outline (N, 2) px of each row's ellipse; no points where it is not finite."""
+    """Return the ellipse (N, 2) px of each row; no points where it is not finite."""
     outlines = []
     for u, v, a, b, angle in table[_ELLIPSE].to_numpy(float):
         x, y = max(a, least_px) * np.cos(_TURN), max(b, least_px) * np.sin(_TURN)
@@ -267,6 +267,6 @@ def _ellipses(table: pd.DataFrame, least_px: float) -> list[Array]:
 
 
 def _scaled(outline: Array, factor: float) -> Array:
-    """The finite points of an outline (N, 2) in pixels of the picture, smaller by ``factor``."""
+    """Return the finite points of an outline (N, 2) in pixels of the scaled picture."""
     points = np.asarray(outline, float).reshape(-1, 2)
     return np.asarray((points[np.isfinite(points).all(axis=1)] + 0.5) * factor - 0.5)

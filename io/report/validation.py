@@ -33,7 +33,7 @@ def write_validation_report(folder: Path, out: Path | None = None) -> Path:
 
 
 def render(content: ValidationFile) -> str:
-    """The page as text."""
+    """Return the page as text."""
     passed = content.verdict is Stillness.PASSED
     context = {
         "name": content.run,

@@ -223,7 +223,7 @@ class _Chains:
 
 
 def _of_white_noise(seen: Observations, graph: GraphLayout, inertia: Inertia) -> Observations:
-    """Pixels with the covariance of their white noise alone."""
+    """Return pixels with the covariance of their white noise alone."""
     along, across = inertia.noise
     scale = []
     for camera in graph.problem.cameras:

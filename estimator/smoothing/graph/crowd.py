@@ -175,7 +175,7 @@ class EliminatedCrowd:
         return self.chains.solved(rows, means)
 
     def _push(self, rig: Array) -> Array:
-        """What a change of the rig (R, N) puts on the bubbles' rows (rows, D, N)."""
+        """Return the effect of a change of the rig (R, N) on the bubbles' rows (rows, D, N)."""
         seen = product(self.images_by_rig, self.starts[0], rig)
         push = transposed_product(self.images_by_bubble, self.starts[1], seen)
         return push.reshape(*self.chains.own.shape[:2], -1)
@@ -184,7 +184,7 @@ class EliminatedCrowd:
         return transposed_product(self.images_by_rig, self.starts[0], self._seen_by_bubbles(rows))
 
     def _split(self, side: Array) -> tuple[Array, Array, Array]:
-        """A vector (D, N) of the graph as rig (R, N), rows and means of the chains."""
+        """Split a vector (D, N) of the graph into rig (R, N), rows and means of the chains."""
         ours, theirs = _starts(self.graph), _starts(self.mean.graph)
         size, places = self.graph.bubble.size, self.chains.places
         rig = np.zeros((_size(self.mean.graph), side.shape[1]))
@@ -295,12 +295,12 @@ def _size(graph: GraphLayout) -> int:
 
 
 def _starts(graph: GraphLayout) -> Families[int]:
-    """The first column of each family of keys."""
+    """Return the first column of each family of keys."""
     return Families(0, *np.cumsum([n * d for n, d in graph.counts()])[:-1].tolist())
 
 
 def _mean_row(mean: GraphLayout) -> Ints:
-    """(F,) the mean bubble's row at each frame."""
+    """Return the mean bubble's row (F,) at each frame."""
     out = np.zeros(len(mean.problem.t_s), np.int64)
     out[mean.frame_of_row] = np.arange(mean.rows)
     return out

@@ -102,7 +102,7 @@ def _drawn(
 
 
 def _by_camera(obs: Observations, parts: Sequence[Array]) -> Array:
-    """(M, 2, K) of all pixels from those of each camera that has some."""
+    """Merge the residuals of each camera into those of all pixels (M, 2, K)."""
     if not parts:
         return np.zeros((0, 2, 0))
     out = np.empty((len(obs), *parts[0].shape[1:]))

@@ -61,7 +61,7 @@ class EliminatedGraph:
     cliques: list[Clique]
 
     def log_det(self) -> float:
-        """log |R|; QR leaves signs on the diagonal."""
+        """Return log |det R|; QR leaves signs on the diagonal."""
         return float(np.log(np.abs(_diagonal(self.cliques))).sum())
 
     @cached_property
@@ -188,7 +188,7 @@ def _eliminated(
 
 
 def _first_place(linear: LinearFactors, place: Ints) -> Ints:
-    """(M,) the place in the order of each factor's variable that is eliminated first."""
+    """Return the place (M,) of each factor's variable that is eliminated first."""
     out = np.full(len(linear.rhs), len(place))
     for key, block in zip(linear.keys, linear.blocks):
         if block.shape[-1]:
@@ -207,14 +207,14 @@ def starts_of(graph: GraphLayout) -> Ints:
 
 
 def _diagonal(cliques: Sequence[Clique]) -> Array:
-    """(D,) diagonals of the roots, in order of elimination."""
+    """Return the diagonals (D,) of the roots, in order of elimination."""
     return np.concatenate([np.zeros(0), *(np.diagonal(c.root) for c in cliques)])
 
 
 def _least_pivot(
     cliques: Sequence[Clique], factors: Sequence[LinearFactors], sizes: Sequence[int]
 ) -> float:
-    """What elimination leaves of the information's diagonal, the least share."""
+    """Return the least ratio of a pivot to the information's diagonal."""
     starts = np.r_[0, np.cumsum(sizes)]
     before = np.zeros(starts[-1])
     for linear in factors:
@@ -229,7 +229,7 @@ def _least_pivot(
 
 
 def _bonds(graph: GraphLayout) -> list[LinearFactors]:
-    """Empty factors between shake and bubbles where no image joins them.
+    """Return empty factors between shake and bubbles that no image joins.
 
     Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
     its first row on would share none.
@@ -392,6 +392,6 @@ def _joined(own: Array, gain: Array, above: Array) -> Array:
 
 
 def _starts(keys: list[int], sizes: Sequence[int]) -> tuple[dict[int, int], int]:
-    """The first column of each of the keys side by side, and the number of columns."""
+    """Return the first column of each key side by side, and the number of columns."""
     ends = list(accumulate([sizes[k] for k in keys], initial=0))
     return dict(zip(keys, ends)), ends[-1]

@@ -375,11 +375,11 @@ class State:
     clocks: Array
 
     def encoder_scale(self, graph: GraphLayout) -> float:
-        """The scale error of the encoder; 0 if it is held."""
+        """Return the scale error of the encoder; 0 if it is held."""
         return float(self.encoder[0]) if graph.encoder_flags[0] else 0.0
 
     def encoder_delay_s(self, graph: GraphLayout) -> float:
-        """The delay of the encoder in s; 0 if it is held."""
+        """Return the delay of the encoder in s; 0 if it is held."""
         return float(self.encoder[-1]) if graph.encoder_flags[1] else 0.0
 
 
@@ -544,7 +544,7 @@ class GraphLayout:
         )
 
     def base(self) -> Families[int]:
-        """The first key of each family."""
+        """Return the first key of each family."""
         numbers = [family.number for family in self.counts()]
         return Families(0, *np.cumsum(numbers)[:-1].tolist())
 
@@ -575,7 +575,7 @@ def with_bubbles(
 
 
 def _of_bubbles(problem: SmoothingProblem, nodes: Nodes, bubble: BubbleLayout) -> dict[str, Any]:
-    """The fields of `GraphLayout` that depend on the bubbles."""
+    """Return the fields of `GraphLayout` that depend on the bubbles."""
     lengths = np.array([len(b) for b in problem.bubbles], np.int64)
     first_row = np.r_[0, np.cumsum(lengths)].astype(np.int64)
     frames = [np.arange(b.first, b.last + 1) for b in problem.bubbles]

@@ -139,7 +139,7 @@ def constant_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
 
 
 def _known(graph: GraphLayout, state: State) -> list[LinearFactors]:
-    """What other parts of the run tell of the constants."""
+    """Yield the information of other pieces of the run about the constants."""
     values, base, out = constant_values(graph, state), graph.base(), list[LinearFactors]()
     for known in graph.problem.known:
         keys = tuple(np.array([getattr(base, family) + i]) for family, i in known.keys)
@@ -290,7 +290,7 @@ def _one_camera(
 def _by_calibration(
     graph: GraphLayout, camera: int, points: Array, position: Array, shake: Array
 ) -> Array:
-    """(M, 2, r) pixels by the unit directions of the calibration's uncertainty."""
+    """Return the derivative (M, 2, r) of pixels by the calibration's unit directions."""
     problem, share = graph.problem, graph.problem.calibration
     assert share is not None
     rig = points - position[:, None] * problem.axis - shake @ graph.shake.offset[camera].T
@@ -371,7 +371,7 @@ def sample_residuals(graph: GraphLayout, state: State) -> tuple[Array, ...]:
 
 
 def _acceleration_rows(graph: GraphLayout, state: State, index: int) -> tuple[Array, Array]:
-    """(3, D) rows that give the mount's acceleration and its jerk from a node's state."""
+    """Return rows (3, D) that give the mount's acceleration and jerk from a node's state."""
     layout, sensor = graph.shake, graph.problem.accelerometers[index]
     along = graph.problem.axis / (1 + state.encoder_scale(graph))
     rows = np.multiply.outer(along, layout.acceleration)
@@ -426,7 +426,7 @@ def _accelerometer(
 
 
 def _slope(sensor: Accelerometer) -> Array:
-    """(N, 3) change of the readings per second over a few ms, by which a delay changes them.
+    """Return the change (N, 3) of the readings per second, for their delay.
 
     Of the readings, not of the states: the states' jerk is as rough as the model's force, readings
     moved along it would be rougher than the force allows, and the priors would hold the delay

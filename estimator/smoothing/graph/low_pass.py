@@ -89,7 +89,7 @@ def _by_axis(along: Array, across: Array, up: Array) -> Inertia:
 
 
 def _pieces(graph: GraphLayout) -> list[Ints]:
-    """Rows of the graph, evenly over all bubbles and times."""
+    """Return rows of the graph, spread evenly over all bubbles and times."""
     cuts = [
         np.array_split(np.arange(a, b), -(-(b - a) // _PIECE_FRAMES))
         for a, b in pairwise(graph.first_row.tolist())

@@ -335,7 +335,7 @@ def _warm(graph: GraphLayout, state: State, start: Solution) -> State:
 
 
 def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
-    """Whether one pass is exact: affine cameras, no bilinear constants."""
+    """Return whether one pass is exact: affine cameras, no bilinear constants."""
     lens = slice(INDEX["kappa_per_mm"], INDEX["wall_x_rad"])
     flat = all(not np.any(c.intrinsics[lens]) for c in problem.cameras)
     held = (
@@ -359,7 +359,7 @@ class _Pass:
 def _linear_solve(
     graph: GraphLayout, state: State, weights: tuple[Array, Array], samples: SampleWeights
 ) -> _Pass:
-    """One Gauss-Newton pass."""
+    """Do one Gauss-Newton pass."""
     factors = all_factors(graph, state, weights, samples)
     done = eliminated(graph, factors)
     if not np.all(np.isfinite(done.vector)):
@@ -385,7 +385,7 @@ def _squared(graph: GraphLayout, factors: list[LinearFactors], vector: Array) ->
 
 
 def _log_norm(graph: GraphLayout, factors: list[LinearFactors]) -> float:
-    """log of the joint density's normalisation, the change to whitening bases included."""
+    """Return the log of the joint density's normalisation, including the change of bases."""
     shake, bubble = graph.shake_motion, graph.bubble_motion
     of_nodes = np.linalg.slogdet(shake.basis)[1][graph.node_basis]
     of_rows = np.linalg.slogdet(bubble.basis)[1][graph.row_basis]
@@ -393,7 +393,7 @@ def _log_norm(graph: GraphLayout, factors: list[LinearFactors]) -> float:
 
 
 def _largest_shift_px(graph: GraphLayout, vector: Array) -> float:
-    """How far bubbles moved in this pass, in pixels of the finest camera."""
+    """Return how far bubbles moved in this pass, in pixels of the finest camera."""
     layout, (nodes, size) = graph.bubble, graph.counts()[0]
     start = nodes * size
     states = vector[start : start + graph.rows * layout.size].reshape(-1, layout.size)

@@ -135,7 +135,7 @@ def considered(travel: Travel, model: ShakeModel) -> Array:
 
 
 def _variance(solution: Solution, along: Array) -> Array:
-    """(n, 3) variances of ``axis * along`` (n,)."""
+    """Return the variances (n, 3) of ``axis * along`` (n,)."""
     travel, stage = solution.graph.problem.travel, solution.graph.problem.stage
     if travel is None or stage is None:
         return np.zeros((len(along), 3))

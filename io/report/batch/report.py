@@ -115,7 +115,7 @@ def _colour(jobs: Sequence[Job]) -> str:
 
 
 def _words(jobs: Sequence[Job]) -> str:
-    """What the page says first: whether jobs failed, and what the verdicts are."""
+    """Return what the page says first: whether jobs failed, and what the verdicts are."""
     words = []
     if any(j["status"] != _DONE for j in jobs):
         words.append(

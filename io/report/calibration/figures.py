@@ -74,7 +74,7 @@ def _quiver(axes: Any, start: Array, arrow: Array, colour: str) -> Any:
 
 
 def _arrows(table: pd.DataFrame, size_px: tuple[int, int]) -> tuple[Array, Array, bool]:
-    """Start and residual of each arrow; means over cells when there are too many dots."""
+    """Return start and residual of each arrow; means over cells if there are too many dots."""
     start = table[["u_px", "v_px"]].to_numpy()
     arrow = table[["du_px", "dv_px"]].to_numpy()
     if len(table) <= MOST_ARROWS:
@@ -237,7 +237,7 @@ _MEASUREMENT = (
 
 
 def _plane(arrays: Mapping[str, Array], name: str) -> tuple[Array, Array, Array]:
-    """x and z (mm) of a grid in the plane of the optical axes, and standard deviations there."""
+    """Return x and z (mm) of a grid in the plane of the optical axes, and the sd there (µm)."""
     points = arrays["points_mm"]
     sd_um = 1e3 * np.sqrt(np.trace(arrays[name], axis1=-2, axis2=-1))
     level = np.abs(points[:, 1])
@@ -251,7 +251,7 @@ def _is_flat(grid: Array) -> bool:
 
 
 def _map(arrays: Mapping[str, Array], name: str, title: str, caption: str) -> Picture | None:
-    """None where it is the same everywhere, which the page says in words (`same_everywhere`)."""
+    """Draw a map; None for a uniform one, which `same_everywhere` states in words."""
     x, z, grid = _plane(arrays, name)
     if _is_flat(grid):
         return None
@@ -265,7 +265,7 @@ def _map(arrays: Mapping[str, Array], name: str, title: str, caption: str) -> Pi
 
 
 def same_everywhere(results: CalibrationResults) -> str:
-    """A sentence on the pixels' share where it has no picture; "" otherwise."""
+    """Return a sentence on a pixels' share that is uniform; "" if it has a picture."""
     arrays = results.uncertainty
     grid = _plane(arrays, _MEASUREMENT[0])[2] if arrays else np.zeros(0)
     if not grid.size or not _is_flat(grid):

@@ -95,7 +95,7 @@ def drawing(
 
 
 def svg(figure: Any) -> str:
-    """``figure`` as a data URI; the text stays text."""
+    """Return the figure as an SVG data URI with text as text."""
     stream = io.BytesIO()
     figure.savefig(stream, format="svg", metadata={"Date": None}, dpi=150)
     return data_uri("image/svg+xml", stream.getvalue())
@@ -118,7 +118,7 @@ def data_uri(kind: str, content: bytes) -> str:
 
 
 def image_axes(axes: Any, image_size_px: tuple[int, int]) -> None:
-    """Axes that are an image: u right, v down, pixel (0, 0) the centre of the top left pixel."""
+    """Set axes to an image's: u right, v down, pixel (0, 0) the centre of the top left pixel."""
     width, height = image_size_px
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="u / px", ylabel="v / px")
     axes.set_aspect("equal")
@@ -126,7 +126,7 @@ def image_axes(axes: Any, image_size_px: tuple[int, int]) -> None:
 
 
 def image_height_in(image_size_px: tuple[int, int], above_in: float = 0.0) -> float:
-    """Height of a figure that holds `image_axes`, with room ``above_in`` for a legend."""
+    """Return the height of a figure with `image_axes`, with room for a legend above."""
     width, height = image_size_px
     inside = (WIDTH_IN - LEFT_IN - RIGHT_IN) * height / width
     return float(min(7.0, BOTTOM_IN + 0.12 + inside)) + above_in
@@ -176,7 +176,7 @@ def draw_curves(sheet: Sheet, curves: Iterable[Curve]) -> None:
 
 
 def limits(*series: Array, beyond: float = 0.08) -> tuple[float, float] | None:
-    """What holds all finite values and a little more; None without any."""
+    """Return limits around all finite values, with a margin; None without values."""
     finite = np.concatenate([s[np.isfinite(s)] for s in series])
     if not len(finite):
         return None

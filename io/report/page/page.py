@@ -55,7 +55,7 @@ def render_page(template: str, context: Mapping[str, Any], scene: str) -> str:
 
 @cache
 def _environment() -> Environment:
-    """It keeps the templates that it compiled."""
+    """Return the Jinja environment, which keeps compiled templates."""
     from jinja2 import Environment, FunctionLoader
 
     loader = FunctionLoader(_package_file)
@@ -76,7 +76,7 @@ def glossary() -> dict[str, str]:
 
 @cache
 def plotly_javascript() -> str:
-    """The library's own JavaScript, from the installed package. Reading it imports no plotly."""
+    """Return plotly's JavaScript from the installed package, without importing plotly."""
     file = resources.files("plotly") / "package_data" / "plotly.min.js"
     return file.read_text(encoding="utf-8")
 
@@ -91,7 +91,7 @@ def prepare_page(template: str) -> None:
 
 
 def drawn_over_cores(drawings: Sequence[Callable[[], Any]]) -> list[Any]:
-    """What each drawing returns, in order."""
+    """Call all drawings on several cores; return their results in order."""
     prepare_drawing()
     return list(ordered_map(_call, drawings, quick_workers(len(drawings))))
 
@@ -147,7 +147,7 @@ def script_data(content: Any) -> str:
 
 
 def xyz(kind: str, points_mm: Array) -> Trace:
-    """Micrometre digits; NaN, which interrupts a line, is null in JSON."""
+    """Return a plotly trace of points (N, 3), rounded to µm; NaN interrupts a line."""
     columns = [[None if np.isnan(c) else round(float(c), 3) for c in axis] for axis in points_mm.T]
     return {"type": kind, **dict(zip("xyz", columns))}
 
@@ -159,7 +159,7 @@ def lines(points_mm: Array, colour: str, width: float) -> Trace:
 
 
 def _eye(up: Sequence[float], distance: float) -> list[float]:
-    """From above, off the two horizontal axes."""
+    """Return the position of the eye, above and beside the scene."""
     axis = int(np.argmax(np.abs(up)))
     eye = 0.8 * np.array(up, float)
     eye[[i for i in range(3) if i != axis]] += (0.85, -1.0)

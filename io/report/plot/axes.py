@@ -17,7 +17,7 @@ MUTED = "#8a8f98"
 
 
 def axes_of(axes: Any, **settings: Any) -> Any:
-    """The given axes, or new ones (``projection`` "3d" for three dimensions), with settings."""
+    """Return the given axes, or new ones, with settings; ``projection`` "3d" makes them 3-D."""
     if axes is None:
         import matplotlib.pyplot as plt
 
@@ -28,7 +28,7 @@ def axes_of(axes: Any, **settings: Any) -> Any:
 
 
 def columns_of(table: pd.DataFrame, *names: str, made_by: str) -> list[Array]:
-    """Columns of a table as numbers. Raises InputError for one that it does not have."""
+    """Return columns of a table as numbers. Raises InputError for a missing one."""
     out = []
     for name in names:
         if name not in getattr(table, "columns", ()):
@@ -39,7 +39,7 @@ def columns_of(table: pd.DataFrame, *names: str, made_by: str) -> list[Array]:
 
 
 def finite(*columns: Array) -> list[Array]:
-    """The rows in which all columns are finite. Raises InputError if there are none."""
+    """Return the rows in which all columns are finite. Raises InputError for none."""
     good = np.isfinite(np.stack(columns)).all(0)
     if not good.any():
         todo = "see `telerig.bubble_table`: some columns need [fluid] in rig.toml, or outlines"

@@ -145,7 +145,7 @@ def _grid(d_mm: Array) -> Array:
 
 
 def _laws(d: Array, liquid: Liquid) -> list[tuple[str, str, str, Array]]:
-    """(name, colour, line, velocities in m/s at diameters in m, NaN where the law does not hold).
+    """Return (name, colour, line style, velocities (m/s)) of laws at diameters d (m).
 
     The wave analogies hold where surface tension does not keep bubbles round.
     """

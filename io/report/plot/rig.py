@@ -113,7 +113,7 @@ def shake(
 
 
 def _of_camera(table: pd.DataFrame, camera: str) -> pd.DataFrame:
-    """The rows of a camera. Raises InputError when there are none."""
+    """Return the rows of a camera. Raises InputError if there are none."""
     if "camera" not in table:
         raise InputError(
             "the table has no column camera", where="telerig.plot", todo=f"give {_RESIDUALS}"
@@ -128,7 +128,7 @@ def _of_camera(table: pd.DataFrame, camera: str) -> pd.DataFrame:
 
 
 def _image(axes: Any) -> Any:
-    """Axes of an image: u right, v down."""
+    """Set axes to an image's: u right, v down."""
     axes.set(xlabel="u / px", ylabel="v / px", aspect="equal")
     if not axes.yaxis_inverted():
         axes.invert_yaxis()

@@ -15,7 +15,7 @@ _FINITE_SHARE = 0.7
 
 
 def velocity_density(trajectories: pd.DataFrame, kind: str = "") -> tuple[Array, Array]:
-    """Frequencies (F,) in Hz and mean density (F, 3) of the longest tracks, in (mm/s)^2/Hz.
+    """Return frequencies (F,) in Hz and mean densities (F, 3) of the longest tracks.
 
     kind : "", "naive_" or "rts_". Raises InputError when no track is long enough.
     """
@@ -43,12 +43,12 @@ def velocity_density(trajectories: pd.DataFrame, kind: str = "") -> tuple[Array,
 
 
 def segment(frames: int) -> int:
-    """Frames of a segment of Welch's estimate: about five of them, half overlapping."""
+    """Return the frames per segment of Welch's estimate: about five, half overlapping."""
     return min(frames, _LONGEST_SEGMENT, max(64, frames // 3))
 
 
 def welch_density(t_s: Array, values: Array, length: int) -> tuple[Array, Array]:
-    """Frequencies (F,) and one-sided densities (F, K) of columns (N, K) without a straight line."""
+    """Return frequencies (F,) and one-sided densities (F, K) of detrended columns (N, K)."""
     from scipy.signal import detrend, welch
 
     even, rate_hz = evenly(t_s, values)
@@ -58,7 +58,7 @@ def welch_density(t_s: Array, values: Array, length: int) -> tuple[Array, Array]
 
 
 def evenly(t_s: Array, values: Array) -> tuple[Array, float]:
-    """Columns of (N, K) at even times, straight lines over what is missing; and the rate in Hz."""
+    """Return columns (N, K) interpolated to even times, and the rate in Hz."""
     step = float(np.median(np.diff(t_s)))
     count = min(round((t_s[-1] - t_s[0]) / step) + 1, 4 * len(t_s))
     wanted = np.linspace(t_s[0], t_s[-1], count)

@@ -101,7 +101,7 @@ def render(
 
 
 def _in_space(results: TrackResults, smoothing: SmoothingResults | None) -> TrackResults:
-    """What the scene shows: smoothed paths in the lab if there are any, else the tracks."""
+    """Return what the scene shows: smoothed paths in the laboratory, or else the tracks."""
     if smoothing is None or not len(smoothing.trajectories):
         return results
     return replace(results, tracks=smoothing.trajectories)
@@ -133,7 +133,7 @@ def _words(results: TrackResults) -> dict[str, Any]:
 
 
 def _rows(content: Mapping[str, Any], file: str) -> list[tuple[str, str]]:
-    """A run of many images has a hash for each of them."""
+    """Return the leaves of a mapping as rows, cut after `_MOST_ROWS`."""
     rows = list(flat_rows(content))
     more = len(rows) - _MOST_ROWS
     return rows if more <= 0 else [*rows[:_MOST_ROWS], ("and", f"{more} more in {file}")]

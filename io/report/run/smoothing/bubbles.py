@@ -23,7 +23,7 @@ _NO_LIQUID = (
 
 
 def size_picture(results: SmoothingResults) -> Picture | None:
-    """Distribution of the diameters by number and by volume."""
+    """Draw the distribution of the diameters by number and by volume."""
     d = column(results.bubble_summary, "d_eq_mm")
     if np.isfinite(d).sum() < 2:
         return None
@@ -40,7 +40,7 @@ def size_picture(results: SmoothingResults) -> Picture | None:
 
 
 def velocity_picture(results: SmoothingResults) -> Picture | None:
-    """Mean velocity against diameter, beside published laws."""
+    """Draw mean velocity against diameter, beside published laws."""
     d = column(results.bubble_summary, "d_eq_mm")
     if not (np.isfinite(d) & np.isfinite(column(results.bubble_summary, "slip_mm_s"))).any():
         return None
@@ -56,7 +56,7 @@ def velocity_picture(results: SmoothingResults) -> Picture | None:
 
 
 def drag_picture(results: SmoothingResults) -> Picture | None:
-    """Drag coefficient against Reynolds number."""
+    """Draw the drag coefficient against the Reynolds number."""
     if not np.isfinite(column(results.bubble_summary, "drag")).any():
         return None
     with drawing(3.4) as sheet:
@@ -71,7 +71,7 @@ def drag_picture(results: SmoothingResults) -> Picture | None:
 
 
 def aspect_picture(results: SmoothingResults) -> Picture | None:
-    """Aspect ratio of the longest tracks against time."""
+    """Draw the aspect ratio of the longest tracks against time."""
     frames, curves = results.bubble_frames, []
     for particle in results.bubbles[:_MOST_LINES]:
         mine = frames[frames["particle"] == particle]
@@ -88,7 +88,7 @@ def aspect_picture(results: SmoothingResults) -> Picture | None:
 
 
 def _shape(results: SmoothingResults) -> str:
-    """What the two views tell of the spheroid as a model."""
+    """Return a sentence on how well the spheroid describes the outlines."""
     known = results.file.bodies
     if not known.get("pairs"):
         return "Their outlines are too few to test the spheroid."
@@ -104,7 +104,7 @@ BUBBLE_PICTURES = (size_picture, velocity_picture, drag_picture, aspect_picture)
 
 
 def _legend_below(sheet: Any) -> None:
-    """A legend of two columns below the axes, which give it room."""
+    """Put a legend of two columns below the axes, which are made smaller."""
     handles, labels = sheet.axes.get_legend_handles_labels()
     rows = -(-len(labels) // 2)
     height = sheet.figure.get_figheight()
@@ -116,7 +116,7 @@ def _legend_below(sheet: Any) -> None:
 
 
 def swarm_figures(results: SmoothingResults) -> list[Figure]:
-    """Numbers per volume of liquid, corrected for bubbles that the border cuts."""
+    """Return numbers per volume of liquid, corrected for bubbles cut by the border."""
     swarm = results.file.swarm
 
     def value(name: str, factor: float = 1.0) -> str:
@@ -144,7 +144,7 @@ _COLUMNS = (
 
 
 def summary_rows(results: SmoothingResults) -> tuple[list[str], list[Row]]:
-    """Heads and rows of the longest tracks' means; columns that no bubble fills are left out."""
+    """Return heads and rows of the longest tracks' means, without empty columns."""
     table = results.bubble_summary.sort_values("frames", ascending=False).head(MOST_ROWS)
     used = [name for name in _COLUMNS if np.isfinite(column(table, name)).any()]
     heads = HEADS[:2] + [HEADS[2 + _COLUMNS.index(name)] for name in used]
@@ -161,7 +161,7 @@ def summary_rows(results: SmoothingResults) -> tuple[list[str], list[Row]]:
 
 
 def bubble_words(results: SmoothingResults) -> str:
-    """What the table holds and what it lacks."""
+    """Return sentences on what the table contains and what is missing."""
     words = (
         "Value ± one standard deviation, over the bubble's frames. All of this, frame by frame, is "
         "in bubbles.csv, and per bubble in bubble_summary.csv."

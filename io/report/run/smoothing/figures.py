@@ -45,7 +45,7 @@ PLACES = ("bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")
 
 
 def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[], Any]]]:
-    """(section, drawing); a drawing gives a `Picture`, or None where there is nothing to see."""
+    """Return (section, function); the function returns a `Picture`, or None without data."""
     axes = range(3)
     bubbles = axes if len(results.trajectories) else range(0)
     drawings: list[tuple[str, Callable[[], Any]]] = [
@@ -76,7 +76,7 @@ _BANDS = "Bands are ± 2 sd."
 
 
 def places(results: SmoothingResults, axis: int) -> Picture:
-    """One lab coordinate of every bubble; up is up. Naive and RTS beneath where bubbles are few."""
+    """Draw one laboratory coordinate of all bubbles, beside naive and RTS for few bubbles."""
     shown = results.bubbles[:_MOST_BUBBLES]
     name, curves = PLACE.format(AXES[axis]), []
     for particle in shown:
@@ -101,7 +101,7 @@ def places(results: SmoothingResults, axis: int) -> Picture:
 
 
 def closer(results: SmoothingResults, axis: int) -> Picture:
-    """Some frames of the longest track's middle without their straight line."""
+    """Draw some frames from the middle of the longest track, detrended."""
     table, _ = detail(results)
     first = max(0, (len(table) - _CLOSE) // 2)
     table = table.iloc[first : first + _CLOSE]
@@ -124,7 +124,7 @@ def closer(results: SmoothingResults, axis: int) -> Picture:
 
 
 def taken_off(results: SmoothingResults, axis: int) -> Picture:
-    """Naive and RTS minus smoothed, against the smoothed band."""
+    """Draw naive and RTS minus smoothed, against the band of the smoothed path."""
     table, where = detail(results)
     name = PLACE.format(AXES[axis])
     t, smooth = table["t_s"].to_numpy(float), column(table, name)
@@ -143,7 +143,7 @@ def taken_off(results: SmoothingResults, axis: int) -> Picture:
 
 
 def velocities(results: SmoothingResults, axis: int) -> Picture:
-    """The longest track's velocity: smoothed with its band, naive, RTS."""
+    """Draw the longest track's velocity: smoothed with its band, naive, RTS."""
     table, where = detail(results)
     name = SPEED.format(AXES[axis])
     smooth, naive, rts = (column(table, kind + name) for kind in ("", "naive_", "rts_"))
@@ -159,7 +159,7 @@ def velocities(results: SmoothingResults, axis: int) -> Picture:
 
 
 def detail(results: SmoothingResults) -> tuple[pd.DataFrame, str]:
-    """The longest track, its middle where it is very long; and which that is, in words."""
+    """Return the longest track, cut to its middle if very long, and which it is in words."""
     particle = results.bubbles[0]
     table, cut = _middle(results.track(particle), "its middle")
     longest = ", the longest track" if len(results.bubbles) > 1 else ""
@@ -167,7 +167,7 @@ def detail(results: SmoothingResults) -> tuple[pd.DataFrame, str]:
 
 
 def _middle(table: pd.DataFrame, of: str) -> tuple[pd.DataFrame, str]:
-    """At most `_WINDOW` rows of the middle; a sentence on it, "" where that is the whole table."""
+    """Return at most `_WINDOW` rows from the middle, and a sentence on it if cut."""
     if len(table) <= _WINDOW:
         return table, ""
     first = (len(table) - _WINDOW) // 2
@@ -175,7 +175,7 @@ def _middle(table: pd.DataFrame, of: str) -> tuple[pd.DataFrame, str]:
 
 
 def _three(t: Array, smooth: Array, naive: Array, rts: Array, sd: Array) -> list[Curve]:
-    """Smoothed on top of naive and RTS."""
+    """Return three curves, smoothed on top of naive and RTS."""
     return [
         Curve(t, naive, NAIVE, "naive", style={"linewidth": 0.7}),
         Curve(t, rts, RTS, "RTS"),
@@ -210,7 +210,7 @@ def _in_time(
 
 
 def _upside_down(results: SmoothingResults, axis: int) -> str:
-    """What to say where the axis points down; "" elsewhere."""
+    """Return a remark for an axis that points down, which is drawn reversed; else ""."""
     return "The axis is turned round, so that up is up. " if results.up[axis] < -0.5 else ""
 
 
@@ -236,7 +236,7 @@ _MOST_DB = 99.0
 
 
 def shake_in_time(results: SmoothingResults, camera: str, axis: str) -> Picture:
-    """A camera's offset from where the encoder has it, with its band."""
+    """Draw a camera's shake with its band."""
     table, note = _middle(results.shake, "the run's middle")
     t = table["t_s"].to_numpy(float)
     value = 1e3 * column(table, f"{camera}_{axis}_mm")
@@ -262,7 +262,7 @@ def shake_in_time(results: SmoothingResults, camera: str, axis: str) -> Picture:
 
 
 def velocity_before_and_after(results: SmoothingResults, axis: int) -> Picture | None:
-    """Spectrum of the bubbles' velocity: naive, RTS, smoothed."""
+    """Draw the spectrum of the bubbles' velocity: naive, RTS, smoothed."""
     kinds = (("naive_", NAIVE, "naive"), ("rts_", RTS, "RTS"), ("", SMOOTHED, "smoothed"))
     found = {
         label: (spectrum, colour)
@@ -297,7 +297,7 @@ def _resolution(spectrum: Spectrum) -> str:
 
 
 def shake_spectra(results: SmoothingResults, camera: str) -> Picture | None:
-    """Spectrum of a camera's shake on the axes that it sees."""
+    """Draw the spectrum of a camera's shake on the axes that it sees."""
     spectrum = shake_spectrum(results, camera)
     seen = results.seen(camera)
     if spectrum is None or not seen:
@@ -319,7 +319,7 @@ _THICK = {"linewidth": 1.1}
 def _spectra(
     title: str, label: str, curves: Sequence[Curve], caption: str, marked_hz: Sequence[float] = ()
 ) -> Picture:
-    """Power densities on axes of powers of ten, dotted lines at the frequencies ``marked_hz``."""
+    """Draw densities on logarithmic axes, with dotted lines at ``marked_hz``."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     values = np.concatenate([curve.y for curve in curves])
@@ -344,7 +344,7 @@ def _spectra(
 
 
 def _modes_hz(results: SmoothingResults) -> list[float]:
-    """Frequencies of the model's modes."""
+    """Return the frequencies of the model's modes."""
     return [float(mode["frequency_hz"]) for mode in results.part("model").get("modes") or []]
 
 
@@ -352,7 +352,7 @@ _LITTLE = 0.5
 
 
 def autocorrelation(results: SmoothingResults) -> Picture:
-    """Of the bubbles' pixels, against the lag in frames, by camera, beside the model's."""
+    """Draw the autocorrelation of the bubbles' pixels by camera, beside the model's."""
     known = known_parts(results, "whiteness", "expected")
     curves = []
     for camera, found in known.items():
@@ -378,7 +378,7 @@ def autocorrelation(results: SmoothingResults) -> Picture:
 
 
 def accelerometer_before_and_after(results: SmoothingResults, sensor: str) -> Picture | None:
-    """A sensor's readings, what the model leaves of them, and its stated noise."""
+    """Draw spectra of a sensor's readings, of the residuals and of its stated noise."""
     found = known_parts(results, "accelerometer_spectra", "frequency_hz").get(sensor)
     if found is None:
         return None

@@ -66,7 +66,7 @@ class SmoothingResults:
         return self.file.content()
 
     def part(self, name: str) -> Mapping[str, Any]:
-        """An object of smoothing.json, empty where it is not there."""
+        """Return an object of smoothing.json; {} if it is missing."""
         return dict(self.content.get(name) or {})
 
     @property
@@ -77,7 +77,7 @@ class SmoothingResults:
         return tuple(int(k) for k in lengths.index.to_numpy()[order])
 
     def track(self, particle: int) -> pd.DataFrame:
-        """One bubble's rows."""
+        """Return the rows of one bubble."""
         table: pd.DataFrame = self.trajectories.loc[self.trajectories["particle"] == particle]
         return table
 
@@ -88,12 +88,12 @@ class SmoothingResults:
         return float(1 / np.median(steps)) if len(steps) else None
 
     def depth(self, camera: str) -> Array | None:
-        """(3,) direction in rig axes along which the camera sees nothing, if the file tells."""
+        """Return the direction (3,) along which a camera sees nothing; None if not stated."""
         found = self.file.depth_axes.get(camera)
         return None if found is None else np.asarray(found / np.linalg.norm(found))
 
     def unseen(self, camera: str) -> tuple[str, ...]:
-        """Axes along the camera's depth: its shake there is the prior's, not a measurement."""
+        """Return the axes along a camera's depth, where its shake is not measured."""
         depth = self.depth(camera)
         if depth is not None:
             return tuple(axis for axis, d in zip(AXES, depth) if abs(d) > _ALONG)
@@ -163,14 +163,14 @@ class Spectrum:
 
 
 def column(table: pd.DataFrame, name: str) -> Array:
-    """The column's values, NaN where the file has none."""
+    """Return a column's values; NaN if the file has none."""
     if name not in table:
         return np.full(len(table), np.nan)
     return table[name].to_numpy(float)
 
 
 def known_parts(results: SmoothingResults, part: str, needed: str) -> dict[str, Mapping[str, Any]]:
-    """The objects of a part of smoothing.json that hold what is needed, by name."""
+    """Return the objects in a part of smoothing.json that have the needed key, by name."""
     return {
         str(name): found
         for name, found in results.part(part).items()
@@ -179,14 +179,14 @@ def known_parts(results: SmoothingResults, part: str, needed: str) -> dict[str, 
 
 
 def axis_sd(results: SmoothingResults, pattern: str = PLACE) -> list[float | None]:
-    """Median sd of the bubbles per axis, in mm or mm/s; None where it is not known."""
+    """Return the median sd of the bubbles by axis, in mm or mm/s; None if it is not known."""
     return [median(column(results.trajectories, "s" + pattern.format(axis))) for axis in AXES]
 
 
 def taken_away(
     results: SmoothingResults, kind: str = "naive_", pattern: str = PLACE
 ) -> list[float | None]:
-    """RMS of a baseline minus smoothed per axis, in mm or mm/s."""
+    """Return the RMS of a baseline minus smoothed by axis, in mm or mm/s."""
     table = results.trajectories
     return [
         rms(column(table, kind + pattern.format(a)) - column(table, pattern.format(a)))
@@ -195,7 +195,7 @@ def taken_away(
 
 
 def shake_rms_um(results: SmoothingResults, camera: str, axis: str) -> float | None:
-    """Of the estimate about its mean; None where the camera does not see it."""
+    """Return the RMS of a camera's shake about its mean; None along an axis it does not see."""
     if axis in results.unseen(camera) or not len(results.shake):
         return None
     return float(1e3 * np.std(column(results.shake, f"{camera}_{axis}_mm")))
@@ -214,7 +214,7 @@ def velocity_spectrum(results: SmoothingResults, kind: str = "") -> Spectrum | N
 
 
 def shake_spectrum(results: SmoothingResults, camera: str) -> Spectrum | None:
-    """Density of a camera's shake per axis, µm²/Hz. None for a short run."""
+    """Return the spectral density of a camera's shake by axis, µm²/Hz; None for a short run."""
     values = 1e3 * np.stack([column(results.shake, f"{camera}_{axis}_mm") for axis in AXES], 1)
     if len(values) < LEAST_FRAMES:
         return None

@@ -52,7 +52,7 @@ from telerig.short_text import (
 
 
 def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str, Any]:
-    """What template_smoothing.html calls ``smoothing``."""
+    """Return the variable ``smoothing`` of template_smoothing.html."""
     verdict = smoothing_verdict(results, tracks)
     return {
         "verdict": verdict,
@@ -99,7 +99,7 @@ _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 
 
 def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headline:
-    """What the smoother says of itself, with the remedy where there is one to take."""
+    """Return the verdict of the smoothing, with a remedy if there is one."""
     file = results.file
     (headline, meaning, _), colour = NOT_JUDGED, "usable"
     if file.verdict is not None:
@@ -139,7 +139,7 @@ def _stale(results: SmoothingResults, tracks: TrackResults) -> list[str]:
 
 
 def smoothing_figures(results: SmoothingResults) -> list[Figure]:
-    """What a reader wants first."""
+    """Return the most important numbers."""
     place, speed = axis_sd(results), axis_sd(results, SPEED)
     away, away_speed = taken_away(results), taken_away(results, pattern=SPEED)
     shake = {
@@ -168,7 +168,7 @@ def _largest(values: list[float | None], factor: float = 1.0) -> str:
 
 
 def use_rows(results: SmoothingResults) -> list[Row]:
-    """What the run is good for: grade, quantity, axis, value with its sd, what it rests on."""
+    """Return rows of what the run is usable for: grade, quantity, axis, value, assumptions."""
     return [
         Row(
             (
@@ -185,7 +185,7 @@ def use_rows(results: SmoothingResults) -> list[Row]:
 
 
 def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
-    """Heads, a column per rig axis, and rows: what was judged, then what the tables hold."""
+    """Return heads, a column per axis of the rig, and rows: the verdict and statistics."""
     judged = {name: axis.content() for name, axis in results.file.axes.items()}
     keys = [
         key for key in dict.fromkeys(k for one in judged.values() for k in one)
@@ -236,7 +236,7 @@ def _scaled(value: Any, factor: float = 1.0) -> str:
 
 
 def swap_rows(results: SmoothingResults) -> list[Row]:
-    """Lines whose owner could be another: Hz, axes, RMS, what the other reading costs, owner."""
+    """Return rows of spectral lines with their owner and how certain it is."""
     alike: dict[tuple[str, str, str], list[tuple[str, AttributedLine]]] = {}
     for axis, judged in results.file.axes.items():
         for line in judged.lines:
@@ -263,7 +263,7 @@ def _swap_row(hz: str, owner: str, identified: str, lines: list[tuple[str, Attri
 
 
 def residual_rows(results: SmoothingResults) -> list[Row]:
-    """Pixels of bubbles and references: how many, outliers, residuals in sigmas."""
+    """Return rows of pixel residuals of bubbles and marks: number, outliers, RMS."""
     return [
         Row(
             (
@@ -300,7 +300,7 @@ def unseen_words(results: SmoothingResults) -> list[str]:
 
 
 def residual_words(results: SmoothingResults) -> str:
-    """What the sigmas mean, and what was done about them."""
+    """Return sentences on what residuals in sigmas mean."""
     text = (
         "A residual is a pixel as it was measured minus the pixel that the smoothed motion "
         "predicts, in sigmas of what was stated for it. Where the stated noise is right these are "
@@ -320,7 +320,7 @@ _PITCH = "stiffen the arm against twisting; camera's weight on the arm's axis"
 
 
 def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
-    """The shake's modes with the remedies of smoothing.json, and where the modes come from."""
+    """Return rows of the shake's modes with remedies, and a sentence on their origin."""
     modes = results.file.modes
     rows = [_mode(mode, results.cameras) for mode in _merged(modes)]
     rows += [_pitch(m, results.cameras) for m in results.part("model").get("pitches") or []]
@@ -336,7 +336,7 @@ def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
 
 
 def _merged(modes: Sequence[Mode]) -> list[Mode]:
-    """A mode that is learned axis by axis as one, with the RMS of all of its axes."""
+    """Return modes, those that were learned axis by axis as one with all axes."""
     found: dict[tuple[str, float], Mode] = {}
     for mode in modes:
         key = (mode.where, mode.frequency_hz)
@@ -364,7 +364,7 @@ def _place(camera: Any, cameras: Sequence[str]) -> str:
 
 
 def _rms_um(rms_mm: Any) -> str:
-    """Of one axis or three."""
+    """Return the RMS of one axis or of three as text."""
     if is_number(rms_mm):
         return number(1e3 * rms_mm, 3)
     if not isinstance(rms_mm, tuple):
@@ -382,7 +382,7 @@ def _pitch(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
 
 
 def constant_rows(results: SmoothingResults) -> list[Row]:
-    """Constants of encoder and accelerometers: sensor, what, value with its sd."""
+    """Return rows of the sensors' constants: sensor, constant, value with sd."""
     parts = {"encoder": results.part("encoder")} | dict(results.part("accelerometers"))
     return [
         Row((str(sensor), *named))
@@ -393,7 +393,7 @@ def constant_rows(results: SmoothingResults) -> list[Row]:
 
 
 def mean_rows(results: SmoothingResults) -> list[Row]:
-    """Mean velocities of the bubbles: the first rows."""
+    """Return rows of the first bubbles' mean velocities."""
     rows = []
     for particle, values in results.part("bubble_means").items():
         if isinstance(values, Mapping):
@@ -423,20 +423,20 @@ _SOURCES = {
 
 
 def model_rows(results: SmoothingResults) -> list[tuple[str, str]]:
-    """Every hyper-parameter by its name in `smoothing.json`."""
+    """Return rows of all hyper-parameters by their names in smoothing.json."""
     model = {k: v for k, v in results.part("model").items() if k != "name"}
     rows = [(name, value) for name, value in flat_rows(model) if value]
     return [(name_with_unit(name)[0], _owner(name, value, results.cameras)) for name, value in rows]
 
 
 def model_words(results: SmoothingResults) -> str:
-    """Where the hyper-parameters come from."""
+    """Return a sentence on the origin of the hyper-parameters."""
     source = str(results.part("model").get("name") or ABSENT)
     return f"{source}: {_SOURCES[source]}" if source in _SOURCES else source
 
 
 def _owner(name: str, value: str, cameras: Sequence[str]) -> str:
-    """Numbers with the digits that matter; a camera's index as its name."""
+    """Return numbers with significant digits, and a camera's index as its name."""
     if name.endswith(".camera"):
         known = value.isdigit() and int(value) < len(cameras)
         return cameras[int(value)] if known else "all alike" if value == "-1" else value
@@ -451,7 +451,7 @@ _LARGER, _SMALLER = 1.25, 0.8
 
 
 def whiteness_rows(results: SmoothingResults) -> list[Row]:
-    """By camera: the verdict, next frame's correlation and RMS beside the model's, a test."""
+    """Return rows by camera: verdict, correlation and RMS beside the model's, p-value."""
     rows = []
     for camera, found in known_parts(results, "whiteness", "expected").items():
         rho, expected = (np.array(found[key], float) for key in ("autocorrelation", "expected"))
@@ -470,7 +470,7 @@ def _beside(seen: Any, expected: Any) -> str:
 
 
 def whiteness_words(results: SmoothingResults) -> str:
-    """What larger, smaller or otherwise correlated residuals mean."""
+    """Return sentences on what too large, small or correlated residuals mean."""
     known = known_parts(results, "whiteness", "expected").values()
     if not known:
         return (

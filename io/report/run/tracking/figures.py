@@ -36,7 +36,7 @@ _BINS = 40
 
 
 def time_series(results: TrackResults, axis: int) -> Picture:
-    """One rig coordinate of every track against time; up is up."""
+    """Draw one rig coordinate of every track against time, reversed if it points down."""
     table = thinned(results.tracks, _MOST_POINTS)
     name, upwards = "xyz"[axis], float(results.up[axis])
     with drawing(2.6, grid=True, xlabel="t / s", ylabel=f"{name} / mm") as sheet:
@@ -84,7 +84,7 @@ def bubbles_in_time(results: TrackResults) -> Picture:
 
 
 def sizes(results: TrackResults) -> Picture:
-    """Histogram of the equivalent diameters, all points and one value per track."""
+    """Draw the histogram of the equivalent diameters, of all points and of the tracks."""
     by_track = results.tracks.groupby("particle")["d_eq_mm"]
     values = results.tracks["d_eq_mm"].to_numpy(float)
     with drawing(2.6, xlabel="equivalent diameter / mm", ylabel="points") as sheet:
@@ -109,7 +109,7 @@ def sizes(results: TrackResults) -> Picture:
 
 
 def predicted_sd(results: TrackResults) -> Picture:
-    """Histogram of the predicted standard deviations on the three axes."""
+    """Draw the histogram of the predicted standard deviations along the three axes."""
     sd = results.sd_um
     edges = _edges(sd.ravel(), high=0.99)
     settings: dict[str, Any] = {"xlabel": "sd of the position / µm", "ylabel": "points"}
@@ -127,7 +127,7 @@ def predicted_sd(results: TrackResults) -> Picture:
 
 
 def confidence(results: TrackResults) -> Picture:
-    """Histogram of the probability that the two outlines are of one bubble."""
+    """Draw the histogram of the probability that two outlines belong to one bubble."""
     values = results.tracks["confidence"].to_numpy(float)
     settings: dict[str, Any] = {
         "xlabel": "confidence of the pair",
@@ -148,7 +148,7 @@ def confidence(results: TrackResults) -> Picture:
 
 
 def _edges(values: Array, high: float = 1.0) -> Array:
-    """From 0 or just below the least value, to the quantile ``high`` with some room."""
+    """Return bin edges from 0 or the least value to the quantile ``high``, with a margin."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return np.linspace(0, 1, _BINS + 1)
@@ -164,7 +164,7 @@ def _bars(axes: Any, values: Array, edges: Array, colour: str, label: str, *, fi
 
 
 def marks_followed(results: TrackResults, camera: int) -> Picture:
-    """Where each mark is in the images of one camera that sees some, frame by frame."""
+    """Draw the positions of all marks in one camera's images against the frame."""
     name = results.cameras[camera]
     table = results.references[results.references["camera"] == name]
     along = max(("u_px", "v_px"), key=lambda c: float(np.ptp(table[c])))
@@ -206,7 +206,7 @@ _CELLS = 16
 
 
 def ray_miss_histogram(results: TrackResults) -> Picture:
-    """Signed ray miss against the distribution that each pair's own noise predicts."""
+    """Draw the histogram of the ray miss beside the one that the noise predicts."""
     miss = 1e3 * results.tracks["ray_miss_mm"].to_numpy(float)
     sd, learnt = _predicted_um(results), 1e3 * (learnt_sd_mm(results) or 0.0)
     known = miss[np.isfinite(miss)]
@@ -252,13 +252,13 @@ def _predicted_um(results: TrackResults) -> Array | None:
 
 
 def _reach(known: Array, sd: Array | None) -> float:
-    """Half the width of the plot: all but the wildest hundredth, at least four predicted sd."""
+    """Return half the width of a plot: 99 % of the values, at least four predicted sd."""
     wide = 1.3 * float(np.quantile(np.abs(known), 0.99)) if len(known) else 1.0
     return max(wide, 4 * float(np.median(sd)) if sd is not None else 0.0, 1e-6)
 
 
 def _mixture(edges: Array, sd: Array) -> tuple[Array, Array]:
-    """Mean density of normal distributions of these widths."""
+    """Return the mean density of normal distributions with these widths."""
     x = np.linspace(edges[0], edges[-1], 161)
     some = np.quantile(sd, np.linspace(0.005, 0.995, 100))
     density = np.exp(-0.5 * (x[:, None] / some) ** 2) / (np.sqrt(2 * np.pi) * some)
@@ -350,6 +350,6 @@ def seen_where(results: TrackResults, index: int) -> Picture:
 
 
 def shared_pictures(results: TrackResults) -> list[Any]:
-    """Height first, because a wrong angle or scale between the cameras shows there."""
+    """Return (direction, name), the height first: it shows a wrong angle or scale best."""
     across = [i for i in range(3) if abs(results.up[i]) < 0.5]
     return [(results.up, "height"), *((np.eye(3)[i], "xyz"[i]) for i in across)]

@@ -86,7 +86,7 @@ class TrackResults:
         return 1e3 * np.sqrt(np.where(variances >= 0, variances, np.nan))
 
     def marked(self, camera: int) -> bool:
-        """Whether marks fixed to the tank were followed in a camera's images."""
+        """Return whether marks were followed in a camera's images."""
         return bool((self.references["camera"] == self.cameras[camera]).any())
 
     @property
@@ -94,7 +94,7 @@ class TrackResults:
         return self.file.pairs or Pairs()
 
     def image_size_px(self, camera: str) -> tuple[int, int] | None:
-        """From tracking.json, if it tells."""
+        """Return a camera's image size; None if tracking.json does not state it."""
         return self.file.image_size_px.get(camera)
 
 
@@ -166,7 +166,7 @@ def unit_vector(vector: ArrayLike) -> Array:
 
 
 def binary_column(camera: str) -> str:
-    """Name of the contact sheet's column that holds a camera's binary pictures."""
+    """Return the name of the contact sheet's column with a camera's binary pictures."""
     return f"{camera}, binary"
 
 
@@ -196,7 +196,7 @@ def ray_miss_sd_mm(results: TrackResults) -> Array | None:
 
 
 def learnt_sd_mm(results: TrackResults) -> float | None:
-    """What pairs were found to scatter besides: shake of the cameras against each other, shapes.
+    """Return the sd of ray misses beyond the outlines' noise, by shake and shapes.
 
     From ``frame_px`` and ``scatter_px`` of tracking.json; None where that is not known.
     """
@@ -209,7 +209,7 @@ def learnt_sd_mm(results: TrackResults) -> float | None:
 
 
 def _mm_per_px(results: TrackResults) -> Array | None:
-    """(2, 2) by camera, what one px of u and of v moves a ray along the common perpendicular."""
+    """Return by camera what one px of u and v moves a ray along the common perpendicular."""
     maps = [_affine(results, camera) for camera in results.cameras]
     known = [m for m in maps if m is not None]
     if len(known) != 2:
@@ -223,7 +223,7 @@ def _mm_per_px(results: TrackResults) -> Array | None:
 
 
 def _affine(results: TrackResults, camera: str) -> Array | None:
-    """(2, 3) px per mm, or None where the points do not tell."""
+    """Return an affine camera (2, 3) px per mm; None if the points do not determine it."""
     uv = results.tracks[[f"{camera}_u_px", f"{camera}_v_px"]].to_numpy(float)
     both = np.c_[results.points_mm, uv]
     both = both[np.isfinite(both).all(axis=1)]
@@ -252,19 +252,19 @@ def ray_miss_ratio(
 
 
 def median(values: Array) -> float | None:
-    """None where no value is finite."""
+    """Return the median of the finite values; None without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else None
 
 
 def rms(values: Array) -> float | None:
-    """None where no value is finite."""
+    """Return the RMS of the finite values; None without any."""
     finite = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
 
 
 def frame_count(results: TrackResults) -> int:
-    """Of the run, else up to the last frame with a bubble."""
+    """Return the number of frames of the run, or up to the last one with a bubble."""
     tables = (results.tracks, results.detections)
     seen = max((int(t["frame"].max()) + 1 for t in tables if len(t)), default=0)
     return max(results.file.frames or 0, seen)
@@ -282,7 +282,7 @@ def per_frame(results: TrackResults) -> dict[str, Ints]:
 
 
 def track_lengths(results: TrackResults) -> Ints:
-    """(K,) points of each track."""
+    """Return the number of points (K,) of each track."""
     return np.asarray(results.tracks["particle"].value_counts().to_numpy(np.int64))
 
 
@@ -290,7 +290,7 @@ _AGREE_MM, _NEAR_MM = 1e-4, 0.02
 
 
 def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Camera] | None, str]:
-    """The two cameras, or None and the reason in words.
+    """Return the two cameras, or None and the reason in words.
 
     calibration.json is looked for in the run's results folder and in `calibration/` beside it.
     It counts only if the rays of the pixels in tracks.csv meet where that table says, so another
@@ -321,7 +321,7 @@ def pair_pixels(results: TrackResults, rows: Ints) -> list[Array]:
 
 
 def paired_rows(results: TrackResults) -> Ints:
-    """Rows of tracks.csv that both cameras measured."""
+    """Return the rows of tracks.csv that both cameras measured."""
     every = np.arange(len(results.tracks))
     good = np.isfinite(results.tracks["ray_miss_mm"].to_numpy(float))
     for uv in pair_pixels(results, every):
@@ -330,7 +330,7 @@ def paired_rows(results: TrackResults) -> Ints:
 
 
 def _agree(results: TrackResults, cameras: tuple[Camera, Camera]) -> bool:
-    """Whether the rays miss each other as tracks.csv says, and meet where it says."""
+    """Return whether the rays' distances and points agree with tracks.csv."""
     rows = paired_rows(results)
     if not len(rows):
         return True

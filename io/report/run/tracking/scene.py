@@ -24,12 +24,12 @@ _WIDENING, _WIDEST, _FLATTEST = (1, 2, 5, 10, 20), 0.5, 0.02
 
 
 def track_colour(particle: int) -> str:
-    """The same in every picture of a report."""
+    """Return a track's colour, the same in all pictures of a report."""
     return TRACK_COLOURS[particle % len(TRACK_COLOURS)]
 
 
 def thinned(tracks: pd.DataFrame, most: int) -> pd.DataFrame:
-    """At most about ``most`` rows, sorted by bubble and frame; the ends of each track stay.
+    """Return about ``most`` rows sorted by bubble and frame, with the ends of all tracks.
 
     Of more tracks than ``most`` / 4 the longest stay. ``new`` marks rows before which a line
     must not be drawn: a track's first, and the first after a gap longer than the thinning.
@@ -72,7 +72,7 @@ def track_scene_json(results: TrackResults) -> str:
 
 
 def scene_widening(results: TrackResults) -> int:
-    """How many times wider than true the scene is drawn, for slender paths; 1: true."""
+    """Return the factor by which slender paths are drawn wider than true."""
     sides = _sides_mm(thinned(results.tracks, MOST_POINTS))
     upright = int(np.argmax(np.abs(results.up)))
     across = float(np.delete(sides, upright).max())
@@ -80,12 +80,12 @@ def scene_widening(results: TrackResults) -> int:
 
 
 def _drawn_wider(up: Array, times: int) -> Array:
-    """(3,) factors per axis."""
+    """Return the factors (3,) by axis."""
     return np.where(np.arange(3) == int(np.argmax(np.abs(up))), 1.0, float(times))
 
 
 def _sides_mm(table: pd.DataFrame) -> Array:
-    """(3,) of the points' box; none is quite flat."""
+    """Return the sides (3,) of the points' box, none of them 0."""
     if not len(table):
         return np.ones(3)
     sides = np.ptp(table[["x_mm", "y_mm", "z_mm"]].to_numpy(float), axis=0) + 1e-9
@@ -98,7 +98,7 @@ def _slenderness(sides: Array) -> float:
 
 
 def _group(table: pd.DataFrame, colour: str, *, named: bool) -> Trace:
-    """The tracks of one colour: lines that break between tracks and at gaps."""
+    """Return the tracks of one colour as lines that break between tracks and at gaps."""
     points = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     starts = np.flatnonzero(table["new"].to_numpy())[1:]
     words = [f"bubble {p}<br>frame {f}" for p, f in zip(table["particle"], table["frame"])]
@@ -114,7 +114,7 @@ def _group(table: pd.DataFrame, colour: str, *, named: bool) -> Trace:
 
 
 def track_plans(results: TrackResults) -> list[Picture]:
-    """Height against the two other directions: for paper, and browsers without 3-D."""
+    """Draw height against both other directions, for paper and browsers without 3-D."""
     axis = int(np.argmax(np.abs(results.up)))
     return [_plan(results, across) for across in range(3) if across != axis]
 
@@ -130,7 +130,7 @@ def _plan(results: TrackResults, across: int) -> Picture:
 
 
 def draw_tracks(sheet: Sheet, x: Array, y: Array, table: pd.DataFrame) -> None:
-    """Lines in the tracks' colours, broken at gaps, a dot where a track begins.
+    """Draw lines in the tracks' colours, broken at gaps, with a dot at the start.
 
     table : from `thinned`, row by row what x and y are of.
     """

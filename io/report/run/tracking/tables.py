@@ -107,7 +107,7 @@ def _miss_words(results: TrackResults) -> str:
 
 
 def _with_learnt(results: TrackResults) -> Array | None:
-    """(N,) sd of the ray miss from the outlines' noise, shake and scatter."""
+    """Return the sd (N,) of the ray miss by the outlines' noise, shake and scatter."""
     noise, learnt = ray_miss_sd_mm(results), learnt_sd_mm(results)
     return None if noise is None else np.asarray(np.hypot(noise, learnt or 0.0))
 
@@ -140,7 +140,7 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
 
 
 def key_numbers(results: TrackResults) -> list[Figure]:
-    """What a reader wants first."""
+    """Return the most important numbers."""
     lengths, tracks = track_lengths(results), results.tracks
     matched = _matched(results) or (None, None)
     size = tracks["d_eq_mm"].to_numpy(float)
@@ -184,7 +184,7 @@ def _centres(results: TrackResults) -> str:
 
 
 def word_counts(flags: Iterable[str]) -> Counter[str]:
-    """How often each of the words joined by | occurs."""
+    """Return how often each of the words joined by | occurs."""
     whole = Counter(flags)
     counts: Counter[str] = Counter()
     for text, times in whole.items():
@@ -194,7 +194,7 @@ def word_counts(flags: Iterable[str]) -> Counter[str]:
 
 
 def pair_rows(results: TrackResults) -> list[tuple[str, str]]:
-    """What the two views of a bubble have in common, as learnt from the run."""
+    """Return rows on the agreement of the two views, as learned from the run."""
     pairs = results.file.pairs
     if pairs is None:
         return []
@@ -234,7 +234,7 @@ def flag_rows(results: TrackResults) -> list[Row]:
 
 
 def event_rows(results: TrackResults) -> list[Row]:
-    """The first events: frame, time, what, which bubbles, why."""
+    """Return the first events: frame, time, kind, bubbles, reason."""
     return [
         Row((str(e.frame), f"{e.t_s:.4f}", str(e.kind), str(e.particles).replace(" ", ", "),
              str(e.reason)))
@@ -243,7 +243,7 @@ def event_rows(results: TrackResults) -> list[Row]:
 
 
 def event_words(results: TrackResults) -> str:
-    """How many of each kind there were."""
+    """Return the number of events of each kind, in words."""
     counts = results.file.events or results.events["kind"].value_counts().to_dict()
     kinds = [
         f"{kind}: {number(n)}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])

@@ -59,14 +59,14 @@ def ray_pair(
 
 
 def rays_of_row(results: TrackResults, cameras: tuple[Camera, Camera], row: int) -> RayPair:
-    """The rays of the outlines' centres in a row of tracks.csv."""
+    """Return the rays of both outlines' centres in a row of tracks.csv."""
     first, second = pair_pixels(results, np.array([row]))
     rays = [camera.unproject(uv) for camera, uv in zip(cameras, (first, second))]
     return ray_pair(rays[0][0][0], rays[0][1][0], rays[1][0][0], rays[1][1][0])
 
 
 def typical_row(results: TrackResults) -> int | None:
-    """The row whose ray miss is the median of all; None where no bubble was seen twice."""
+    """Return the row with the median ray miss; None if no bubble was seen twice."""
     rows = paired_rows(results)
     if not len(rows):
         return None

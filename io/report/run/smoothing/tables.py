@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -315,15 +314,13 @@ def residual_words(results: SmoothingResults) -> str:
 MODE_HEADS = ["what shakes", "Hz", "damping", "RMS, µm", "what would help"]
 
 MOST_ROWS = 30
-_FOLLOWING = "servo (following error)"
-_PITCH = "stiffen the arm against twisting; camera's weight on the arm's axis"
+_PLACES = {"common": "all cameras alike (carriage, mount)", "servo": "servo (following error)"}
 
 
 def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
     """Return rows of the shake's modes with remedies, and a sentence on their origin."""
     modes = results.file.modes
     rows = [_mode(mode, results.cameras) for mode in _merged(modes)]
-    rows += [_pitch(m, results.cameras) for m in results.part("model").get("pitches") or []]
     if not rows:
         return rows, "The model has no modes, and no peak in the spectrum of the shake was found."
     if any(mode.source != "estimate" for mode in modes):
@@ -352,15 +349,9 @@ def _mode(mode: Mode, cameras: Sequence[str]) -> Row:
     return Row((_place(mode.where, cameras), *numbers, mode_remedy(mode)))
 
 
-def _place(camera: Any, cameras: Sequence[str]) -> str:
-    if isinstance(camera, int) and 0 <= camera < len(cameras):
-        camera = cameras[camera]
-    name = str(camera).removeprefix("arm ")
-    if name in cameras:
-        return f"arm of {name}"
-    if camera == -1 or str(camera).lower() in ("common", "carriage", "none"):
-        return "all cameras alike (carriage, mount)"
-    return _FOLLOWING if camera == "servo" else str(camera)
+def _place(where: str, cameras: Sequence[str]) -> str:
+    name = where.removeprefix("arm ")
+    return f"arm of {name}" if name in cameras else _PLACES.get(where, where)
 
 
 def _rms_um(rms_mm: Any) -> str:
@@ -371,14 +362,6 @@ def _rms_um(rms_mm: Any) -> str:
         return ABSENT
     known = [(a, v) for a, v in zip(AXES, rms_mm) if is_number(v) and v > 0]
     return ", ".join(f"{axis}: {number(1e3 * value, 3)}" for axis, value in known) or "0"
-
-
-def _pitch(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
-    where = _place(mode.get("camera"), cameras)
-    rms: Any = mode.get("rms_rad")
-    angle = f"{number(math.degrees(rms), 2)}°" if is_number(rms) else ABSENT
-    return Row((f"{where}, turning", number(mode.get("frequency_hz")),
-                number(mode.get("damping")), angle, _PITCH))  # fmt: skip
 
 
 def constant_rows(results: SmoothingResults) -> list[Row]:

@@ -163,8 +163,9 @@ def expected_calibration(
 
     The cameras are the nominal ones, and the covariance is the Cramer-Rao bound.
 
-    views : number of views. sigma_px : standard deviation of a dot's centre. seed : of the random
-    poses of the target.
+    views : number of views.
+    sigma_px : standard deviation of a dot's centre.
+    seed : of the random poses of the target.
 
     Raises InputError if the target does not fit into the views.
     """

@@ -520,7 +520,9 @@ def rig_change_from(
     """Return a movement with offset, roll and pitch, from its tangent.
 
     tangent, covariance, prior : (6,), (6, 6), (6, 6) estimate, its covariance and the covariance of
-    its prior. place_mm : (3,) point to which the offset refers. pairs, refined : see `RigChange`.
+        its prior.
+    place_mm : (3,) point to which the offset refers.
+    pairs, refined : see `RigChange`.
     """
     rows = offset_roll_pitch(cameras, place_mm)
     sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
@@ -613,8 +615,8 @@ def drift_posterior(
     conditioning, the movement is a gain times this sum.
 
     rig, rig_covariance : (P,), (P, P) posterior of the sum, for the cameras' P parameters.
-    prior_rig : (P, P) covariance of the calibration. drift : (6, 6) prior covariance of the
-    movement.
+    prior_rig : (P, P) covariance of the calibration.
+    drift : (6, 6) prior covariance of the movement.
     """
     total = with_drift(prior_rig, drift)
     unit = _scale(total)

@@ -87,7 +87,8 @@ def drag_coefficient(
     C_D = 4 d / (3 s^2) ((1 - rho_gas/rho) g up.e - (rho_gas/rho + C_A) a.e),
     the reference area being that of the sphere of equal volume. The liquid does not accelerate.
 
-    slip, acceleration : (..., 3) of the bubble relative to the liquid. up : (3,) unit vector.
+    slip, acceleration : (..., 3) of the bubble relative to the liquid.
+    up : (3,) unit vector.
     mass_coefficient : (...) C_A of the body along the slip, see `added_mass`.
     """
     slip = np.asarray(slip, float)

@@ -164,8 +164,9 @@ def triangulate(
 
     sigma_px : noise as in `pixel_covariance`; a tuple of two gives each camera its own.
     method : "ml" minimises the whitened reprojection error by Gauss-Newton steps from the
-    mid-point; "midpoint" takes the middle of the shortest segment between both rays.
+        mid-point; "midpoint" takes the middle of the shortest segment between both rays.
     rays : what ``unproject`` of each camera gives for the pixels, if it is known.
+
     Raises InputError for unequal shapes, pixels that are not finite or an unknown method, and
     GeometryError for parallel rays.
     """
@@ -204,10 +205,12 @@ def triangulate_views(
 ) -> Triangulation:
     """Return the points that C cameras see at the given pixels; each needs at least two of them.
 
-    uv_px : C arrays (..., 2), with NaN where a camera does not see a point. sigma_px : as in
-    `triangulate`. method : "ml" as there, but from the point nearest to all rays; "midpoint"
-    returns that point.
-    A point that fewer than two cameras see gets NaN; ``seen_by`` of the result counts the cameras.
+    uv_px : C arrays (..., 2), with NaN where a camera does not see a point.
+    sigma_px : as in `triangulate`.
+    method : "ml" as there, but from the point nearest to all rays; "midpoint" returns that point. A
+        point that fewer than two cameras see gets NaN; ``seen_by`` of the result counts the
+        cameras.
+
     Raises InputError for unequal shapes or an unknown method, and GeometryError for parallel rays.
     """
     pixels = [np.asarray(uv, float) for uv in uv_px]
@@ -462,7 +465,8 @@ def aligned_covariance(
 
     Rigid motions are projected out as in `aligned_shift`.
 
-    free : as in `rig_jacobian`. points_mm : (N, 3) in the rig frame.
+    free : as in `rig_jacobian`.
+    points_mm : (N, 3) in the rig frame.
     covariance : (P, P) of the P parameters of the rig, in the order of `rig_jacobian`.
     """
     inner = aligned_shift(cameras, free, points_mm)

@@ -335,7 +335,8 @@ def write_batch(
 ) -> pd.DataFrame:
     """Write batch.csv, batch.json and report.html to ``folder``, and return the table in batch.csv.
 
-    records : the journal's record of each job. report : whether report.html is written.
+    records : the journal's record of each job.
+    report : whether report.html is written.
     again : the command line that makes the files again; "" for `telerig batch`.
     """
     table = table_of(records)

@@ -137,10 +137,11 @@ def jobs_of(
     calibration : a calibration.json to use for all datasets, none of which is then calibrated.
     model, medium, shake, refine_rig, accept, cluster, report : see `Job`.
     tracks : folder with a folder of tracks for each run, if nothing is tracked; None for the
-    results folders.
+        results folders.
     only : kinds of jobs (`KINDS`) and names of runs to do; all if empty.
     strict : whether a dataset that cannot be used raises InputError; otherwise it becomes a
-    calibration job that fails.
+        calibration job that fails.
+
     Raises InputError for folders that do not exist or are named twice, for unknown runs, and for
     options of jobs that are not done.
     """

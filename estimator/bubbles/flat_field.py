@@ -93,7 +93,7 @@ def _divisible(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def screen_of_field(image: NDArray[Any], field: Bools) -> Float32:
-    """`screen_level` of an image that shows the screen in a field (rows, columns) alone."""
+    """Return `screen_level` of an image that shows the screen in a field (rows, columns) only."""
     level = float(np.median(image[field]))
     seen = np.where(field, image, _OUTSIDE * level).astype(np.float32)
     return np.maximum(screen_level(seen), np.float32(_LEAST_LEVEL * level))

@@ -100,12 +100,11 @@ def calibrate(
     """Calibrate a rig from the images or the dots of a dataset; no file is written.
 
     model : "auto" (chosen for each camera), the name of a lens model (none, radial, brown,
-    kappa+radial, ...), or one for each camera: {"left": "brown"}, "left=brown,right=auto".
+        kappa+radial, ...), or one for each camera: {"left": "brown"}, "left=brown,right=auto".
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     medium : "air" or "water", in which the target is. If `rig.toml` has `[walls]` (refractive
         windows), the runs are in water in both cases.
-    outlier_sd : a dot that is further from the model than this is left out, in standard
-        deviations.
+    outlier_sd : a dot that is further from the model than this is left out, in standard deviations.
     seed : number that is written with the result; the calibration itself uses no random numbers.
     progress : True to show a progress bar; or a function that is called with the name of the step,
         the number done and the total, 0 if it is not known.
@@ -186,7 +185,8 @@ def solve_dots(
     """Calibrate the rig from a table of dots, without measuring the stage's axis.
 
     table : the measured dots, with the columns of dots.csv. model, solver, medium, dots_free,
-    outlier_sd, stage : as for `run_calibration`. notes : further sentences for the user.
+    outlier_sd, stage : as for `run_calibration`.
+    notes : further sentences for the user.
 
     The refractive windows of rig.toml are part of the model only if ``medium`` is "water". If it is
     "air", the caller adds them for the runs in water.

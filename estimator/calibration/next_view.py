@@ -341,8 +341,9 @@ def predicted(
 ) -> tuple[State, Observations]:
     """Return the state and the observations of K new views, without measured pixels.
 
-    poses : of the target in the new views. dots : (n,) indices of the dots, which all C cameras
-    observe. whitener : (C,) reciprocal of the standard deviation of a pixel, in 1/px.
+    poses : of the target in the new views.
+    dots : (n,) indices of the dots, which all C cameras observe.
+    whitener : (C,) reciprocal of the standard deviation of a pixel, in 1/px.
     """
     cameras = np.arange(len(problem.cameras))
     view, camera, dot = (
@@ -645,8 +646,9 @@ def first_views(
 ) -> tuple[str, ...]:
     """Return instructions for the first views, which are needed before any calibration.
 
-    first, second : names of two cameras. angle_deg : angle between their axes. alone : whether the
-    rig has no further cameras.
+    first, second : names of two cameras.
+    angle_deg : angle between their axes.
+    alone : whether the rig has no further cameras.
     """
     between = "the cameras" if alone else f"cameras {first} and {second}"
     turn = max(0, min(20, int(TILT_LIMIT_DEG - angle_deg / 2 - 5) // 5 * 5))

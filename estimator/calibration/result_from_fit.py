@@ -95,9 +95,11 @@ def calibration_from_fit(
 ) -> Calibration:
     """Make the public `Calibration` from a finished fit, in which the mirror ambiguity is resolved.
 
-    joint : covariance of all parameters. free : for each camera the names of the intrinsics that
-    the covariance contains. weak : the sentences of `checks.weak_parameters`. nominal_rotvec_deg :
-    nominal rotation vectors by the camera's index. name : name of the rig.
+    joint : covariance of all parameters.
+    free : for each camera the names of the intrinsics that the covariance contains.
+    weak : the sentences of `checks.weak_parameters`.
+    nominal_rotvec_deg : nominal rotation vectors by the camera's index.
+    name : name of the rig.
     """
     problem, state = fit.robust.problem, fit.robust.solution.state
     cameras = cameras_from_state(problem, state)

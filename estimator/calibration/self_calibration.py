@@ -99,11 +99,12 @@ def self_calibrate(
         name, or that of the second camera alone; they resolve the mirror ambiguity.
     model : a name of `telerig.rig.lens_parameters`, or "auto"; one for all cameras, or by camera.
     dots_free : how the dots may differ from their nominal positions: "3d" (in all directions, as
-        far as the target's stated standard deviations allow), "plane" (only within the plane of
-        the target) or "nominal" (not at all).
+        far as the target's stated standard deviations allow), "plane" (only within the plane of the
+        target) or "nominal" (not at all).
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     outlier_sd : number of standard deviations from the model beyond which a dot is left out.
-    notes : sentences for the user that are added to the result. name : name of the rig.
+    notes : sentences for the user that are added to the result.
+    name : name of the rig.
 
     Raises CalibrationError if the views cannot determine a calibration; the error says what to do.
     """

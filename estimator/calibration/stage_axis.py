@@ -174,10 +174,11 @@ def stage_axis_of(
     The covariance of the result includes the errors of the cameras' calibration.
 
     table : measured dots of a target at rest, with the columns of dots.csv: view, camera, dot,
-    u_px, v_px and either suu_px2, suv_px2, svv_px2 or sigma_px.
+        u_px, v_px and either suu_px2, suv_px2, svv_px2 or sigma_px.
     positions_mm : the encoder reading of each view, a mapping or a table with the columns view and
-    position_mm.
+        position_mm.
     position_sigma_mm, wander_sigma_mm : as in `StageAxis`.
+
     Raises InputError for views without a position and for unknown cameras, and CalibrationError for
     fewer than two positions, less than 1 mm between them, or a single camera.
     """

@@ -219,9 +219,11 @@ def watch(
     This ends when one more view would gain little, when points in space are good enough, or when
     ``stop`` is set.
 
-    tell : function that gets messages for the user. interval_s : time between two looks into the
-    folder. until_um : standard deviation of points in space that is good enough; None for none.
-    options : as for `run_calibration`.
+    tell : function that gets messages for the user.
+    interval_s : time between two looks into the folder.
+    until_um : standard deviation of points in space that is good enough; None for none. options :
+        as for `run_calibration`.
+
     Returns the dataset of the images that were used, and its calibration with windows and stage.
     Raises CalibrationError or DetectionError if it is stopped before there are enough views.
     """

@@ -178,8 +178,11 @@ def estimate_noise(
 ) -> NoiseModel:
     """Estimate the noise of an image from its flat areas.
 
-    response : the image after `high_pass`. flat : whether a pixel is far from all edges. step : see
-    `grey_step`. clip : grey levels (black, white) at which the image is clipped.
+    response : the image after `high_pass`.
+    flat : whether a pixel is far from all edges.
+    step : see `grey_step`.
+    clip : grey levels (black, white) at which the image is clipped.
+
     Pixels are grouped by the grey level of their surroundings. A line is fitted through the clipped
     variances of the groups if they differ significantly. Groups that the image's clipping touches
     are left out; if it touches all, the ``relative_error`` of the result is infinite.

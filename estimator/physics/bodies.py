@@ -100,7 +100,7 @@ def _columns(bodies: Spheroids, up: Array) -> dict[str, Array]:
 
 
 def _tilt(bodies: Spheroids, up: Array) -> tuple[Array, Array]:
-    """(M,) angle between pole and up in rad, 0 to pi/2, and its standard deviation."""
+    """Return the angle (M,) between pole and vertical in rad, 0 to pi/2, and its sd."""
     along = (bodies.frame.mT @ up[:, None])[..., 0]
     across = np.linalg.norm(along[:, :2], axis=-1, keepdims=True)
     tilt = np.arctan2(across[:, 0], np.abs(along[:, 2]))

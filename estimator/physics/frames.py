@@ -31,7 +31,8 @@ def frames_table(
     """Return the content of bubbles.csv: one row for each row of trajectories.csv.
 
     bodies : the table that `bodies_table` returns; None if no size is known.
-    up : (3,) unit vector against gravity in the rig frame. gravity_m_s2 : its magnitude.
+    up : (3,) unit vector against gravity in the rig frame.
+    gravity_m_s2 : its magnitude.
     fluid : as for `liquid_of`; if it is None, the dimensionless numbers are NaN.
     """
     liquid = liquid_of(fluid, gravity_m_s2)
@@ -74,7 +75,7 @@ def _vectors(columns: Mapping[str, Array], name: str, unit: str) -> Array:
 
 
 def _curvature(velocity: Array, acceleration: Array) -> Array:
-    """(...) curvature of a path in 1/mm: |v x a| / |v|^3."""
+    """Return the curvature (...) of a path in 1/mm: |v x a| / |v|^3."""
     turn = np.linalg.norm(np.cross(velocity, acceleration), axis=-1)
     return np.asarray(turn / np.linalg.norm(velocity, axis=-1) ** 3)
 

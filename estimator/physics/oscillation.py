@@ -51,7 +51,8 @@ def dominant_oscillation(
 ) -> Oscillation | None:
     """Return the strongest sinusoid of a series between two frequencies.
 
-    t_s : (N,). values : (N, K), K = 1 or 2.
+    t_s : (N,).
+    values : (N, K), K = 1 or 2.
     significant : least amplitude over its standard deviation.
 
     The series is modelled as a straight line, a sinusoid of frequency f, and coloured noise. The
@@ -108,7 +109,7 @@ def _fitted(t: Array, y: Array, f: float) -> tuple[Array, Array]:
 
 
 def _refined(t: Array, y: Array, f: float, around: float) -> float:
-    """The frequency near f whose sinusoid leaves least."""
+    """Return the frequency near f whose sinusoid leaves the smallest residual."""
     from scipy.optimize import minimize_scalar
 
     found = minimize_scalar(

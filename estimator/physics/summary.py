@@ -29,8 +29,9 @@ def summary_table(
 ) -> pd.DataFrame:
     """Return the content of bubble_summary.csv, one row per bubble.
 
-    frames : what `telerig.bubble_table` returns. up : (3,) unit vector against gravity in the rig
-    frame. liquid : properties of the liquid; if it is None, the dimensionless numbers are NaN.
+    frames : what `telerig.bubble_table` returns.
+    up : (3,) unit vector against gravity in the rig frame.
+    liquid : properties of the liquid; if it is None, the dimensionless numbers are NaN.
     ways : by particle and number of its rows, standard deviations (3,) in mm of the displacement
         from the first row to the last one; other bubbles get an upper bound.
     """
@@ -119,7 +120,7 @@ def _along(mine: pd.DataFrame, pattern: str, direction: Array) -> Array:
 def _mean_rise(
     t: Array, mine: pd.DataFrame, up: Array, way_sd_mm: Array | None
 ) -> tuple[float, float]:
-    """Height gained over the time, and its standard deviation.
+    """Return the height gained over the time, and its standard deviation.
 
     Where that of the way is not known, an upper bound: errors of both ends have a positive
     correlation, and so have those of the velocities, so that the smaller of the two is taken.
@@ -144,7 +145,7 @@ def _along_variance(mine: pd.DataFrame, pattern: str, direction: Array) -> Array
 
 
 def _zigzag(t: Array, mine: pd.DataFrame, up: Array) -> dict[str, float]:
-    """The strongest oscillation of the velocity across the vertical, as a displacement.
+    """Return the strongest oscillation of the lateral velocity, as a displacement.
 
     The velocity's noise is white where a wandering path's is red, so that a slow drift is not taken
     for a zigzag.

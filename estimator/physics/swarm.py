@@ -39,8 +39,11 @@ def swarm_numbers(
     """Return number density, void fraction, gas flux and mean diameters with standard deviations.
 
     trajectories, bodies : tables of a run, see `telerig.estimator.physics.frames`.
-    carriage_mm : (F,) position of the stage in each frame. axis : (3,) direction of its travel.
-    up : (3,) unit vector against gravity. cameras : the two cameras of the run.
+    carriage_mm : (F,) position of the stage in each frame.
+    axis : (3,) direction of its travel.
+    up : (3,) unit vector against gravity.
+    cameras : the two cameras of the run.
+
     The result is empty where no shape is known; "left_out" counts bubbles that hardly fit the
     images, or whose shape is not known.
     """

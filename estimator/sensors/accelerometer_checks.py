@@ -119,7 +119,9 @@ def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | 
     exchange brings gravity within 15 degrees of up. A rotation about the vertical remains
     undetermined.
 
-    gravity : (3,) reading at rest. axes : (3, 3) stated axes. up : (3,) as in `check_axes`.
+    gravity : (3,) reading at rest.
+    axes : (3, 3) stated axes.
+    up : (3,) as in `check_axes`.
     """
     from scipy.spatial.transform import Rotation
 

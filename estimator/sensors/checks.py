@@ -89,8 +89,11 @@ def read_sensors(
 ) -> Sensors:
     """Return encoder and accelerometers with their unusable samples masked, and the findings.
 
-    stage, accelerometers, rig : as for `telerig.smooth`. frames_t_s : (F,). files : names of both
-    tables for messages, or "". Raises InputError for records that cannot be read.
+    stage, accelerometers, rig : as for `telerig.smooth`.
+    frames_t_s : (F,).
+    files : names of both tables for messages, or "".
+
+    Raises InputError for records that cannot be read.
     """
     frames = np.asarray(frames_t_s, float)
     encoder, findings = _encoder(stage, frames, files[0])
@@ -186,8 +189,10 @@ def check_overlap(
     """Return a finding if a sensor's record does not cover all frames.
 
     It has the code ``code``, so that the record is refused, if hardly any frame is covered.
-    t : (N,) times of the record. frames_t_s : (F,) times of the frames. where, sensor : for the
-    message.
+
+    t : (N,) times of the record.
+    frames_t_s : (F,) times of the frames.
+    where, sensor : for the message.
     """
     frames = np.asarray(frames_t_s, float)
     share = _covered(t, frames)

@@ -57,8 +57,9 @@ def smooth_run(
     refine_rig, accept : see `telerig.smooth`.
     inputs : the files of the calibration.
     again : the command line that makes the files again; "" for `telerig smooth` of the run.
-    Files appear together at the end. Raises InputError when there are no tracks, or
-    not all of their cameras are in the calibration.
+
+    Files appear together at the end. Raises InputError when there are no tracks, or not all of
+    their cameras are in the calibration.
     """
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)

@@ -101,10 +101,13 @@ def validate(
     Each mark is smoothed beside the other marks and all sensors, and, if the run has
     accelerometers, also beside the sensors only. A mark that both cameras see is a bubble that both
     see; of any other mark only the two axes of its image count.
+
     marks : how many are withheld, those that are seen longest, of each camera in turn. model,
-    accept : see `telerig.smooth`. seed : of the motions. progress : called with the name of the
-    step and the share that is done. Raises InputError if no mark is seen long enough, and what
-    `telerig.smooth` raises.
+    accept : see `telerig.smooth`.
+    seed : of the motions.
+    progress : called with the name of the step and the share that is done.
+
+    Raises InputError if no mark is seen long enough, and what `telerig.smooth` raises.
     """
     calibration = pair_of_run(calibration, run.cameras)
     every = seen_marks(run, calibration)

@@ -635,7 +635,8 @@ def children(
 
     Those with the same recent measurements are merged.
 
-    members : indices of the groups. edges : indices of the pairings that are possible for them.
+    members : indices of the groups.
+    edges : indices of the pairings that are possible for them.
     outside : the shift that all bubbles share, estimated from the other bubbles.
     """
     settings, pairs = found.scan.settings, found.pairs
@@ -695,8 +696,9 @@ def continue_tracks(
 ) -> None:
     """Update tracks in place with their measurements in a frame.
 
-    columns : for each track the index of its measurement, -1 for none. common : the shift that all
-    bubbles share. mean_gain : (n, 3) mean Kalman gain of the bubbles.
+    columns : for each track the index of its measurement, -1 for none.
+    common : the shift that all bubbles share.
+    mean_gain : (n, 3) mean Kalman gain of the bubbles.
     """
     measured, at = scan.measured, np.array(columns, np.int64)
     points, covariances = np.full((len(at), 3), np.nan), np.full((len(at), 3, 3), np.nan)

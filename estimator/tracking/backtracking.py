@@ -65,8 +65,9 @@ class Readings:
     ) -> None:
         """Add M measurements with k components each.
 
-        frames, bubbles : (M,) indices. values : (M, k) equal to by_points (M, k, 3) @ point plus
-        noise. covariances : (M, k, k) of the noise.
+        frames, bubbles : (M,) indices.
+        values : (M, k) equal to by_points (M, k, 3) @ point plus noise.
+        covariances : (M, k, k) of the noise.
         """
         weighted = np.swapaxes(np.linalg.solve(covariances, by_points), -1, -2)
         np.add.at(self.information, (frames, bubbles), weighted @ by_points)
@@ -536,7 +537,7 @@ _BEHIND = 0.25
 
 
 def shared_rows(tracks: SmoothedTracks, frames: slice) -> list[dict[str, Any]]:
-    """Rows for the hidden bubbles of some of the frames; the others are context.
+    """Return rows for the hidden bubbles of some frames; the other frames are context.
 
     The hidden view's pixel is that of the point; its covariance states only that the bubble is
     behind that outline, so that motion is not counted twice when tracks are smoothed.

@@ -324,7 +324,7 @@ def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:
 
 
 def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
-    """One image's bubbles; an image without any gives one row with the reason."""
+    """Detect the bubbles of an image; without any the reason is the only row."""
     image, strip = scene.image(camera, frame), scene.strips.get(camera)
     if image is None:
         found, reason = pd.DataFrame(columns=DETECTION_COLUMNS), "no image"

@@ -179,7 +179,8 @@ class FrameMeasurements:
     ) -> FrameMeasurements:
         """Return the measurements of a frame after checking them.
 
-        points_mm : (M, 3).  covariance_mm2 : (M, 3, 3), or one (3, 3) for all points.
+        points_mm : (M, 3).
+        covariance_mm2 : (M, 3, 3), or one (3, 3) for all points.
         d_eq_mm : (M,); None if all diameters are unknown.
         confidence : (M,); None for 1 everywhere.
         particle : (M,) whole numbers, -1 for no id; None if no ids are given.
@@ -434,7 +435,8 @@ class StageMotion:
 
         position_mm : reading of the encoder at the end of the interval. If it is None or NaN, the
             last speed is assumed to continue, and the next reading corrects the position.
-        t_s : time of the end of the interval.  dt_s : its length.
+        t_s : time of the end of the interval.
+        dt_s : its length.
         """
         if position_mm is None or not np.isfinite(position_mm):
             moved = self.speed_mm_s * dt_s if self.in_lab else 0.0

@@ -165,7 +165,8 @@ class RowMaker:
 
         number, t_s : number and time of the frame.
         position_mm : encoder position of the stage; None without one.
-        tables : the detections of the two cameras; sight : the same as arrays, if known.
+        tables : the detections of the two cameras
+        sight : the same as arrays, if known.
         """
         predicted = self.tracker.predict(t_s, position_mm)
         sight = self.sights([tables])[0] if sight is None else sight
@@ -314,7 +315,7 @@ def _others(rows: Ints, many: int) -> Ints:
 
 
 def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
-    """(N, 2) centres and (N, 2, 2) covariances, with the share of the unknown shape."""
+    """Return centres (N, 2) and covariances (N, 2, 2), the unknown shape's share included."""
     covariance = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
     radius = np.nan_to_num(table["d_eq_px"].to_numpy(float)) / 2
     shape = (wander * radius)[:, None, None] ** 2 * np.eye(2)
@@ -342,7 +343,7 @@ def _measured(
 
 
 def _detections(frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Every detection with the id of its track, blank where it has none."""
+    """Return every detection with the id of its track, blank where it has none."""
     particle = np.concatenate([frame.owners(c) for c in range(2) for frame in frames])
     order = [2 * k + c for c in range(2) for k, f in enumerate(frames) for _ in f.sight.given[c]]
     both = pd.concat(joined, ignore_index=True)

@@ -148,7 +148,7 @@ def write_tracking(
 
 
 def _sources(run: RunData) -> list[Path | Source]:
-    """The inputs whose change makes the tracks of a run stale, besides the calibration."""
+    """Return the inputs, besides the calibration, whose change makes tracks stale."""
     rig = run.path.parent.parent / "rig.toml"
     images = Source(run.path, cameras=run.cameras)
     return [
@@ -202,7 +202,7 @@ def _record(run: RunData, options: TrackOptions, record: Mapping[str, Any]) -> d
 
 
 def _write_pictures(scene: Scene, summary: Mapping[str, Any], staged: Path) -> None:
-    """overlays/<camera>/<frame>.jpg and binary/<camera>/<frame>.png of the worst frames."""
+    """Write overlays and binary pictures of the worst frames."""
     frames = [int(w["frame"]) for w in summary["worst_frames"]]
     tasks = [(c, f, _labels(staged, c, f)) for f in frames for c in scene.run.cameras]
     draw = partial(_draw, scene, staged)
@@ -246,7 +246,7 @@ def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> No
 
 
 def _particle(labels: pd.DataFrame, row: pd.Series[Any]) -> str:
-    """The id of the track that holds this detection, "" for none."""
+    """Return the id of the track of a detection; "" for none."""
     near = np.hypot(labels["u_px"] - row["u_px"], labels["v_px"] - row["v_px"])
     if not len(near) or not near.min() < 1e-6:
         return ""

@@ -182,7 +182,7 @@ class TrackingStream:
         return content
 
     def _crowded(self) -> list[str]:
-        """A sentence on each camera in whose images bubbles cover more than detection can take."""
+        """Return a warning for each camera with more bubbles than the detection can separate."""
         found, frames = [], self.run.frame_count
         for camera, (many, area) in self.covered.items():
             width, height = self.run.image_sizes_px[camera]
@@ -352,7 +352,7 @@ def stage_axis(run: RunData, calibration: Calibration) -> Array:
 
 
 def _complete(detections: pd.DataFrame) -> pd.DataFrame:
-    """A user's detections, the columns that they lack filled with blanks."""
+    """Return a user's detections with missing columns left blank."""
     missing = [name for name in DETECTION_COLUMNS if name not in detections]
     blank = {name: "" if name == "flags" else np.nan for name in missing}
     return detections.assign(**blank)
@@ -390,7 +390,7 @@ def _given(
 
 
 def _labelled(part: Linked, labels: dict[int, str]) -> Linked:
-    """The given names in place of numbers."""
+    """Replace numbers by the given names."""
 
     def named(particle: pd.Series[Any]) -> list[str]:
         return ["" if pd.isna(p) else labels.get(int(p), str(p)) for p in particle]
@@ -402,7 +402,7 @@ def _labelled(part: Linked, labels: dict[int, str]) -> Linked:
 
 
 def _split(table: pd.DataFrame, cameras: tuple[Camera, Camera]) -> dict[int, Tables]:
-    """By frame, the two cameras' bubbles; rows that hold only a reason are left out."""
+    """Return the bubbles of both cameras by frame; rows with a reason only are left out."""
     kept = table[np.isfinite(table["u_px"].to_numpy(float))]
     found = dict(iter(kept.groupby(["frame", "camera"], sort=False)))
     first, second = (c.name for c in cameras)
@@ -415,7 +415,7 @@ def _split(table: pd.DataFrame, cameras: tuple[Camera, Camera]) -> dict[int, Tab
 def _sample(
     run: RunData, cameras: tuple[Camera, Camera], batches: Iterator[pd.DataFrame]
 ) -> list[Tables]:
-    """The detections of `MODEL_FRAMES` frames."""
+    """Return the detections of `MODEL_FRAMES` frames."""
     frames = np.linspace(0, run.frame_count - 1, MODEL_FRAMES).astype(int)
     return [
         tables
@@ -427,7 +427,7 @@ def _sample(
 def _shape_sigma(
     sample: list[Tables], cameras: tuple[Camera, Camera], model: PairModel
 ) -> Array | None:
-    """How much the outlines of this run deviate from ellipses, by its reliable pairs."""
+    """Return how much outlines deviate from ellipses, by the run's reliable pairs."""
     firsts, seconds = [], []
     for first, second in sample:
         found = match_pairs(first, second, cameras, model)

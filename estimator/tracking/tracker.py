@@ -129,7 +129,8 @@ def born(
 ) -> Track:
     """Return a tentative track that starts at a measurement.
 
-    scan : the measurements of the frame.  column : index of the measurement.
+    scan : the measurements of the frame.
+    column : index of the measurement.
     velocity_mm_s : (3,) first velocity.
     encoder : whether an encoder has given the stage's speed.
     tracks : confirmed tracks; the nearest one is noted as a possible parent.

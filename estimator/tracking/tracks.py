@@ -253,7 +253,8 @@ def _numbered(table: pd.DataFrame) -> pd.DataFrame:
 def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") -> str:
     """Return the text that `telerig track` prints.
 
-    summary : content of tracking.json.  seconds : time that the tracking took.
+    summary : content of tracking.json.
+    seconds : time that the tracking took.
     steps : how long its steps took, in words.
     """
     tracks = "1 track" if summary["tracks"] == 1 else f"{summary['tracks']} tracks"

@@ -74,7 +74,8 @@ def matched(
 ) -> tuple[pd.DataFrame, Bools]:
     """Find the true bubble that each of N points shows.
 
-    table : N points, as in tracks.csv.  truth : the simulator's table of bubbles.
+    table : N points, as in tracks.csv.
+    truth : the simulator's table of bubbles.
     cameras : names of the cameras.
 
     Returns a table of N rows of ``truth``, with the row's number in the column ``row`` (blank if

@@ -62,6 +62,7 @@ def new_dataset(
     cameras : one to four, with different names.
     angle_deg : nominal angle in degrees between the optical axes of one camera and the next.
     target : the lines of the table [target].
+
     Returns the paths of rig.toml and of the folders for the images and the runs, in this order.
     Raises InputError when the folder already has a rig.toml, and for values that no rig can have.
     """

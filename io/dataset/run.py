@@ -166,15 +166,16 @@ def load_run(
     path : `DATASET/runs/NAME`, or any folder that holds the same files.
     rig : the content of rig.toml; None looks for a `rig.toml` two folders above the run.
     source : "images" or "detections", from which bubbles are taken; None takes the only one that
-    there is. It has to be given if the folder has both.
+        there is. It has to be given if the folder has both.
     cameras : names of the cameras; None takes the two that `[tracking]` in rig.toml names, or the
-    first two.
+        first two.
     image_sizes_px : (width, height) by camera; they replace those of rig.toml.
     pair_by : how the images of several cameras are paired: "numbers", "order" or "auto", see
-    `telerig.io.dataset.run.pair_frames`.
+        `telerig.io.dataset.run.pair_frames`.
     skip_unreadable : True leaves out every frame that cannot be read, False leaves out none and
-    raises an error. None leaves out only the last frame of a recording, which may be cut short
-    because the disk was full or the power failed.
+        raises an error. None leaves out only the last frame of a recording, which may be cut short
+        because the disk was full or the power failed.
+
     Returns a `RunData`. Raises InputError, which names the file, the row or frame, and what to do.
     """
     folder = _run_folder(Path(path))
@@ -480,10 +481,11 @@ def pair_frames(
     """Find which images of several cameras belong to the same frame.
 
     pair_by : "numbers" pairs by the numbers in the file names, "order" by the order of the images,
-    and "auto" by the numbers if they are plausible, otherwise by the order.
+        and "auto" by the numbers if they are plausible, otherwise by the order.
     sources : the opened frames by camera.
     missing : (F,) by camera, True for the frames that frames.csv reports as dropped; None for none.
     where : the folder, for errors.
+
     Returns for each camera the position (F,) of each frame among its opened frames, -1 for a
     missing frame, and sentences for the user. Raises InputError if the images cannot be paired
     safely.

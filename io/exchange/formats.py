@@ -138,8 +138,9 @@ def export_results(
     run : name of the run; None takes the only one with results.
     calibration : calibration.json to use in place of that of the dataset.
     out : file or folder to write; None writes into the folder results/export of the dataset.
-    accept : ("stale",) also exports results whose inputs have changed.
-    options : options of the format, see `Format.options`.
+    accept : ("stale",) also exports results whose inputs have changed. options : options of the
+        format, see `Format.options`.
+
     Returns lines of text that say what was written and where. Raises InputError for an unknown
     format, and for results that are missing, stale or cannot be used.
     """

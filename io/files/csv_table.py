@@ -60,13 +60,15 @@ def read_table(
 ) -> pd.DataFrame:
     """Read a CSV table and check its header and its cells.
 
-    columns : the columns that the table may or must have. extra : keeps further columns, as numbers
-    if all their cells are numbers; otherwise they are refused. empty : allows no rows.
+    columns : the columns that the table may or must have.
+    extra : keeps further columns, as numbers if all their cells are numbers; otherwise they are
+        refused.
+    empty : allows no rows.
+
     Returns the columns in the file's order. The index is the row in the file (the header is row 1).
-    "whole" columns are int64, or float64 where cells may be blank.
-    Raises InputError for a missing or unknown column, more than `MOST_COLUMNS`, a cell that is no
-    number up to `LARGEST_NUMBER`, a text with control characters, a row with too few or too many
-    cells, and an empty table.
+    "whole" columns are int64, or float64 where cells may be blank. Raises InputError for a missing
+    or unknown column, more than `MOST_COLUMNS`, a cell that is no number up to `LARGEST_NUMBER`, a
+    text with control characters, a row with too few or too many cells, and an empty table.
     """
     file = Path(path)
     table = _sound_table(file, columns, "keep" if extra else "refuse")
@@ -137,7 +139,8 @@ class Rows:
     def refuse(self, bad: Bools, column: str, what: str | Callable[[int], str], todo: str) -> None:
         """Raise InputError if a row is bad; the message names the first one and lists others.
 
-        bad : (rows,) whether each row is bad. column : the column that the message names.
+        bad : (rows,) whether each row is bad.
+        column : the column that the message names.
         what : what is wrong, or a function that returns this for the index of a row in the table.
         todo : what the user can do.
         """

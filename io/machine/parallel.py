@@ -48,8 +48,9 @@ def ordered_map(
 ) -> Iterator[Result]:
     """Yield the result of ``function`` for each task, in the order of the tasks.
 
-    function : a module's function or a `functools.partial` of one. workers : number of processes
-    that work at the same time. meanwhile : is called once in this process while the others work.
+    function : a module's function or a `functools.partial` of one.
+    workers : number of processes that work at the same time.
+    meanwhile : is called once in this process while the others work.
     """
     if workers <= 1:
         yield from map(function, tasks)

@@ -77,8 +77,10 @@ def mostly_garbage(device: DeviceDescription, found: Readings) -> InputError | N
 def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) -> Bools:
     """Return (N,) which readings have a value that is far from what their neighbours predict.
 
-    t_s : (N,) increasing times in s. values : one or more arrays (N,) of values. most : the largest
-    second derivative in time that the values can have; a value may differ by its effect.
+    t_s : (N,) increasing times in s.
+    values : one or more arrays (N,) of values.
+    most : the largest second derivative in time that the values can have; a value may differ by its
+        effect.
 
     A value is far if it deviates from a quartic through its neighbours by more than
     `_FAR_RESIDUALS` times the largest residual of the neighbours and the resolution. The readings

@@ -45,10 +45,13 @@ def draw_overlay(
 ) -> Picture:
     """Return an RGB picture (h, w, 3) of the image with its dots, and a legend underneath.
 
-    image : grey (H, W), 8 or 16 bit or float. accepted : u_px, v_px, a_px, b_px, angle_rad, dot,
-    row, column; green with their index, as far as there is room. rejected : u_px, v_px, a_px, b_px,
-    angle_rad, reason; red with the number of the reason, which the legend spells out. Raises
-    InputError for what is no grey image or a table without these columns.
+    image : grey (H, W), 8 or 16 bit or float.
+    accepted : u_px, v_px, a_px, b_px, angle_rad, dot, row, column; green with their index, as far
+        as there is room.
+    rejected : u_px, v_px, a_px, b_px, angle_rad, reason; red with the number of the reason, which
+        the legend spells out.
+
+    Raises InputError for what is no grey image or a table without these columns.
     """
     for table, extra, name in (
         (accepted, ["dot", "row", "column"], "accepted"),
@@ -95,11 +98,15 @@ def draw_bubble_overlay(
 ) -> Picture:
     """Return an RGB picture (h, w, 3) of the image, not wider than max_width_px, with its bubbles.
 
-    image : grey (H, W), 8 or 16 bit or float. outlines : each (N, 2) px, closed; points that are
-    not finite are passed over. labels : one each, "" for none, where there is room. colours : RGB,
-    one each or one for all. rejected : (u, v, radius, reason) is circled in red with the number of
-    its reason, which the legend spells out. found : what the outlines are; None for bubbles. Raises
-    InputError for what is no grey image, and for labels or colours that do not fit.
+    image : grey (H, W), 8 or 16 bit or float.
+    outlines : each (N, 2) px, closed; points that are not finite are passed over.
+    labels : one each, "" for none, where there is room.
+    colours : RGB, one each or one for all.
+    rejected : (u, v, radius, reason) is circled in red with the number of its reason, which the
+        legend spells out.
+    found : what the outlines are; None for bubbles.
+
+    Raises InputError for what is no grey image, and for labels or colours that do not fit.
     """
     alike = len(colours) == 3 and all(np.ndim(part) == 0 for part in colours)
     shades: list[Any] = [colours] * len(outlines) if alike else list(colours)

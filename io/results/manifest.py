@@ -276,8 +276,10 @@ def replaced_results(
     that the command wrote earlier and did not write again are removed, and all other files stay.
     Whoever reads the folder gets the old result or the new one, also after a kill at any moment.
 
-    command : the name of the section. again : the command line that makes the files again.
+    command : the name of the section.
+    again : the command line that makes the files again.
     inputs : the fingerprints of the inputs by path relative to ``folder``, see `fingerprints`.
+
     Raises InputError when the folder cannot be written.
     """
     again = again if len(again) <= LONGEST_COMMAND else again[:LONGEST_COMMAND] + " ..."

@@ -247,9 +247,10 @@ def run_record(
 ) -> dict[str, Any]:
     """Return the content of run.json for a command that has just finished; nothing is written.
 
-    dataset : the dataset folder. inputs : the files that the command read; they are hashed and
-    named relative to the dataset.
-    options : the values of the command's options. seconds : duration in s of each step by name.
+    dataset : the dataset folder.
+    inputs : the files that the command read; they are hashed and named relative to the dataset.
+    options : the values of the command's options.
+    seconds : duration in s of each step by name.
     """
     return {
         "command": command,

@@ -61,10 +61,12 @@ def read_table(
     """Return the object that a table of rig.toml describes; faults are added to ``problems``.
 
     kind : the dataclass of the object; its annotated fields are the keys of the table.
-    raw : content of the table. table : its name.
+    raw : content of the table.
+    table : its name.
     homes : for keys that users often write into a wrong table, the table to which they belong.
     keys : the keys of fields that have another name in the file. fixed : values of fields that are
-    not in the file.
+        not in the file.
+
     If keys are faulty, the object is made from the others; None if these are not enough.
     """
     if not isinstance(raw, dict):

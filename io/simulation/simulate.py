@@ -28,10 +28,11 @@ def simulate(
 
     config : the name of a preset, or a configuration (`telerig.io.simulation.presets`).
     rng : random generator; the same seed gives the same files. With and without images, the rig,
-    the target, the poses and the bubbles are the same.
+        the target, the poses and the bubbles are the same.
     out : a new or empty folder; None makes a temporary one, which the caller may delete.
     images : whether TIFF images are rendered; otherwise dots.csv and detections.csv are written,
-    with the true centres plus noise.
+        with the true centres plus noise.
+
     Returns the dataset. Raises InputError for an unknown preset, for conditions that no pose of the
     target fulfils, or for a folder that is not empty.
     """

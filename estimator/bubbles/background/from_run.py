@@ -246,7 +246,7 @@ def _first_gains(sample: _Sample) -> Array:
 
 
 def _first_rig(sample: _Sample, layers: Layers, masks: Bools) -> tuple[Layers, Float32, Bools]:
-    """The layers with the frames' upper quantile, and how far the brighter frames spread.
+    """Return the layers with the frames' upper quantile, and the spread of brighter frames.
 
     masks : (n, H, W) what is left out. Then (H, W) the pixels that no two frames show, filled.
     """
@@ -272,7 +272,7 @@ def _blocks(height: int) -> Iterator[slice]:
 
 
 def _quantiles(values: Float32, shares: tuple[float, ...]) -> Float32:
-    """(Q, H, W) quantiles over the first axis, NaN left out; NaN where fewer than two remain.
+    """Return quantiles (Q, H, W) over the first axis without NaN; NaN if fewer than two remain.
 
     The values are put in order in place.
     """
@@ -337,7 +337,7 @@ def _comparisons(count: int) -> list[tuple[int, int]]:
 
 
 def _first_lab(sample: _Sample, layers: Layers, masks: Bools) -> Layers:
-    """The layers with the lab layer's quantiles over the frames that saw each place."""
+    """Return the layers with the lab layer's quantiles over the frames that saw each place."""
     height, width = layers.rig.shape
     low, high = np.floor(sample.shifts.min(0)), np.ceil(sample.shifts.max(0))
     origin = (int(low[0]), int(low[1]))
@@ -364,7 +364,7 @@ def _lab_rows(
     origin: tuple[int, int],
     width: int,
 ) -> Float32 | None:
-    """What frame k shows in these rows of the lab, NaN beside it; None when it shows nothing."""
+    """Return what frame k shows in these rows of the lab, NaN beside it; None for nothing."""
     left, top = sample.shifts[k] - origin
     column, row = math.floor(left), math.floor(top)
     height = layers.rig.shape[0]
@@ -383,7 +383,7 @@ def _lab_rows(
 
 
 def _centred(layers: Layers) -> Layers:
-    """The same sum of layers with the lab's median at 0."""
+    """Return the same sum of layers with the lab's median at 0."""
     assert layers.lab is not None
     some = layers.lab.ravel()[:: max(1, layers.lab.size // _ENOUGH_OF_LAB)]
     known = some[some != 0]
@@ -402,7 +402,7 @@ def _residuals(sample: _Sample, layers: Layers, out: Float32) -> Float32:
 
 
 def _noise(sample: _Sample, layers: Layers, residuals: Float32) -> tuple[Array, Array]:
-    """Log levels and the relative noise at each, from the bright half of the residuals."""
+    """Return log levels and the relative noise at each, from the positive residuals."""
     step = _step(sample)
     some = residuals[:: max(1, len(residuals) // 8), ::step, ::step]
     residual = some.ravel()
@@ -418,7 +418,7 @@ def _noise(sample: _Sample, layers: Layers, residuals: Float32) -> tuple[Array, 
 
 
 def _marked(sample: _Sample, layers: Layers, residuals: Float32) -> tuple[Layers, Bools]:
-    """The layers with new gains, and (n, H, W) the pixels under bubbles and other outliers.
+    """Return the layers with new gains, and the outlier pixels (n, H, W), such as bubbles.
 
     residuals : (n, H, W) are overwritten by those of the new layers.
     """
@@ -481,7 +481,7 @@ def _covered(layers: Layers, marked: Bools, spread: Float32, never: Bools) -> tu
 
 
 def _filled(sample: _Sample, layers: Layers, hidden: Bools, usable: Bools) -> Layers:
-    """The rig layer interpolated where it is hidden, along the travel if that is an image axis.
+    """Interpolate the rig layer where it is hidden, along the travel if that is an image axis.
 
     A pattern that is constant along the travel looks the same in both layers, and what one has of
     it the other lacks: such stripes must continue through a hole.
@@ -517,7 +517,7 @@ def _mean_rig(
 
 
 def _mean_lab(sample: _Sample, layers: Layers, marked: Bools, residuals: Float32) -> Layers:
-    """The lab layer as the mean of the residuals that are free of marks, where these become 0."""
+    """Return the lab layer as the mean of unmarked residuals, which then become 0."""
     assert layers.lab is not None
     height, width = layers.rig.shape
     total, seen = np.zeros_like(layers.lab), np.zeros_like(layers.lab)
@@ -547,7 +547,9 @@ def crop_of_lab(
 ) -> Float32:
     """Return the part (H, W) of the lab layer that is seen at a shift, by cubic interpolation.
 
-    shift_px : (u, v). shape : (H, W). outside : value beyond the layer.
+    shift_px : (u, v).
+    shape : (H, W).
+    outside : value beyond the layer.
     """
     left, top = shift_px[0] - origin_px[0], shift_px[1] - origin_px[1]
     column, row = math.floor(left), math.floor(top)

@@ -164,7 +164,7 @@ def _trace(
     min_contrast: float,
     min_diameter_px: float,
 ) -> tuple[list[_Traced], str]:
-    """Outlines at half depth within one region, or the reason why there is none."""
+    """Return outlines at half depth within one region, or the reason why there is none."""
     x, y, width, height = box
     rows, columns = ratio.shape
     left, top = max(x - 1, 0), max(y - 1, 0)
@@ -205,7 +205,7 @@ def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
 
 
 def _refined(ratio: Float32, traced: list[_Traced]) -> list[Blob]:
-    """The blobs: outline points moved along the gradient to half depth, and the edges' blur."""
+    """Return blobs with outline points moved along the gradient to half depth."""
     if not traced:
         return []
     rows, columns = ratio.shape
@@ -312,7 +312,7 @@ def _arm(points: Array) -> int:
 
 
 def _sense(points: Array) -> float:
-    """1 for outlines that run from +u to +v, -1 for the others."""
+    """Return 1 for outlines that run from +u to +v, -1 for the others."""
     x, y = (points - points[0]).T
     return float(np.sign(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)))
 
@@ -326,7 +326,7 @@ def _turning(points: Array, arm: int) -> Array:
 
 
 def _notches(turn: Array, arm: int) -> list[int]:
-    """Deepest inward turns first, none nearer than ``arm`` to a deeper one."""
+    """Return the deepest inward turns first, none nearer than ``arm`` to a deeper one."""
     found: list[int] = []
     for index in np.argsort(turn).tolist():
         if turn[index] > _TURN_RAD:
@@ -510,7 +510,7 @@ def _seen_rad(ellipse: Array, points: Array) -> float:
 
 
 def _grouped(arcs: list[Array], contour: Array) -> list[Array]:
-    """Arcs joined, best pair first, as long as one ellipse fits both."""
+    """Join arcs, best pair first, as long as one ellipse fits both."""
     groups = list(arcs)
     rejected: set[tuple[int, int]] = set()
     ids = list(range(len(groups)))

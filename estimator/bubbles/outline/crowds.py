@@ -69,10 +69,11 @@ def resolved_crowd(
 ) -> Crowd:
     """Look for rims in the whole image; dark regions that show none are clusters, unless single.
 
-    ratio : (rows, columns) grey levels divided by the background; sigma : noise of a pixel.
+    ratio : (rows, columns) grey levels divided by the background
+    sigma : noise of a pixel.
     blobs, parts : the dark regions, and what their outlines tell of the bubbles in them.
-    known : (K, 5) ellipses of bubbles that are sure. Their rims belong to them; they are not
-        among the bubbles that are returned, the blobs of which follow ``blobs``.
+    known : (K, 5) ellipses of bubbles that are sure. Their rims belong to them; they are not among
+        the bubbles that are returned, the blobs of which follow ``blobs``.
     """
     largest = min(ratio.shape) / _LARGEST_SHARE
     rims = find_rims(ratio, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
@@ -138,7 +139,7 @@ def _explained(shape: tuple[int, ...], ellipses: Array) -> NDArray[np.uint8]:
 def _left(
     ratio: Float32, blob: Blob, explained: NDArray[np.uint8], min_diameter_px: float
 ) -> list[Array]:
-    """Outlines (n, 2) of the dark parts of a blob that nothing explains."""
+    """Return outlines (n, 2) of the dark parts of a blob that nothing explains."""
     outline = _drawn(blob.contour_px)
     if len(outline) < 3:
         return []

@@ -175,7 +175,8 @@ def products(rows: Array, used: int, total: Array) -> None:
 def feet(ellipse: Array, u: Array, v: Array, foot: Array) -> None:
     """Find the nearest points on an ellipse (its feet).
 
-    ellipse : (5,); u, v : (N,) pixels of the points.
+    ellipse : (5,)
+    u, v : (N,) pixels of the points.
     foot : (7, N) receives the cosine and the sine of the foot's eccentric anomaly, the distance of
         the point from the ellipse (px, positive outside), the length (px) of the derivative of the
         ellipse's point by the anomaly, the curvature there (1/px), and the outward unit normal
@@ -739,7 +740,8 @@ def fitted(
 
     image : (rows, columns) grey levels divided by the background.
     table : profile of a blurred disc, see `profiles`.
-    rims : the outlines at the start; own : (B,) their positions among all bubbles of the image.
+    rims : the outlines at the start
+    own : (B,) their positions among all bubbles of the image.
     everyone, everyone_sigma : (A, 5) ellipses and (A,) blurs of all bubbles. Pixels inside or near
         another bubble are left out.
     steps : largest number of steps. With ``STEPS`` all pixels at the rim are used, except glare,

@@ -33,7 +33,8 @@ def close_pairs(
 ) -> list[tuple[int, int]]:
     """Find pairs of ellipses that may be near each other.
 
-    ellipse : (B, 5) ellipses; everyone : (A, 5) ellipses with which they are compared.
+    ellipse : (B, 5) ellipses
+    everyone : (A, 5) ellipses with which they are compared.
     reach_px, reach_everyone_px : (B,), (A,) widths (px) of the surroundings of each ellipse.
     own : (B,) positions of the B ellipses in ``everyone``; these pairs are left out.
 

@@ -80,9 +80,11 @@ def closed_rims(
 ) -> tuple[Array, Array]:
     """Find around each ellipse the closed path along which the image gets brighter outwards most.
 
-    image : (rows, columns) grey levels. ellipse : (N, 5) centre u, v, semi-axes (px), angle (rad).
+    image : (rows, columns) grey levels.
+    ellipse : (N, 5) centre u, v, semi-axes (px), angle (rad).
     window : how far from the ellipse the path may be, as a share of its radius; 1.5 px is used
-        where this is less. floor : slope (1/px) that is noise.
+        where this is less.
+    floor : slope (1/px) that is noise.
     stiffness : what a step sideways costs, between 0 and 1.
 
     Along each ray the strength of a place is g / (g + g0 / 2 + floor), with g its slope and g0 the
@@ -217,8 +219,10 @@ def judged(image: Float32, ellipse: Array, floor: float) -> Judged:
 def owners(order: Ints, ellipse: Array, places: Array, strong: Bools, least: Array) -> Bools:
     """Choose ellipses one after the other; a place at a rim belongs to the first that has it.
 
-    order : (N,) the best first; ellipse : (N, 5).
-    places : (N, RAYS, 2) places at the rims (px); strong : (N, RAYS) where a rim is seen.
+    order : (N,) the best first
+    ellipse : (N, 5).
+    places : (N, RAYS, 2) places at the rims (px)
+    strong : (N, RAYS) where a rim is seen.
     least : (N,) number of places that have to be seen and to belong to no other.
 
     Returns (N,) which are chosen.

@@ -147,7 +147,8 @@ def common_shift(
     """Estimate the shift that all gaps of a frame share; see `matching.common_shift`.
 
     gap, variance : (N1, N2) gaps less their bias (px), and variances (px^2).
-    appearance : (N1, N2) log odds from everything but the gaps; least : see `marginals`.
+    appearance : (N1, N2) log odds from everything but the gaps
+    least : see `marginals`.
 
     Returns the log odds (N1, N2) of all pairs, the shift (px) and its variance (px^2).
     """
@@ -188,7 +189,8 @@ def ratio_log_odds(
         unknown: such pairs get 0.
     axes, alike : (K, K), (K,) as in `LogRatioModel.uncorrelated`.
     wrong : (E,) chance that a measurement says nothing about the bubble.
-    rare : limit of the bubble's rareness (standard deviations); freedom : that of the tails.
+    rare : limit of the bubble's rareness (standard deviations)
+    freedom : that of the tails.
     """
     pairs, many = ratio.shape
     out = np.zeros(pairs)
@@ -230,7 +232,8 @@ def track_density(
 ) -> Array:
     """Return (E,) the density of a pair's point and size, summed over K tracks.
 
-    points : (E, 3) points (mm); added : (E,) variance in every direction (mm^2).
+    points : (E, 3) points (mm)
+    added : (E,) variance in every direction (mm^2).
     log_size, log_expected : (E,), (K,) logarithms of the radii (mm); NaN where unknown.
     expected, variances, axes : (K, 3), (K, 3), (K, 3, 3) the tracks' positions (mm), and the
         variances (mm^2) of these along axes, which are the columns of matrices.

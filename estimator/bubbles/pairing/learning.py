@@ -166,7 +166,7 @@ def _likely_pairs(
 
 
 def _improved(model: PairModel, geometries: list[PairGeometry], terms: int) -> PairModel:
-    """One pass: probabilities of all pairs, then everything that follows from them."""
+    """Do one pass: probabilities of all pairs, then the model that follows from them."""
     found = [common_shift(g, model) for g in geometries]
     probability = [marginals(odds) for odds, _ in found]
     shifts = np.array([shift for _, shift in found])
@@ -252,7 +252,7 @@ def _frame_scatter(model: PairModel, shifts: Array, total: Array) -> float:
 
 
 def _learnt(old: LogRatioModel, name: str, ratio: Array, weight: Array) -> LogRatioModel:
-    """Mean and covariance of the ratios over likely pairs, tails tempered (Student's t, 8)."""
+    """Return mean and covariance of ratios over likely pairs, robust (Student's t, 8)."""
     known = np.isfinite(ratio).all(-1)
     ratio, weight = ratio[known], weight[known]
     if weight.sum() < 0.5:
@@ -287,7 +287,7 @@ def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
 
 
 def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, float]:
-    """The fullest place of the gaps within the search range, and how far it stands out.
+    """Return the gap with most votes within the search range, and its significance.
 
     Each combination counts by the log odds of its appearance, at most e^6 for one.
     """

@@ -141,7 +141,8 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
 def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     """Compute rays and sizes from the detections of one camera.
 
-    table : table of `detect_bubbles`; camera : the calibrated camera.
+    table : table of `detect_bubbles`
+    camera : the calibrated camera.
     axis : (3,) shared axis in the rig frame, see `shared_axis`.
 
     Raises InputError if a column is missing, or if a centre or its covariance is not finite.
@@ -780,7 +781,7 @@ def track_log_odds(found: Candidates, model: PairModel, predicted: Prediction) -
 def _track_density(
     found: Candidates, model: PairModel, predicted: Prediction, points_mm: Array
 ) -> Array:
-    """(E,) density of a pair's point and size at the tracks, relative to anywhere."""
+    """Return the density (E,) of a pair's point and size at the tracks, relative to anywhere."""
     from telerig.estimator.bubbles.pairing import kernels
 
     variances, axes = np.linalg.eigh(predicted.covariance_mm2)

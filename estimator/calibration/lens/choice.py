@@ -530,8 +530,9 @@ def considered_covariance(
 ) -> tuple[tuple[tuple[str, ...], ...], JointCovariance]:
     """Return the covariance of the free and the considered parameters, and their names by camera.
 
-    joint : covariance of the solution, without considered parameters. models : for each camera the
-    name of its lens model. groups : for each camera the considered groups.
+    joint : covariance of the solution, without considered parameters.
+    models : for each camera the name of its lens model.
+    groups : for each camera the considered groups.
     """
     if not any(groups):
         return problem.free, joint

@@ -219,14 +219,15 @@ class Calibration(ShortText):
         """Compute N points in the rig frame from their pixels in two or more cameras.
 
         uv_first_px, uv_second_px : (N, 2) pixels in the first and in the second camera. For more
-        cameras, give ``uv_first_px`` alone: a mapping from the camera's name to (N, 2) pixels, NaN
-        where this camera does not see the point.
+            cameras, give ``uv_first_px`` alone: a mapping from the camera's name to (N, 2) pixels,
+            NaN where this camera does not see the point.
         sigma_px : noise of the pixels. A number or (N,) are standard deviations in px; (N, 2, 2)
-        are covariances in px^2; a pair or a mapping gives each camera its own. None means the
-        scatter of this calibration's own dots.
+            are covariances in px^2; a pair or a mapping gives each camera its own. None means the
+            scatter of this calibration's own dots.
         method : "ml" (maximum likelihood) or "midpoint" (the point midway between the rays).
         include_calibration : whether ``covariance_mm2`` of the result includes the errors of the
-        calibration, which are common to all points; ``measurement_covariance_mm2`` never does.
+            calibration, which are common to all points; ``measurement_covariance_mm2`` never does.
+
         Returns a `Triangulation`. If the pixels were given by name, its ``ray_miss_mm`` is (N, C),
         with one column for each of the C cameras of this calibration; points that fewer than two
         cameras see are NaN, and ``unplaced`` is their number. Raises CalibrationError for a single
@@ -606,6 +607,7 @@ def calibration_from_cameras(
     cameras : the frame of the first one has to be the rig frame.
     sigma_px : standard deviation of pixels that `Calibration.triangulate` assumes.
     notes : further sentences for the user, for example the names of the cameras' files.
+
     The result has no free intrinsics, and the covariance of its poses is zero; its first note says
     that the uncertainty is unknown. Raises CalibrationError if there is no camera, if two have the
     same name, if the first frame is not the rig frame, or if sigma_px is not positive.

@@ -173,7 +173,8 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float
     It is taken as equal along u and v, and is 0 if it is not significant. It follows from the
     median of the squared distances, so up to half of the dots may be wrong.
 
-    residual_px : (M, 2) residuals of all dots. covariance_px2 : (M, 2, 2) their image noise.
+    residual_px : (M, 2) residuals of all dots.
+    covariance_px2 : (M, 2, 2) their image noise.
     dof_per_row : degrees of freedom per measured coordinate.
     """
     expected = _MEDIAN * dof_per_row

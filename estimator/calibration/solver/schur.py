@@ -61,7 +61,9 @@ class Posterior:
     def of(whole: Array, common: int, untouched: NDArray[np.bool_]) -> Posterior:
         """Return the parts of a full covariance.
 
-        whole : (K + 3 N, K + 3 N). common : the number K. untouched : as in the class.
+        whole : (K + 3 N, K + 3 N).
+        common : the number K.
+        untouched : as in the class.
         """
         at = common + np.arange(len(whole) - common).reshape(-1, 3)
         cross = whole[:common, common:].reshape(common, -1, 3)
@@ -263,7 +265,10 @@ class SchurComplement:
     ) -> SchurComplement:
         """Return the factorisation of the normal equations.
 
-        matrix : (m, m) K, which is overwritten. coupling : (m, n, B) E. blocks : (B, n, n) D.
+        matrix : (m, m) K, which is overwritten.
+        coupling : (m, n, B) E.
+        blocks : (B, n, n) D.
+
         Raises CalibrationError if a block or the Schur complement is not positive definite.
         """
         try:

@@ -101,8 +101,10 @@ def coverage_on_grid(
 ) -> tuple[Array, Array]:
     """Return how much of each pixel's blurred footprint an ellipse covers, exactly.
 
-    u_px, v_px : columns (..., U) and rows (..., V) of the pixels. centre_px : (..., 2).
-    shape_px : (..., 3). sigma_px : (...) standard deviation of the blur.
+    u_px, v_px : columns (..., U) and rows (..., V) of the pixels.
+    centre_px : (..., 2).
+    shape_px : (..., 3).
+    sigma_px : (...) standard deviation of the blur.
 
     Returns the coverage F (..., V, U), 0 to 1, and its derivatives (..., 6, V, U) with respect to
     centre (2), shape (3) and sigma.

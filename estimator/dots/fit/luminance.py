@@ -480,10 +480,11 @@ def fit_dots(
     """Fit the luminance model of each dot to the pixels of its window.
 
     windows, starts, priors : one for each dot. Pixels whose residual exceeds 5 standard deviations
-    are left out, if they are few; the standard deviation is enlarged if the fit as a whole is
-    worse than the noise.
-    iterations : largest number of steps. tolerance : a fit has converged if one more step would
-    lower chi-square by less than this. outlier_rounds : how many times outliers are searched.
+        are left out, if they are few; the standard deviation is enlarged if the fit as a whole is
+        worse than the noise.
+    iterations : largest number of steps.
+    tolerance : a fit has converged if one more step would lower chi-square by less than this.
+    outlier_rounds : how many times outliers are searched.
     """
     fits: dict[int, DotFit] = {}
     for some in _chunks(windows):

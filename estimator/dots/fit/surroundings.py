@@ -41,12 +41,14 @@ def dot_window(
 ) -> Window:
     """Return the part of an image to which one dot is fitted: its edge, inside, and background.
 
-    grey : (rows, columns) grey levels. labels : see `Candidates`. blob : the dot. start : its
-    approximate ellipse.
+    grey : (rows, columns) grey levels.
+    labels : see `Candidates`.
+    blob : the dot.
+    start : its approximate ellipse.
     coarse : whether only one pixel in four is used everywhere, for a fast first fit.
     known : labels of neighbouring blobs whose light is subtracted before the fit. Pixels that are
-    blurred together with these blobs stay in the mask; without them a third of the precision would
-    be lost.
+        blurred together with these blobs stay in the mask; without them a third of the precision
+        would be lost.
 
     Pixels that are nearer to another blob, or near a hole, are left out. Of a large dot only the
     surroundings of the edge are used, and beyond the edge's blur one pixel in four.

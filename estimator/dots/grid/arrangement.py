@@ -60,8 +60,10 @@ def match_points(
 ) -> list[PointMatch]:
     """Return the ways to match the dots of an image with the listed points of a target, best first.
 
-    points_px : (M, 2) centres of the dots. shapes_px2 : (M, 2, 2), see `shape_matrix`.
-    points_mm : (N, 2) points of the target. dot_radius_mm : radius of its dots.
+    points_px : (M, 2) centres of the dots.
+    shapes_px2 : (M, 2, 2), see `shape_matrix`.
+    points_mm : (N, 2) points of the target.
+    dot_radius_mm : radius of its dots.
 
     Raises DetectionError when there are fewer than 6 dots or no map explains half of them.
     """

@@ -34,9 +34,11 @@ def fit_neighbours(
 ) -> tuple[Array, Array, Array]:
     """Fit an affine function to the values of the dots round each of C places of a grid.
 
-    at : (H, W) index of the dot at each place of the grid, -1 for none. values : (N, 2) of the N
-    dots. places : (C, 2) indices into ``at``. basis : (N, 2, 2) pitch vectors of each dot, towards
-    which the fit is pulled weakly. itself : whether the dot at the place itself is used, too.
+    at : (H, W) index of the dot at each place of the grid, -1 for none.
+    values : (N, 2) of the N dots.
+    places : (C, 2) indices into ``at``.
+    basis : (N, 2, 2) pitch vectors of each dot, towards which the fit is pulled weakly.
+    itself : whether the dot at the place itself is used, too.
 
     Returns for each place the fitted value (C, 2), its change (C, 2, 2) per step of the grid, and
     the variance (C,) of the fitted value if the values of the dots have unit variance.
@@ -62,8 +64,10 @@ def fit_neighbours(
 def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
     """Return how far each dot's residual is from the value that its neighbours predict.
 
-    at : (H, W) index of the dot at each place, -1 for none. residuals : (N, 2) of the N dots, in
-    standard deviations. places : (C, 2) indices into ``at`` of the dots that are tested.
+    at : (H, W) index of the dot at each place, -1 for none.
+    residuals : (N, 2) of the N dots, in standard deviations.
+    places : (C, 2) indices into ``at`` of the dots that are tested.
+
     Returns the distances (C,) in standard deviations.
     """
     flat = np.zeros((len(residuals), 2, 2))
@@ -183,7 +187,8 @@ def grow_lattice(
 ) -> Lattice:
     """Find the largest grid among the N dots of an image.
 
-    points_px : (N, 2) centres. shapes_px2 : (N, 2, 2), see `shape_matrix`.
+    points_px : (N, 2) centres.
+    shapes_px2 : (N, 2, 2), see `shape_matrix`.
     cell : shape of the grid's cell; it does not say which axis is x.
     floor_px : a dot within this distance of its place on the grid always belongs to the grid.
 

@@ -294,7 +294,7 @@ class Clique:
 
 
 def cliques_of(net: Any, sizes: Sequence[int], when: Ints) -> list[Clique]:
-    """The cliques of a `gtsam.GaussianBayesNet` of one key a conditional, in order of elimination.
+    """Return the cliques of a `gtsam.GaussianBayesNet`, one per conditional, in elimination order.
 
     A conditional is joined to the next one where that is its parent and of the same time.
     sizes : dimension of each key, keys counting from 0.  when : (C,) times of the conditionals.
@@ -340,7 +340,8 @@ def fill_covariances(
 ) -> None:
     """Write marginal covariances into the arrays that are given.
 
-    sizes : dimension of each key, keys counting from 0.  wanted : (d, d) of keys.
+    sizes : dimension of each key, keys counting from 0.
+    wanted : (d, d) of keys.
     pairs : (d, e) of keys with others of their clique.
     """
     from scipy.linalg.lapack import dtrtri

@@ -18,8 +18,12 @@ def filtered(
     Their whitened squares are added to ``squares`` (K,), of each column of the values.
 
     mean (n, K), covariance (n, n) : of the first state, whose first element is what is measured;
-        they are used up.  transition, noise : (U, n, n) of steps.  index : (N - 1,) which of them.
-    values : (N, K).  variance : (N,) of their noise; infinite where nothing was measured.
+    they are used up.
+
+    transition, noise : (U, n, n) of steps.
+    index : (N - 1,) which of them.
+    values : (N, K).
+    variance : (N,) of their noise; infinite where nothing was measured.
     """
     size, columns = mean.shape
     total = 0.0

@@ -675,8 +675,9 @@ def times(matrices: Array, vectors: Array) -> Array:
 def times_chosen(blocks: Array, matrices: Array, which: Ints) -> Array:
     """Return the products (n, r, E) of n blocks with a matrix each.
 
-    blocks : (n, r, D), or (1, r, D) for equal blocks. matrices : (U, D, E). which : (n,) index of
-    each block's matrix. The matrices are not copied for each block.
+    blocks : (n, r, D), or (1, r, D) for equal blocks.
+    matrices : (U, D, E).
+    which : (n,) index of each block's matrix. The matrices are not copied for each block.
     """
     out = np.empty((len(which), blocks.shape[-2], matrices.shape[-1]))
     blocks = np.broadcast_to(blocks, (len(which), *blocks.shape[-2:]))

@@ -194,9 +194,12 @@ def cameras_of(
     """Read calibrated cameras for an export.
 
     source : a calibration.json, or a dataset or one of its results folders, whose calibration is
-    read. calibration : a calibration.json to read instead; None for none.
+        read.
+    calibration : a calibration.json to read instead; None for none.
     required : whether InputError is raised if there is no calibration; otherwise the result holds
-    no camera then. accept : as in `read_results`.
+        no camera then.
+    accept : as in `read_results`.
+
     Raises InputError for a calibration that is stale or cannot be read.
     """
     trials = [results_root(source) / "calibration" / "calibration.json"]

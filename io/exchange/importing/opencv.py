@@ -37,9 +37,10 @@ def read_opencv_cameras(
     """Read a stereo calibration of OpenCV (YAML, XML or JSON): two pinhole cameras.
 
     paths : one file with everything, or several: intrinsics and extrinsics, or one file for each
-    camera (in their order) and one with R and T.
+        camera (in their order) and one with R and T.
     image_size_px : (width, height) in px; None where a file has image_width and image_height.
     unit_mm : the length in mm that was given to OpenCV as 1 (1000 for metres).
+
     Raises InputError when something is missing, and for distortion beyond k1 k2 p1 p2 k3 s1..s4.
     """
     if not unit_mm > 0:

@@ -34,10 +34,13 @@ def write_film(
 ) -> None:
     """Write the pictures, each once, into every file: .mp4 or .gif.
 
-    pictures : RGB (height, width, 3), all of one even size. rate_hz : a GIF's is rounded to whole
-    hundredths of a second a picture. palette : a GIF's, up to 256 colours; by default of its first
-    picture. stage : called with (what, done, count). Raises InputError for another kind of file, a
-    place that cannot be written, and for an MP4 without PyAV.
+    pictures : RGB (height, width, 3), all of one even size.
+    rate_hz : a GIF's is rounded to whole hundredths of a second a picture.
+    palette : a GIF's, up to 256 colours; by default of its first picture.
+    stage : called with (what, done, count).
+
+    Raises InputError for another kind of file, a place that cannot be written, and for an MP4
+    without PyAV.
     """
     targets = [Path(file) for file in files]
     for file in targets:

@@ -117,8 +117,9 @@ def scene_text(
 ) -> str:
     """Return traces with a layout for them, safe inside a script element.
 
-    up : (3,) unit vector on the screen. distance : of the eye. ratio : of the box' sides, None:
-    true proportions.
+    up : (3,) unit vector on the screen.
+    distance : of the eye.
+    ratio : of the box' sides, None: true proportions.
     """
     axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
     lower = [-min(0.3 * (distance - 1), 0.12) * float(part) for part in up]

@@ -43,9 +43,11 @@ def path(
 ) -> Any:
     """Draw the paths of bubbles in space; returns 3-D axes.
 
-    trajectories : `Smoothing.trajectories`, bubbles.csv or tracks.csv. particles : which bubbles;
-    None for all. colour_by : a column that colours the path, like "slip_mm_s"; None for a colour
-    per bubble. y_up : the vertical axis is the height, -y.
+    trajectories : `Smoothing.trajectories`, bubbles.csv or tracks.csv.
+    particles : which bubbles; None for all.
+    colour_by : a column that colours the path, like "slip_mm_s"; None for a colour per bubble.
+    y_up : the vertical axis is the height, -y.
+
     Raises InputError for a table without positions.
     """
     axes = axes_of(axes, projection="3d")

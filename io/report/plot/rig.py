@@ -22,8 +22,11 @@ def residuals(
 ) -> Any:
     """Draw an arrow from the predicted towards the measured place of each dot; returns axes.
 
-    table : residuals.csv of a calibration. camera : its name. magnified : how many times as long as
-    true the arrows are drawn; None for a twentieth of the image at the 90 % quantile.
+    table : residuals.csv of a calibration.
+    camera : its name.
+    magnified : how many times as long as true the arrows are drawn; None for a twentieth of the
+        image at the 90 % quantile.
+
     Dots that were left out are not drawn. Raises InputError for a camera without dots.
     """
     mine = _of_camera(table, camera)
@@ -96,8 +99,11 @@ def shake(
 ) -> Any:
     """Draw a camera's shake against time with a band of 2 standard deviations; returns axes.
 
-    table : `Smoothing.shake` or shake.csv. axis : "x", "y" or "z" of the rig. y_up : y is drawn as
-    height, -y, which is positive upwards. Raises InputError for an unknown camera or axis.
+    table : `Smoothing.shake` or shake.csv.
+    axis : "x", "y" or "z" of the rig.
+    y_up : y is drawn as height, -y, which is positive upwards.
+
+    Raises InputError for an unknown camera or axis.
     """
     t, values = columns_of(table, "t_s", f"{camera}_{axis}_mm", made_by="Smoothing.shake")
     turned = y_up and axis == "y"

@@ -98,9 +98,10 @@ def strip_places(
 
     The strip runs along the travel, and ``count`` dots are in view at a time.
 
-    position_mm : positions of the stage. at : distance of the strip from the image's middle, on a
-    random side, divided by half the width of the image. jitter : largest deviation of the dots'
-    heights from even spacing, divided by the spacing.
+    position_mm : positions of the stage.
+    at : distance of the strip from the image's middle, on a random side, divided by half the width
+        of the image.
+    jitter : largest deviation of the dots' heights from even spacing, divided by the spacing.
     """
     size = np.array(camera.image_size_px) - 1
     height_mm = size[1] / camera["scale_px_per_mm"]

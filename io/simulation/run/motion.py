@@ -412,9 +412,12 @@ def rig_shake(
     """Return a random shake: on each axis one mode that is common to all cameras, and one mode of
     each camera's arm.
 
-    rms_mm : (axes,) RMS of each camera's whole shake. frequency_hz : frequency of the common mode.
-    common_share : share of the common mode in the variance. arm_ratio : frequency of the arms'
-    modes divided by frequency_hz. damping : damping ratio of all modes. force_hz : see `rig_mode`.
+    rms_mm : (axes,) RMS of each camera's whole shake.
+    frequency_hz : frequency of the common mode.
+    common_share : share of the common mode in the variance.
+    arm_ratio : frequency of the arms' modes divided by frequency_hz.
+    damping : damping ratio of all modes.
+    force_hz : see `rig_mode`.
     """
     rms = np.asarray(rms_mm, float)
     offset = np.zeros((cameras, steps, len(rms)))
@@ -445,9 +448,10 @@ def accelerometer_readings(
 ) -> Array:
     """Return the noisy readings (N, 3) in m/s^2 of an accelerometer: axes . (a - g) + bias.
 
-    acceleration_mm_s2 : (N, 3) in rig axes. up : (3,) unit vector against gravity. axes : (3, 3)
-    whose rows are the sensor's axes in rig coordinates. rate_hz, density_ug_sqrt_hz : sampling rate
-    and noise density.
+    acceleration_mm_s2 : (N, 3) in rig axes.
+    up : (3,) unit vector against gravity.
+    axes : (3, 3) whose rows are the sensor's axes in rig coordinates.
+    rate_hz, density_ug_sqrt_hz : sampling rate and noise density.
     """
     force = np.asarray(acceleration_mm_s2, float) / 1000 + gravity_m_s2 * np.asarray(up, float)
     sigma = density_ug_sqrt_hz * MICRO_G_M_S2 * np.sqrt(rate_hz / 2)

@@ -88,10 +88,11 @@ _MOST_COMPARED, _BUBBLES_COMPARED = 1500, 3
 _ENCODER_SIGMA_MM = 0.005
 _LEAST_SAMPLES = 2
 _LEAST_LEARNED_S = 0.2
-_SIZED_FRAMES, _SIZING_PASSES = 600, 3
 """Shortest time of a bubble for which shake is learned. In less time a slow shake shows no period,
 and learning would find no shake.
 """
+_SIZED_FRAMES, _SIZING_PASSES = 600, 3
+"""Frames in the middle of a run that set the RMS of guessed modes, and passes over them."""
 
 
 @showing_progress

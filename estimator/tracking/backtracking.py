@@ -91,6 +91,7 @@ def smooth_points(
     x[:, POSITION] = np.linalg.solve(total, readings.pull.sum(0)[..., None])[..., 0]
     still = Motion(np.eye(len(prior)), np.zeros_like(prior), np.zeros(len(prior)))
     steps = [still, *(m for m in motions[1:] if m is not None)]
+    assert len(steps) == max(len(motions), 1), "only the first frame has no motion into it"
     matrices, noises, offsets = (
         np.array([getattr(step, field.name) for step in steps]) for field in fields(Motion)
     )

@@ -115,11 +115,16 @@ class LinearProcess:
 
 
 def square_root(covariance: Array) -> Array:
-    """Return a matrix S (n, n) with S S^T = ``covariance`` (n, n), which may be singular."""
+    """Return the S (n, n) with S S^T = ``covariance`` (n, n), which may be singular.
+
+    Scaled to unit variances S is symmetric, and so does not depend on the signs of eigenvectors,
+    which are different from machine to machine: a seed gives the same run everywhere.
+    """
     sigma = np.sqrt(np.diag(covariance))
     unit = np.where(sigma > 0, sigma, 1.0)
     values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
-    return np.asarray(unit[:, None] * vectors * np.sqrt(np.clip(values, 0, None)))
+    root = vectors * np.sqrt(np.clip(values, 0, None)) @ vectors.T
+    return np.asarray(unit[:, None] * root)
 
 
 def ornstein_uhlenbeck(sigma: float, tau_s: float) -> LinearProcess:

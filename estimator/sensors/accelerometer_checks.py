@@ -14,6 +14,9 @@ from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
 _FLOATING_M_S2 = 0.6
 _DOUBLED = (1.8, 2.2)
 _FIT = 1.5
+_PARTS, _CLEAR_SIGMAS = 8, 4.0
+"""A record tells its gravity to 4 times the standard error that the medians of 8 parts give."""
+
 _TILTED_DEG = 20.0
 _FITS_DEG = 15.0
 _CLEAR, _CHANCE_SIGMAS, _INDEPENDENT_S = 0.6, 3.5, 0.025
@@ -31,18 +34,25 @@ def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> l
     return _check_gravity(sensor, np.asarray(up, float), gravity_m_s2) or check_axes(sensor, up)
 
 
-def gravity_of(reading: ArrayLike) -> Array:
-    """Return the median (3,) of readings (N, 3): gravity plus bias, hardly changed by shake."""
-    return np.asarray(np.median(np.asarray(reading, float), axis=0))
+def gravity_of(reading: ArrayLike) -> tuple[Array, float]:
+    """Return the median (3,) of readings (N, 3), and how far off it can be.
+
+    The median is gravity plus bias. In a short record a hard shake moves it.
+    """
+    readings = np.asarray(reading, float)
+    parts = np.array([np.median(p, axis=0) for p in np.array_split(readings, _PARTS) if len(p)])
+    spread = np.linalg.norm(parts.std(axis=0, ddof=1)) if len(parts) > 1 else np.inf
+    return np.median(readings, axis=0), float(_CLEAR_SIGMAS * spread / np.sqrt(len(parts)))
 
 
 def _check_gravity(sensor: Sensor, up: Array, gravity_m_s2: float) -> list[Finding]:
     """Return a finding if the size of the median reading is not gravity."""
     where, name = sensor.where, sensor.name
     stated = ACCELERATION_UNITS[sensor.unit]
-    size = float(np.linalg.norm(gravity_of(sensor.reading_m_s2))) / stated
-    ratio = size * stated / STANDARD_GRAVITY_M_S2
-    if 1 / _FIT < ratio < _FIT:
+    gravity, off = gravity_of(sensor.reading_m_s2)
+    size = float(np.linalg.norm(gravity)) / stated
+    ratio, off = size * stated / STANDARD_GRAVITY_M_S2, off / STANDARD_GRAVITY_M_S2
+    if 1 / _FIT - off < ratio < _FIT + off:
         return []
     at_rest = f"{STANDARD_GRAVITY_M_S2 / stated:.3g}"
     unit = unit_of_gravity(size)
@@ -91,9 +101,9 @@ def check_axes(sensor: Sensor, up: ArrayLike) -> list[Finding]:
 
     The finding contains axes that would fit. up : (3,) unit vector against gravity in rig axes.
     """
-    gravity, axes = gravity_of(sensor.reading_m_s2), sensor.axes
+    (gravity, off), axes = gravity_of(sensor.reading_m_s2), sensor.axes
     angle = _tilt_deg(gravity, axes, up)
-    if angle < _TILTED_DEG:
+    if angle - np.degrees(np.arctan2(off, np.linalg.norm(gravity))) < _TILTED_DEG:
         return []
     words = f"with its axes as stated, gravity points {angle:.0f} deg away from up"
     fits = fitting_axes(gravity, axes, up)

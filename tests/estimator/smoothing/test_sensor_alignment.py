@@ -134,7 +134,7 @@ def test_marks_show_the_unit_of_an_encoder_that_seems_to_stand() -> None:
 def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
     information: str, known: bool
 ) -> None:
-    _, said = placed(905, information, scenario="S2", encoder=1 / 4)
+    _, said = placed(906, information, scenario="S2", encoder=1 / 4)
     (finding,) = [f for f in said if f.code is not None]
     assert finding.code == "ENCODER_SCALE"
     assert finding.fix == ({"encoder_factor": pytest.approx(4.0, rel=2e-3)} if known else {})

@@ -285,7 +285,7 @@ def test_upside_down(run: Path) -> None:
         table[["ax_m_s2", "ay_m_s2"]] *= -1
 
     spoil(run / "accelerometer.csv", change)
-    refused(run, "179 deg away from up")
+    refused(run, "178 deg away from up")
 
 
 @pytest.mark.parametrize(("felt", "sign", "told"), [(0, -1, ""), (2, 1, "-z"), (0, 1, "-x")])

@@ -117,11 +117,6 @@ def _smooth_one(
     from telerig.scripts.track import cameras_without_rig, default_folder
 
     calibrated, files = calibration_for(run, calibration)
-    # tracks are smoothed, so it does not matter whether a run with both has images or detections
-    data = load_run(
-        run, source="detections" if (run / "detections.csv").is_file() else None,
-        **cameras_without_rig(run, calibrated),
-    )  # fmt: skip
     folder = out or default_folder(run)
     own = folder if (folder / "tracks.csv").is_file() else default_folder(run)
     words = ["telerig", "smooth", str(run)]
@@ -131,6 +126,12 @@ def _smooth_one(
     words += [f"--model={model}", *(["--refine-rig"] if refine_rig else [])]
     words += [word for code in accept for word in ("--accept", code)]
     with progress(quiet) as stage:
+        stage("reading the run", 0, 1)
+        # tracks are smoothed: it does not matter whether a run with both has images or detections
+        data = load_run(
+            run, source="detections" if (run / "detections.csv").is_file() else None,
+            **cameras_without_rig(run, calibrated),
+        )  # fmt: skip
         found = smooth_run(
             data, calibrated, tracks or own, folder, model=model, inputs=files,
             refine_rig=refine_rig, accept=accept, report=report, stage=stage,

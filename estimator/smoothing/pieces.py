@@ -1,7 +1,7 @@
 """A long run is smoothed in pieces: which frames each is solved with, and what they share.
 
-Each piece is solved with more frames on both sides, which are not taken from its solution: three
-times as long as the slowest process remembers. What is constant along the run (biases, delays and
+Each piece is solved with more frames on both sides, which are not taken from its solution: twice
+as long as the slowest process remembers. What is constant along the run (biases, delays and
 scales of sensors, the encoder's scale, the calibration, marks) is known to a piece from all others:
 a first round, of pieces without margins, collects the information of each on them
 (docs/decisions/032). A run that fits into one piece is solved as it is.
@@ -31,11 +31,11 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.estimator.smoothing.problem.window import Window, all_of
 
-MOST_ROWS, MOST_FRAMES = 120_000, 12_000
+MOST_ROWS, MOST_FRAMES = 90_000, 12_000
 """Frames of all bubbles together, and frames, that are solved in one piece."""
-_ROWS, _FRAMES = 100_000, 10_000
+_ROWS, _FRAMES = 60_000, 10_000
 """Of a piece of a run that has more."""
-_DECAY_TIMES = 3.0
+_DECAY_TIMES = 2.0
 _CONSTANT = 1e-6
 Sizes = dict[ConstantFamily, tuple[int, int]]
 _FAMILIES: tuple[ConstantFamily, ...] = ("sensors", "constants", "marks", "clocks")
@@ -95,7 +95,7 @@ def pieces_of(
 
 
 def margin_s(problem: SmoothingProblem, model: ShakeModel) -> float:
-    """Return three times as long as the slowest process of the rig remembers, or a bubble's speed.
+    """Return twice as long as the slowest process of the rig remembers, or a bubble's speed.
 
     Other processes of a bubble are seen in every frame, and those of the rig by all bubbles.
     """

@@ -159,7 +159,7 @@ def smooth(
     folder : an existing folder for results.h5 of a run that is too long for memory; None for a
         temporary one, which lasts as long as what is returned.
 
-    A run of more than 12,000 frames, or of more than 120,000 of all bubbles together, is smoothed
+    A run of more than 12,000 frames, or of more than 90,000 of all bubbles together, is smoothed
     in pieces; its tables are read from results.h5 when they are asked for.
 
     Returns a `Smoothing`: the table ``trajectories`` (t_s, x_mm, vx_mm_s, their standard deviations
@@ -339,21 +339,21 @@ class _Run:
                 for piece, window, solution in solved_pieces(
                     problem, model, pieces, self.options, step, constants
                 ):
-                    widened = with_hyperparameter_uncertainty(solution)
-                    widened = _with_accelerations(widened, low_passes)
-                    if widened.accelerations and widened.graph.rows >= LEARNED_ROWS:
-                        low_passes = widened.accelerations.low_passes
+                    solution = with_hyperparameter_uncertainty(solution)
+                    solution = _with_accelerations(solution, low_passes)
+                    if solution.accelerations and solution.graph.rows >= LEARNED_ROWS:
+                        low_passes = solution.accelerations.low_passes
                     span = Span(piece.own, piece.low, problem.t_s)
-                    parts.append(Evidence.of(widened, drawn(widened), span))
-                    paths, offsets = self._tables(piece, window, widened, span)
+                    parts.append(Evidence.of(solution, drawn(solution), span))
+                    paths, offsets = self._tables(piece, window, solution, span)
                     bodies, found = self._bodies(
                         frames_between(self.tracks, piece.first, piece.end)
                     )
-                    file.append(paths, offsets, states_of(widened, span), _beside(paths, bodies))
+                    file.append(paths, offsets, states_of(solution, span), _beside(paths, bodies))
                     if piece == pieces[middle]:
-                        deviations, swarm = found, self._swarm(widened, paths, bodies, span)
-                        moved = widened.accelerations
-                    del solution, widened
+                        deviations, swarm = found, self._swarm(solution, paths, bodies, span)
+                        moved = solution.accelerations
+                    del window, solution, paths, offsets, bodies
                 with self.phases.phase("verdict", "judging the result"):
                     evidence = evidence_of(parts)
                     _, window, solution = next(

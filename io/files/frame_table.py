@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 LARGE_BYTES = 64 << 20
 """Smaller tables are read into memory as a whole."""
-_BLOCK_BYTES = 8 << 20
+_BLOCK_BYTES = 1 << 20
 
 Read = Callable[[bytes, int], "pd.DataFrame | None"]
 """Return the table of a CSV text that begins with the header, from the number of the row in the

@@ -21,7 +21,7 @@ from telerig.estimator.smoothing.problem.problem import Observations
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 
 DRAWS = 16
-_FEWEST_DRAWS, _DRAWN_ROWS, _ROWS_AT_ONCE = 2, 320_000, 100_000
+_FEWEST_DRAWS, _DRAWN_ROWS, _ROWS_AT_ONCE = 2, 200_000, 100_000
 """Of a long run with many bubbles fewer draws do: what is compared are means over all states. Few
 states times draws at once take little memory."""
 _REFINEMENTS = 1

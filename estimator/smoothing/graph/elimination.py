@@ -27,7 +27,7 @@ LEAST_PIVOT = 1e-9
 """Of the information's diagonal, what Cholesky's elimination has to leave of it; covariances are
 then good to 1e-5."""
 
-_KEYS_AT_ONCE = 2000
+_KEYS_AT_ONCE = 500
 
 _NOTHING = np.zeros(0, np.int64)
 

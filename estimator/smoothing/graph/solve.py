@@ -56,7 +56,7 @@ _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
 _LARGEST_STEP_PX = 5.0
 _ROUNDING = 1e-9
 _STACK_BYTES = 512 << 20
-_AT_ONCE = 8192
+_AT_ONCE = 2048
 _COLUMNS_AT_ONCE = 4
 
 
@@ -421,6 +421,7 @@ def _finish(
     draws = draws_of(graph, last.factors, last.done) if options.draws else None
     constants = _constants_covariance(graph, last.done) if options.constants else None
     last.factors.clear()
+    give_back_freed_memory()
     found = None
     if options.covariances:
         progress("covariances", 0.0)
@@ -663,6 +664,7 @@ def in_large_stack(task: Callable[[], T]) -> T:
         except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
             fault.append(error)
 
+    give_back_freed_memory()  # of this thread, which the other one cannot use
     collecting = gc.isenabled()
     gc.disable()
     before = threading.stack_size(_STACK_BYTES)

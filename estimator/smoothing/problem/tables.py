@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, cast
+from tempfile import TemporaryFile
+from typing import IO, TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -303,19 +301,19 @@ def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | N
     particles = sorted(ends)
     number = {p: i for i, p in enumerate(particles)}
     places = [(ends[p][0], np.full((ends[p][1] - ends[p][0] + 1, 3), np.nan)) for p in particles]
-    with _store(tracks) as store:
-        for table, detections in _parts(tracks):
-            _place(table, number, places)
-            parts = [_paired(table, c, camera.name, number) for c, camera in enumerate(cameras)]
-            if detections is not None and "particle" in detections:
-                parts += [
-                    _single(table, detections, c, camera.name, number, ends, corrected)
-                    for c, camera in enumerate(cameras)
-                ]
-            found = Observations(*(np.concatenate(p) for p in zip(*parts)))
-            store.add(found.of(np.lexsort((found.camera, found.item, found.frame))))
-        observations = store.observations()
-    return Tracked(tracks, sample, particles, observations, t_s, places)
+    files = None if _in_memory(tracks) else (TemporaryFile(), TemporaryFile())  # noqa: SIM115
+    store = _Store(files)
+    for table, detections in _parts(tracks):
+        _place(table, number, places)
+        parts = [_paired(table, c, camera.name, number) for c, camera in enumerate(cameras)]
+        if detections is not None and "particle" in detections:
+            parts += [
+                _single(table, detections, c, camera.name, number, ends, corrected)
+                for c, camera in enumerate(cameras)
+            ]
+        found = Observations(*(np.concatenate(p) for p in zip(*parts)))
+        store.add(found.of(np.lexsort((found.camera, found.item, found.frame))))
+    return Tracked(tracks, sample, particles, store.observations(), t_s, places)
 
 
 def _in_memory(tracks: Any) -> bool:
@@ -345,16 +343,18 @@ def _place(table: pd.DataFrame, number: dict[int, int], places: list[tuple[int, 
 
 @dataclass
 class _Store:
-    """Collects observations in memory, or their pixels in files of a folder."""
+    """Collects observations in memory, or their pixels in files.
 
-    folder: TemporaryDirectory[str] | None
+    files : of uv_px and covariance_px2, which vanish with the process; None for memory.
+    """
+
+    files: tuple[IO[bytes], IO[bytes]] | None
     parts: list[Observations] = field(default_factory=list)
 
     def add(self, part: Observations) -> None:
-        if self.folder is not None:
-            for name in ("uv_px", "covariance_px2"):
-                with (Path(self.folder.name) / name).open("ab") as file:
-                    file.write(np.ascontiguousarray(getattr(part, name)).tobytes())
+        if self.files is not None:
+            for file, values in zip(self.files, (part.uv_px, part.covariance_px2)):
+                file.write(np.ascontiguousarray(values).tobytes())
             none = Observations.none()
             part = replace(
                 part, item=part.item.astype(np.int32), frame=part.frame.astype(np.int32),
@@ -366,34 +366,28 @@ class _Store:
     def observations(self) -> Observations:
         names = ("item", "frame", "camera", "uv_px", "covariance_px2")
         joined = [np.concatenate([getattr(p, name) for p in self.parts]) for name in names]
-        if self.folder is not None:
-            shapes = ((len(joined[0]), 2), (len(joined[0]), 2, 2))
+        if self.files is not None:
+            count = len(joined[0])
+            shapes: tuple[tuple[int, ...], ...] = (count, 2), (count, 2, 2)
             joined[3:] = [
-                cast("Array", OnDisk(self.folder, name, shape))
-                for name, shape in zip(names[3:], shapes)
+                cast("Array", OnDisk(file, shape)) for file, shape in zip(self.files, shapes)
             ]
         return Observations(*joined)
 
 
-@contextmanager
-def _store(tracks: Any) -> Iterator[_Store]:
-    yield _Store(None if _in_memory(tracks) else TemporaryDirectory(prefix="telerig-"))
-
-
 @dataclass(frozen=True)
 class OnDisk:
-    """An array of numbers in a file of a temporary folder; parts of it are read when needed."""
+    """An array of numbers in a temporary file; parts of it are read when needed."""
 
-    folder: TemporaryDirectory[str] = field(repr=False)
-    name: str
+    file: IO[bytes] = field(repr=False)
     shape: tuple[int, ...]
 
     def __len__(self) -> int:
         return self.shape[0]
 
     def __getitem__(self, which: Any) -> Array:
-        path = Path(self.folder.name) / self.name
-        return np.array(np.memmap(path, np.float64, "r", shape=self.shape)[which])
+        self.file.flush()
+        return np.array(np.memmap(self.file, np.float64, "r", shape=self.shape)[which])
 
 
 def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:

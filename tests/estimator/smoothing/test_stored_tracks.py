@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +43,12 @@ def test_a_run_is_tracked_and_smoothed_from_disk(
     monkeypatch.setattr(frame_table, "LARGE_BYTES", 0)
     monkeypatch.setattr(frame_table, "_BLOCK_BYTES", 5000)
     monkeypatch.setattr(tables, "_FRAMES_AT_ONCE", 17)
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     assert isinstance(telerig.load_run(run).detections, FrameTable)
     stored = done(tmp_path / "stored")
+    assert not list(temporary.iterdir())  # nothing is left of a process that is killed
     assert isinstance(open_tracks(tmp_path / "stored"), StoredTracks)
     for name in ("tracks.csv", "detections.csv"):
         both = [pd.read_csv(tmp_path / folder / name) for folder in ("whole", "stored")]

@@ -109,7 +109,7 @@ def calibrate(
     progress : True to show a progress bar; or a function that is called with the name of the step,
         the number done and the total, 0 if it is not known.
 
-    Returns the calibration; no file is written.
+    Returns the calibration.
     Raises InputError, DetectionError or CalibrationError; each says what happened, where, and what
     to do.
     """

@@ -426,7 +426,7 @@ class StripInImages:
     def of(
         follower: Follower, look: DotLook, kept: list[Mark], position_mm: Array
     ) -> StripInImages:
-        """Return the strip of the kept marks, of which there must be at least one.
+        """Return where the strip of the kept marks (at least one) is in all frames.
 
         position_mm : (F,) position of the stage in each frame.
         """

@@ -93,15 +93,15 @@ def with_wander(model: ShakeModel, refinement: Refinement) -> ShakeModel:
 
 
 def refined_change(solution: Solution, calibration: Calibration) -> RigChange | None:
-    """Return the posterior of the movement; None if it is no variable of the graph."""
+    """Return the posterior of the second camera's movement; None if it was not estimated."""
     problem, found = solution.graph.problem, solution.covariances
     share = problem.calibration
     if share is None or share.drift is None or found is None:
         return None
     root = share.root
     rig = root @ solution.state.calibration
-    unfelt = share.covariance - root @ root.T
-    covariance = unfelt + root @ found.calibration @ root.T
+    unaffected = share.covariance - root @ root.T
+    covariance = unaffected + root @ found.calibration @ root.T
     before = share.covariance.copy()
     before[-6:, -6:] -= share.drift
     tangent, own = drift_posterior(rig, covariance, before, share.drift)

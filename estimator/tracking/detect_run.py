@@ -122,7 +122,7 @@ def described_fields(run: RunData) -> dict[str, Bools]:
 
 
 def mask_files(run: RunData) -> dict[str, Path]:
-    """Return by camera the image that says where bubbles are looked for."""
+    """Return {camera: mask}, images that are 0 where no bubbles are sought."""
     described = {} if run.rig is None else run.rig.bubbles
     folder = run.path.parent.parent
     return {name: folder / one.mask for name, one in described.items() if one.mask is not None}

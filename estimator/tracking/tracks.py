@@ -73,7 +73,7 @@ class Tracks(ShortText):
             "points": f"{points} from {counted(len(self.detections), 'detection')}",
             "length": f"{rows.median():.0f} points per track (median)" if len(rows) else "",
             "events": ", ".join(f"{count} x {kind}" for kind, count in kinds.items()),
-            "frame": "the first camera's; travel and shake of the rig are still in it",
+            "frame": "that of the first camera, so positions contain the rig's travel and shake",
             "warnings": first_of(list(self.summary.get("warnings", ()))),
         }
 

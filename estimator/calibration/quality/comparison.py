@@ -187,7 +187,7 @@ class RigComparison:
             return []
         return [
             f"the earlier one was made in {_of(self.media[0])}, this one in {_of(self.media[1])}: "
-            "windows that [walls] of rig.toml does not state count as changes"
+            "a refractive window that [walls] of rig.toml lacks appears as a change of the rig"
         ]
 
     def as_dict(self) -> dict[str, Any]:

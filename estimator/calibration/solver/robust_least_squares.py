@@ -98,8 +98,9 @@ def solve(
     point, equations = start, _at(linearised, start)
     if equations is None:
         raise CalibrationError(
-            "the cost at the start is not finite: a camera cannot see some of its dots at all",
-            todo="check the cameras and windows in rig.toml",
+            "the start values are impossible: no ray of a camera reaches some of the dots that it "
+            "has measured",
+            todo="check scale and image size of the cameras, and [walls], in rig.toml",
         )
     damping, iteration = 1e-4, 0
     for iteration in range(1, max_iterations + 1):

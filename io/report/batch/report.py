@@ -70,7 +70,9 @@ def _checked(job: Any) -> Job:
         if not isinstance(job[name], str):
             raise ValueError(f"a job garbles {name!r}")
     if max(map(len, f"{job['dataset']}/{job['run']}".split("/"))) > _LONGEST_NAME:
-        raise ValueError("a job has a dataset or run with too long a name")
+        raise ValueError(
+            f"the name {job['dataset']!r:.60} of a dataset, or of its run, is too long"
+        )
     if not isinstance(job.get("host") or "", str):
         raise ValueError("a job garbles 'host'")
     if not isinstance(job.get("figures") or {}, dict):

@@ -94,9 +94,9 @@ def _shape(results: SmoothingResults) -> str:
         return "Their outlines are too few to test the spheroid."
     chi2 = median(column(results.bubble_frames, "spheroid_chi2"))
     return (
-        f"The equatorial semi-axes differ by {number(200 * known.get('triaxial', 0.0), 2)} % "
-        f"(typically); a spheroid misses both outlines by a chi-square of {number(chi2, 2)} for 2 "
-        "degrees of freedom (median; 1.4 if nothing but noise)."
+        f"The two equatorial semi-axes differ by {number(200 * known.get('triaxial', 0.0), 2)} % "
+        "(1 sd). The fit of a spheroid to both outlines has a chi-square with 2 degrees of freedom "
+        f"of {number(chi2, 2)} (median; 1.4 if there were only noise)."
     )
 
 

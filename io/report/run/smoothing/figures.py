@@ -390,7 +390,7 @@ def accelerometer_before_and_after(results: SmoothingResults, sensor: str) -> Pi
         Curve(frequency, after, SMOOTHED, "left by the model", style=_THICK),
     ]
     share = float(after.sum() / before.sum()) if before.sum() > 0 else 0.0
-    caption = f"The model leaves {number(100 * share, 2)} % of the readings' power"
+    caption = f"The residuals have {number(100 * share, 2)} % of the readings' power"
     noise: Any = found.get("noise")
     if is_number(noise):
         flat = np.full(len(frequency), float(noise))

@@ -141,7 +141,8 @@ def confidence(results: TrackResults) -> Picture:
         sheet.axes.set_ylim(0, 3 * max(float(sheet.axes.get_ylim()[1]), 1.0))
     low = int(np.sum(values < 0.9))
     caption = (
-        "Probability that the two outlines are of one bubble; counts grow by powers of ten. "
+        "Probability that the two outlines belong to the same bubble, on a logarithmic axis of "
+        "counts. "
         f"{number(low)} of {number(len(values))} points ({share(low, len(values))}) lie below 0.9."
     )
     return Picture("Confidence of the pairs", sheet.source, caption)
@@ -350,6 +351,9 @@ def seen_where(results: TrackResults, index: int) -> Picture:
 
 
 def shared_pictures(results: TrackResults) -> list[Any]:
-    """Return (direction, name), the height first: it shows a wrong angle or scale best."""
+    """Return (direction, name) of the coordinates against which the ray miss is drawn.
+
+    The height is the first: an error of the angle between the cameras or of a scale shows there.
+    """
     across = [i for i in range(3) if abs(results.up[i]) < 0.5]
     return [(results.up, "height"), *((np.eye(3)[i], "xyz"[i]) for i in across)]

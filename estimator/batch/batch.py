@@ -33,7 +33,7 @@ from telerig.estimator.batch.jobs import Job, check_run_name, fingerprint
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
-from telerig.io.results.batch import verdict_counts
+from telerig.io.results.batch import BatchFile, verdict_counts
 from telerig.io.results.manifest import is_whole, replaced_results
 
 Stage = Callable[[str, float, int], None]
@@ -344,7 +344,7 @@ def write_batch(
     content = {"schema": 1, "kind": "telerig batch", "name": name, "jobs": list(records)}
     with replaced_results(folder, "batch", again=again or "telerig batch", inputs={}) as staged:
         write_table(table, staged / "batch.csv")
-        write_json_atomic(staged / "batch.json", content)
+        BatchFile.of(content, staged / "batch.json").write(staged / "batch.json")
         if report:
             from telerig.io.report.batch.report import write_batch_report
 

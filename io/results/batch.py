@@ -1,10 +1,60 @@
-"""What the records of a batch say together."""
+"""Describe batch.json, the records of all jobs of a batch."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AfterValidator, Field
+
+from telerig.io.results.record import Part, Record
+
+_LONGEST_NAME = 255
+"""What file systems allow for a folder's name."""
+
+
+def _checked_path(path: str) -> str:
+    if max(map(len, path.split("/"))) > _LONGEST_NAME:
+        raise ValueError(f"the name {path[:60]!r}... is too long for a folder")
+    return path
+
+
+_Path = Annotated[str, AfterValidator(_checked_path)]
+
+
+class JobRecord(Part):
+    """Hold what became of one job.
+
+    kind : "calibrate", "track" or "smooth".
+    dataset, run : folder of the dataset, and name of the run; "" for a calibration.
+    status : "done", "rejected", "failed", "crashed" or "left out".
+    words : the result or the reason of a failure, in words.
+    figures : numbers of the result by name.
+    seconds : duration; None if it is not known.
+    host : name of the computer; None if it is not known.
+    """
+
+    kind: str
+    dataset: _Path
+    run: _Path
+    status: str
+    words: str
+    figures: dict[str, Any] | None = None
+    seconds: float | None = None
+    host: str | None = None
+
+
+class BatchFile(Record):
+    """Hold the content of batch.json: the name of the batch and the records of its jobs."""
+
+    MISSING: ClassVar[str] = "no batch here"
+    MAKE: ClassVar[str] = "telerig batch DATASETS --out FOLDER"
+    AGAIN: ClassVar[str] = "run `telerig batch` again with --out of this folder"
+
+    schema_: int = Field(1, alias="schema")
+    name: str | None = None
+    jobs: tuple[JobRecord, ...]
 
 
 def verdict_of(record: Mapping[str, Any]) -> str:

@@ -51,7 +51,7 @@ def test_a_recording_whose_header_states_gigabytes_is_refused(tmp_path: Path) ->
 def test_a_batch_whose_job_garbles_its_host_is_refused(tmp_path: Path) -> None:
     job = dict.fromkeys(("dataset", "run", "kind", "status", "words"), "") | {"host": ["a"]}
     (tmp_path / "batch.json").write_text(json.dumps({"jobs": [job]}), encoding="utf-8")
-    with pytest.raises(InputError, match="garbles 'host'"):
+    with pytest.raises(InputError, match=r"garbles 'jobs\.0\.host'"):
         write_batch_report(tmp_path)
 
 

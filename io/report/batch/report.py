@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from telerig.errors import InputError
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.page.figures import (
     CAMERA_COLOURS,
@@ -23,9 +22,8 @@ from telerig.io.report.page.figures import (
     drawing,
 )
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
-from telerig.io.results.batch import verdict_counts, verdict_of
+from telerig.io.results.batch import BatchFile, verdict_counts, verdict_of
 from telerig.io.results.manifest import reading
-from telerig.io.results.record import read_object
 from telerig.io.results.smoothing import Verdict
 from telerig.short_text import ABSENT, counted, is_number, number
 
@@ -35,8 +33,6 @@ KINDS = {"calibrate": "calibrated", "track": "tracked", "smooth": "smoothed"}
 _DONE = "done"
 _COLOUR = {"calibrate": CAMERA_COLOURS[0], "track": CAMERA_COLOURS[1], "smooth": CAMERA_COLOURS[2]}
 _LONGEST_WORDS = 600
-_LONGEST_NAME = 255
-"""What file systems allow for a folder's name."""
 
 
 @dataclass(frozen=True)
@@ -51,33 +47,13 @@ class Line:
 
 def write_batch_report(folder: Path, out: Path | None = None) -> Path:
     """Write report.html beside batch.json, or into ``out``; InputError where there is no batch."""
-    file, todo = Path(folder) / "batch.json", "run `telerig batch` with --out of this folder"
-    with reading(file.parent, [file.name]):
-        content = read_object(file, todo)
-    try:
-        jobs = [_checked(job) for job in content["jobs"]]
-        name = str(content.get("name") or Path(folder).resolve().name)
-    except (ValueError, KeyError, TypeError) as error:
-        what = f"holds no batch that can be read: {error}"
-        raise InputError(what, where=str(file), todo=todo) from error
+    with reading(Path(folder), ["batch.json"]):
+        file = BatchFile.read(Path(folder) / "batch.json")
+    jobs = [job.content() for job in file.jobs]
+    name = file.name or Path(folder).resolve().name
     place = Path(folder) if out is None else Path(out)
     write_text_atomic(place / "report.html", render(jobs, place, name))
     return place / "report.html"
-
-
-def _checked(job: Any) -> Job:
-    for name in ("dataset", "run", "kind", "status", "words"):
-        if not isinstance(job[name], str):
-            raise ValueError(f"a job garbles {name!r}")
-    if max(map(len, f"{job['dataset']}/{job['run']}".split("/"))) > _LONGEST_NAME:
-        raise ValueError(
-            f"the name {job['dataset']!r:.60} of a dataset, or of its run, is too long"
-        )
-    if not isinstance(job.get("host") or "", str):
-        raise ValueError("a job garbles 'host'")
-    if not isinstance(job.get("figures") or {}, dict):
-        raise ValueError("a job garbles 'figures'")
-    return dict(job)
 
 
 def render(jobs: Sequence[Job], folder: Path, name: str) -> str:

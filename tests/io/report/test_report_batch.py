@@ -75,14 +75,14 @@ def test_a_page_without_failures_says_the_verdicts(
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (None, "does not exist"),
+        (None, "no batch here"),
         ("{", "Expecting"),
         ("[]", "not an object"),
-        ('{"jobs": 3}', "not iterable"),
-        ('{"jobs": [3]}', "not subscriptable"),
-        ('{"jobs": [{"dataset": "a"}]}', "'run'"),
-        ('{"jobs": [{"dataset": 3}]}', "garbles 'dataset'"),
-        (json.dumps({"jobs": [_job("track", "a") | {"figures": [3]}]}), "garbles 'figures'"),
+        ('{"jobs": 3}', "garbles 'jobs'"),
+        ('{"jobs": [3]}', "garbles 'jobs.0'"),
+        ('{"jobs": [{"dataset": "a"}]}', "garbles 'jobs.0.kind': Field required"),
+        (json.dumps({"jobs": [_job("track", "a") | {"dataset": 3}]}), "garbles 'jobs.0.dataset'"),
+        (json.dumps({"jobs": [_job("track", "a") | {"figures": [3]}]}), "garbles 'jobs.0.figures'"),
     ],
 )
 def test_a_batch_that_cannot_be_read_is_named(

@@ -138,7 +138,7 @@ def _refuse_too_few(
     if unknown_dots:
         needed, undetermined = 4, "the shape of the target (3 affine numbers) and with it the scale"
     elif stereo:
-        needed, undetermined = 2, "the rotation between the cameras: two different ones fit alike"
+        needed, undetermined = 2, "the rotation between the cameras: two of them fit equally well"
     else:
         needed, undetermined = 1, "everything"
     if len(usable) >= needed:
@@ -175,7 +175,7 @@ def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
             names = [problem.cameras[c].name for c in (a, b)]
             raise CalibrationError(
                 f"cameras {names[0]!r} and {names[1]!r} have {count} view in common, which does "
-                "not determine the rotation between them: two different ones fit alike",
+                "not determine the rotation between them: two different ones fit equally well",
                 todo="add views at other tilts that both of them see",
             )
 

@@ -25,10 +25,11 @@ from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import hat
 from telerig.rig.windows import affine_map
-from telerig.short_text import ShortText, counted
+from telerig.short_text import ShortText, counted, xarray_dataset
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 VOLUME_SHARE = 0.6
@@ -106,6 +107,33 @@ class Triangulation(ShortText):
         if self.seen_by is not None:
             columns["seen_by"] = self.seen_by.reshape(-1)
         return pd.DataFrame(columns)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return an `xarray.Dataset` with units; its dimension ``obs`` has one entry per point.
+
+        It has the coordinates x, y and z, ``covariance`` and ``measurement_covariance``
+        (obs, axis, axis_of) and ``ray_miss_mm``; from `triangulate_views` this is (obs, camera),
+        and there is ``seen_by``. Raises InputError if xarray is not installed.
+        """
+        points = self.points_mm.reshape(-1, 3)
+        square = ("obs", "axis", "axis_of")
+        variables: dict[str, tuple[Any, ...]] = {}
+        for name, of in (("covariance", ""), ("measurement_covariance", ", the pixels' share")):
+            words = {"units": "mm2", "long_name": f"covariance of the position{of}"}
+            variables[name] = (square, getattr(self, f"{name}_mm2").reshape(-1, 3, 3), words)
+        cameras = self.ray_miss_mm.shape[self.points_mm.ndim - 1 :]
+        misses = self.ray_miss_mm.reshape(len(points), *cameras)
+        words = {"units": "mm", "long_name": "distance between the rays"}
+        variables["ray_miss_mm"] = ("obs", "camera")[: misses.ndim], misses, words
+        if self.seen_by is not None:
+            words = {"units": "1", "long_name": "number of cameras that saw the point"}
+            variables["seen_by"] = ("obs",), self.seen_by.reshape(-1), words
+        places = {
+            a: (("obs",), points[:, i], {"units": "mm", "long_name": f"position along {a}"})
+            for i, a in enumerate("xyz")
+        }
+        axes = {"axis": list("xyz"), "axis_of": list("xyz")}
+        return xarray_dataset(variables, places | axes, {"title": self.title()})
 
 
 def midpoint(

@@ -1,11 +1,19 @@
-"""Short texts: numbers with significant digits and units, results at a prompt and in notebooks."""
+"""Short texts: numbers with significant digits and units, results at a prompt and in notebooks.
+
+`xarray_dataset` makes datasets of results.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from telerig.errors import InputError
+
+if TYPE_CHECKING:
+    import xarray
 
 LONGEST = 160
 """Longest text of a fact in characters; the rest is cut."""
@@ -40,6 +48,23 @@ class ShortText:
             for name, text in _shown(self.facts()).items()
         )
         return f"<div><b>{escape(self.title())}</b><table>{rows}</table></div>"
+
+
+def xarray_dataset(
+    variables: Mapping[str, tuple[Any, ...]],
+    coordinates: Mapping[str, Any],
+    about: Mapping[str, str],
+) -> xarray.Dataset:
+    """Return an `xarray.Dataset` of variables (dimensions, values, attributes), by name.
+
+    about : its attributes. Raises InputError if xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError as error:
+        todo = "pip install 'telerig[notebook]'"
+        raise InputError("xarray is not installed", where="to_xarray", todo=todo) from error
+    return xarray.Dataset(variables, coordinates, {"Conventions": "CF-1.8", **about})
 
 
 def _shown(facts: Mapping[str, str]) -> dict[str, str]:

@@ -21,7 +21,7 @@ from telerig.io.exchange.export.run_results import read_results
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import Triangulation
+from telerig.rig.triangulation import POSE_COMPONENTS, Triangulation, triangulate_views
 from telerig.short_text import LONGEST, ShortText
 
 
@@ -163,6 +163,33 @@ def test_parameters_as_a_table(chain: Chain) -> None:
     assert table.loc["right.rx_rad", "sd"] == 0.0 and "left.rx_rad" not in table.index
     triangulated = points(chain.calibration).to_pandas()
     assert list(triangulated["x_mm"].round(9)) == [0.0, 3.0, 6.0]
+
+
+def test_points_and_parameters_with_their_covariances() -> None:
+    pytest.importorskip("xarray")
+    cameras = true_cameras(run_preset("rise").calibration)
+    free = (("scale_px_per_mm",), ("kappa_per_mm",))
+    names = ("left.scale_px_per_mm", "right.kappa_per_mm", *(f"right.{p}" for p in POSE_COMPONENTS))
+    covariance = 1e-10 * (np.eye(8) + 0.5)
+    calibration = replace(
+        calibration_from_cameras(list(cameras.values())),
+        covariance=covariance, covariance_names=names, free=free,
+    )  # fmt: skip
+    data = calibration.to_xarray()
+    assert data["covariance"].sel(parameter=names[1], parameter_of=names[2]) == 0.5e-10
+    np.testing.assert_allclose(np.diagonal(data["covariance"]), data["sd"] ** 2)
+    assert data["units"].sel(parameter="right.kappa_per_mm") == "mm-1"
+    assert data["value"].sel(parameter="left.k1") == calibration.camera("left")["k1"]
+    found = points(calibration)
+    one, table = found.to_xarray(), found.to_pandas()
+    np.testing.assert_array_equal(one["covariance"].sel(axis="x", axis_of="z"), table["sxz_mm2"])
+    np.testing.assert_array_equal(one["ray_miss_mm"], table["ray_miss_mm"])
+    np.testing.assert_array_equal(one["y"], table["y_mm"])
+    assert one["covariance"].attrs["units"] == "mm2" and one["z"].attrs["units"] == "mm"
+    views = [calibration.project(c, np.arange(12.0).reshape(2, 2, 3)) for c in range(2)]
+    several = triangulate_views(calibration.cameras, views, 0.1)
+    assert several.to_xarray()["ray_miss_mm"].dims == ("obs", "camera")
+    assert several.to_xarray()["seen_by"].to_numpy().tolist() == [2, 2, 2, 2]
 
 
 def test_undistorted_images_are_those_of_opencv() -> None:

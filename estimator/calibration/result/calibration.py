@@ -31,10 +31,11 @@ from telerig.rig.triangulation import (
     triangulate,
     triangulate_views,
 )
-from telerig.short_text import ShortText, first_of
+from telerig.short_text import ShortText, first_of, xarray_dataset
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
 
     from telerig.io.results.calibration import CalibrationFile, CameraRecord
 
@@ -134,6 +135,35 @@ class Calibration(ShortText):
                 name = f"{camera.name}.{parameter}"
                 rows[name] = (float(value), self.sd(name))
         return pd.DataFrame.from_dict(rows, orient="index", columns=["value", "sd"])
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the table of `to_pandas` with its covariance as an `xarray.Dataset`.
+
+        ``value`` and ``sd`` have the dimension ``parameter``, along which the coordinate ``units``
+        lies; ``covariance`` (parameter, parameter_of) is 0 for parameters that were held fixed.
+        Raises InputError if xarray is not installed.
+        """
+        from telerig.io.exchange.export.run_results import unit_of
+
+        table = self.to_pandas()
+        place = {name: i for i, name in enumerate(table.index)}
+        free = [place[name] for name in self.covariance_names]
+        covariance = np.zeros((len(table), len(table)))
+        covariance[np.ix_(free, free)] = self.covariance
+        names = table.index.to_numpy()
+        words = {"comment": "each in the unit of its parameter: the coordinate units"}
+        return xarray_dataset(
+            {
+                "value": ("parameter", table["value"].to_numpy(), words),
+                "sd": ("parameter", table["sd"].to_numpy(), words),
+                "covariance": (("parameter", "parameter_of"), covariance, words),
+            },
+            {
+                "parameter": names, "parameter_of": names,
+                "units": ("parameter", [unit_of(name) for name in names]),
+            },
+            {"title": self.title()},
+        )  # fmt: skip
 
     def camera(self, camera: str | int) -> Camera:
         """Return one camera by name or index; CalibrationError if there is no such camera."""

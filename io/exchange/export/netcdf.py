@@ -19,6 +19,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import RunResults, facts, numbered, unit_of
 from telerig.io.files.atomic import atomic_path
+from telerig.short_text import xarray_dataset
 
 if TYPE_CHECKING:
     import xarray
@@ -110,11 +111,6 @@ def to_xarray(results: RunResults, covariance_mm2: Array | None = None) -> xarra
     frame.
     Raises InputError if xarray is not installed.
     """
-    try:
-        import xarray
-    except ImportError as error:
-        todo = "pip install 'telerig[notebook]'"
-        raise InputError("xarray is not installed", where="to_xarray", todo=todo) from error
     points = results.points.reset_index(drop=True)
     order = points.sort_values(["particle", "frame"], kind="stable").index
     points = points.loc[order].reset_index(drop=True)
@@ -129,12 +125,11 @@ def to_xarray(results: RunResults, covariance_mm2: Array | None = None) -> xarra
     if covariance is not None:
         words = {"units": "mm2", "long_name": "covariance of the position"}
         content["covariance"] = Variable(("obs", "axis", "axis_of"), covariance, words)
-    data = xarray.Dataset(
+    data = xarray_dataset(
         {name: (one.dimensions, one.values, one.attributes) for name, one in content.items()},
-        attrs=_global_attributes(results),
+        {} if covariance is None else {"axis": list("xyz"), "axis_of": list("xyz")},
+        _global_attributes(results),
     )
-    if covariance is not None:
-        data = data.assign_coords(axis=list("xyz"), axis_of=list("xyz"))
     particle = ("obs", points["particle"].to_numpy(), {"long_name": "particle"})
     return data.assign_coords(particle=particle).set_coords(["time", "x", "y", "z", "frame"])
 

@@ -31,6 +31,7 @@ LAB = (
 RIG = "rig: the first camera's frame, which rides on the stage; shake and travel are still in it"
 
 _UNITS = {
+    "_px_per_mm": "px mm-1", "_per_mm": "mm-1",
     "_mm_s2": "mm s-2", "_mm_s": "mm s-1", "_mm2": "mm2", "_mm": "mm", "_m_s2": "m s-2",
     "_px2": "px2", "_px": "px", "_rad": "rad", "_s": "s",
 }  # fmt: skip

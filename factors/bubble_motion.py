@@ -134,10 +134,15 @@ class Inertia:
 
 
 class LowPasses(NamedTuple):
-    """The most probable low-pass filter, and the shortest one that the run does not exclude."""
+    """The most probable low-pass filter, and the shortest one that the run does not exclude.
+
+    cancelled : variances of velocity (mm^2/s^2) and acceleration (mm^2/s^4) by which errors along
+        the path are smaller than independent errors along the axes would make them.
+    """
 
     probable: Inertia
     shortest: Inertia
+    cancelled: tuple[float, float] = (0.0, 0.0)
 
 
 def learned_names(model: BubbleModel) -> list[str]:

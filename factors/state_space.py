@@ -67,6 +67,12 @@ class Component:
         part."""
         return np.asarray(self.acceleration @ self.drift)
 
+    def density(self, frequency_hz: Array) -> Array:
+        """Return the one-sided spectral density (N,) of the position, in mm^2/Hz."""
+        swing = 2j * np.pi * frequency_hz[:, None, None] * np.eye(self.size) - self.drift
+        gain = np.linalg.solve(swing, self.noise[None])
+        return np.asarray(2 * (np.abs(self.position @ gain) ** 2).sum(-1))
+
     def without_input(self) -> Component:
         """Return the same process about a known mean, so that it has no inputs."""
         nothing = np.zeros((self.size, 0))

@@ -27,6 +27,7 @@ def frames_table(
     up: Array,
     gravity_m_s2: float,
     fluid: Any = None,
+    along: tuple[float, float] = (1.0, 1.0),
 ) -> pd.DataFrame:
     """Return the content of bubbles.csv: one row for each row of trajectories.csv.
 
@@ -34,6 +35,8 @@ def frames_table(
     up : (3,) unit vector against gravity in the rig frame.
     gravity_m_s2 : its magnitude.
     fluid : as for `liquid_of`; if it is None, the dimensionless numbers are NaN.
+    along : variances of velocity and acceleration along the slip velocity, divided by those that
+        errors independent along the axes would have.
     """
     liquid = liquid_of(fluid, gravity_m_s2)
     size = BODY_COLUMNS[2:]
@@ -52,8 +55,11 @@ def frames_table(
     acceleration, acceleration_sd = (_vectors(state, f"{p}a", "mm_s2") for p in ("", "s"))
     flow = liquid_velocity(None if liquid is None else liquid[1], up)
     slip = velocity - flow
-    inputs = [(slip, velocity_sd), (acceleration, acceleration_sd)]
-    curvature, curvature_sd = propagated(_curvature, [(velocity, velocity_sd), inputs[1]])
+    inputs = [
+        (slip, _errors(velocity_sd, slip, along[0])),
+        (acceleration, _errors(acceleration_sd, slip, along[1])),
+    ]
+    curvature, curvature_sd = propagated(_curvature, [(velocity, inputs[0][1]), inputs[1]])
     speed, speed_sd = propagated(lambda v: np.linalg.norm(v, axis=-1), inputs[:1])
     shape = {name: _column(table, name) for name in size}
     out = {name: table[name].to_numpy() for name in ("frame", "particle", "t_s")} | state | shape
@@ -72,6 +78,16 @@ def _column(table: pd.DataFrame, name: str) -> Array:
 
 def _vectors(columns: Mapping[str, Array], name: str, unit: str) -> Array:
     return np.stack([columns[f"{name}{axis}_{unit}"] for axis in AXES], -1)
+
+
+def _errors(sd: Array, direction: Array, share: float) -> Array:
+    """Return three independent errors (N, 3, 3) of one standard deviation each.
+
+    sd : (N, 3) along the axes. share : of the variance along the directions (N, 3) that is left.
+    """
+    unit = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    away = np.eye(3) - (1 - np.sqrt(share)) * unit[:, :, None] * unit[:, None, :]
+    return np.asarray(sd[..., None] * away)
 
 
 def _curvature(velocity: Array, acceleration: Array) -> Array:

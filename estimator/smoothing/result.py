@@ -12,7 +12,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.layout import points_in_rig
-from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.solve import Accelerations, Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     carriage,
     carriage_sigma,
@@ -202,7 +202,11 @@ def bubble_table(smoothing: Smoothing, fluid: Any = None) -> pd.DataFrame:
     up, gravity, known = _surroundings(smoothing, fluid)
     if not len(smoothing.trajectories):
         return smoothing.trajectories
-    return frames_table(smoothing.trajectories, smoothing.bodies, up, gravity, known)
+    along = smoothing.summary.get("along_path") or {}
+    return frames_table(
+        smoothing.trajectories, smoothing.bodies, up, gravity, known,
+        (along.get("velocity", 1.0), along.get("acceleration", 1.0)),
+    )  # fmt: skip
 
 
 def bubble_summary(
@@ -295,7 +299,19 @@ def _accelerations(solution: Solution) -> dict[str, Any]:
         "inertia_by_axis_s": dict(zip(AXES, found.inertia.time_s, strict=True)),
         "force_intensity": dict(zip(AXES, found.inertia.forces, strict=True)),
         "white_noise": dict(zip(("along", "across"), found.inertia.noise, strict=True)),
+        "along_path": _along_path(solution, found),
     }
+
+
+def _along_path(solution: Solution, found: Accelerations) -> dict[str, float]:
+    """Return the variances of velocity and acceleration along the paths, divided by those of errors
+    that are independent along the axes."""
+    square = solution.velocities_mm_s**2
+    share = square / np.maximum(square.sum(-1, keepdims=True), 1e-18)
+    speed = solution.velocity_variances() + considered_variance(solution)[1]
+    totals = [(share * v).sum(-1).mean() for v in (speed, found.sd_mm_s2**2)]
+    left = 1 - np.divide(found.low_passes.cancelled, totals)
+    return dict(zip(("velocity", "acceleration"), left.clip(_LEAST_LEFT, 1).tolist(), strict=True))
 
 
 def _direction(vector: Array) -> str:
@@ -465,6 +481,8 @@ def load_smoothing(folder: str | Path) -> Smoothing:
 
 
 AXES = ("x", "y", "z")
+_LEAST_LEFT = 0.1
+"""The pixels' noise alone leaves about a sixth of an acceleration's variance."""
 LONGEST_RTS = 5000
 MOST_RTS_ROWS = 40_000
 """Largest number of frames of a track, and of frames of all tracks in their order, for which the

@@ -239,6 +239,8 @@ class SmoothingFile(Record):
         axis, divided by that in the model; None and {} without accelerations.
     white_noise : standard deviation of the pixels' white noise "along" the rise and "across" it,
         divided by the stated one.
+    along_path : variances of "velocity" and "acceleration" along the bubbles' paths, divided by
+        those that errors independent along the axes would have; {} without accelerations.
     """
 
     MISSING: ClassVar[str] = "this run is not smoothed"
@@ -290,6 +292,7 @@ class SmoothingFile(Record):
     inertia_by_axis_s: dict[str, float] = Field(default_factory=dict)
     force_intensity: dict[str, float] = Field(default_factory=dict)
     white_noise: dict[str, float] = Field(default_factory=dict)
+    along_path: dict[str, float] = Field(default_factory=dict)
     rig_change: RigChange | None = None
     learning: dict[str, Any] = Field(default_factory=dict)
     seconds: dict[str, float] = Field(default_factory=dict)

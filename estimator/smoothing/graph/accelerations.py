@@ -63,7 +63,7 @@ def accelerations_of(
         return None
     rig = _rig_errors(solution, draws)
     low_passes = low_passes or learned_low_passes(solution, rig)
-    probable, shortest = low_passes
+    probable, shortest, _ = low_passes
     velocity, value = np.empty((2, graph.rows, 3))
     velocity_covariance, covariance = np.empty((2, graph.rows, 3, 3))
     displacement = list[Array]()
@@ -245,9 +245,7 @@ def _bandwidth_hz(process: Component, variance: float, highest_hz: float) -> flo
 
     frequency = np.geomspace(_LOWEST_HZ, highest_hz, _FREQUENCIES)
     omega = 2 * np.pi * frequency
-    swing = 1j * omega[:, None, None] * np.eye(process.size) - process.drift
-    gain = np.linalg.solve(swing, process.noise[None])
-    density = 2 * (np.abs(process.position @ gain) ** 2).sum(-1)
+    density = process.density(frequency)
 
     def left(log_noise: float) -> float:
         after = density / (1 + density / np.exp(log_noise))

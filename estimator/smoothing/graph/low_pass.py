@@ -27,6 +27,7 @@ from telerig.factors.bubble_motion import (
     Inertia,
     LowPasses,
     Prior,
+    bubble_processes,
     inertial_bubble_path,
 )
 from telerig.factors.state_space import Component, discretise, distinct_steps
@@ -37,6 +38,7 @@ RigErrors = tuple[Array, Array]
 _PIECE_FRAMES, LEARNED_ROWS, _DRAWS = 250, 6000, 2
 """Pieces of tracks of at most so many frames, so many together, with so many draws of the rig."""
 _LEAST_INFORMATION = 1e-6
+_SPECTRUM_HZ, _FREQUENCIES, _STILL_MM_S = (0.1, 3e4), 4000, 1e-9
 _EXCLUDED, _HALVINGS, _SHORTEST_S = 0.5, 6, 1e-5
 """A low-pass is excluded if its log-likelihood is so much less than that of the most probable."""
 
@@ -65,21 +67,74 @@ def learned_low_passes(solution: Solution, rig: RigErrors) -> LowPasses:
     place, information = _positions(
         solution, (rig[0][..., :_DRAWS], rig[1][..., :_DRAWS]), np.concatenate(pieces)
     )
-    t_s, up = graph.problem.t_s[graph.frame_of_row], graph.problem.up
+    t_s, up, bubble = graph.problem.t_s[graph.frame_of_row], graph.problem.up, graph.model.bubble
     dt_s, step = distinct_steps(np.concatenate([np.diff(t_s[p]) for p in pieces]))
     steps = np.split(step, np.cumsum([len(p) - 1 for p in pieces])[:-1])
-    ends, first = np.cumsum([len(p) for p in pieces])[:-1], np.eye(place.shape[-1])[0]
+    ends = np.cumsum([len(p) for p in pieces])[:-1]
 
-    def learned(directions: Array) -> Array:
+    def learned(directions: Array, bubble: BubbleModel = bubble) -> Array:
         paths = []
-        for direction in directions:
-            values, variance = _along(direction, place, information)
-            parts = zip(steps, np.split(values, ends), np.split(variance, ends), strict=True)
-            paths.append([Series(step, x - x[0, 0] * first, v) for step, x, v in parts])
-        return _Paths(graph.model.bubble, directions, dt_s, paths).learned()
+        for direction in np.broadcast_to(directions, (len(directions), len(place), 3)):
+            cut = (np.split(x, ends) for x in (direction, place, _variance(direction, information)))
+            paths.append([_series(*part) for part in zip(steps, *cut, strict=True)])
+        return _Paths(bubble, directions[:, 0], dt_s, paths).learned()
 
-    along, across = learned(up[None]), learned(np.linalg.svd(up[None])[2][1:])
-    return LowPasses(*(_by_axis(*both, up) for both in zip(along, across, strict=True)))
+    along, across = learned(up[None, None]), learned(np.linalg.svd(up[None])[2][1:, None])
+    probable, shortest = (_by_axis(*both, up) for both in zip(along, across, strict=True))
+    seen = information.any((1, 2))
+    if not seen.any():
+        return LowPasses(probable, shortest)
+    path = solution.state.bubbles[np.concatenate(pieces)] @ graph.bubble.velocity.T
+    path = path / np.maximum(np.linalg.norm(path, axis=-1, keepdims=True), _STILL_MM_S)
+    share = (path**2).mean(0)
+    plain = _without_swing(bubble, share)
+
+    def left_out(inertia: Inertia, derivative: int) -> float:
+        time_s = float(share @ inertia.time_s)
+        force = float(learned(path[None], replace(plain, inertia_s=time_s))[0, 1])
+        white = inertia.noise[1] + (inertia.noise[0] - inertia.noise[1]) * up**2
+        return _cancelled(
+            [inertial_bubble_path(bubble, axis, inertia) for axis in np.eye(3)],
+            inertial_bubble_path(plain, up, Inertia((time_s,) * 3, (force,) * 3)),
+            white**2 * noise, share, derivative,
+        )  # fmt: skip
+
+    every = np.diagonal(np.linalg.inv(information[seen]), axis1=1, axis2=2)
+    noise = 2 * float(np.median(dt_s[step])) * np.median(every, axis=0)
+    return LowPasses(probable, shortest, (left_out(shortest, 1), left_out(probable, 2)))
+
+
+def _cancelled(
+    axes: Sequence[Component], along: Component, noise: Array, share: Array, derivative: int
+) -> float:
+    """Return the variance by which a derivative's errors along the path are smaller than errors of
+    axes that are independent.
+
+    axes : processes along the axes, whose filters S / (S + N) made the estimate. along : process
+    that moves the bubbles along their paths. noise : (3,) one-sided densities N of the positions'
+    white noise, mm^2/Hz. share : (3,) mean squares of the components of the paths' directions.
+    """
+    frequency = np.geomspace(*_SPECTRUM_HZ, _FREQUENCIES)
+    density = np.stack([process.density(frequency) for process in axes])
+    kept = density / (density + noise[:, None])
+    mean = share @ kept
+    # forces across the path cancel along it where all axes are filtered alike
+    hidden = (1 - mean) ** 2 * along.density(frequency) + share @ ((kept - mean) ** 2 * density)
+    less = share @ (kept * (1 - kept) * noise[:, None]) - hidden
+    return float(np.trapezoid((2 * np.pi * frequency) ** (2 * derivative) * less, frequency))
+
+
+def _without_swing(bubble: BubbleModel, share: Array) -> BubbleModel:
+    """Return the model of a speed that wanders, driven as strongly as the axes are on average.
+
+    share : (3,) of each axis. The speed along a path does not swing as its components do.
+    """
+    driven = [
+        part * sum((p.component.noise[1] ** 2).sum() for p in bubble_processes(bubble, axis))
+        for part, axis in zip(share, np.eye(3), strict=True)
+    ]
+    sigma = float(np.sqrt(sum(driven) * bubble.velocity_tau_s / 2))
+    return replace(bubble, zigzags=(), velocity_sigma_mm_s=sigma)
 
 
 def _by_axis(along: Array, across: Array, up: Array) -> Inertia:
@@ -123,18 +178,31 @@ def _positions(solution: Solution, rig: RigErrors, rows: Ints) -> tuple[Array, A
         np.add.at(side, number[row], by_place.mT @ right)
     size = np.linalg.eigvalsh(information)
     seen = size[:, 0] > _LEAST_INFORMATION * size[:, -1]
-    information[~seen] = 0.0
+    information[~seen], side[~seen] = 0.0, 0.0
     side[seen] = np.linalg.solve(information[seen], side[seen])
     side[..., 0] += solution.state.bubbles[rows] @ graph.bubble.position.T
     return side, information
 
 
-def _along(direction: Array, place: Array, information: Array) -> tuple[Array, Array]:
-    """Return values (n, 1 + K) and variances (n,) along a direction (3,)."""
-    variance = np.full(len(place), np.inf)
+def _variance(direction: Array, information: Array) -> Array:
+    """Return the variances (n,) of positions along directions (n, 3)."""
+    variance = np.full(len(information), np.inf)
     seen = information.any((1, 2))
-    variance[seen] = direction @ np.linalg.solve(information[seen], direction[:, None])[..., 0].T
-    return np.asarray(np.einsum("d,ndk->nk", direction, place)), variance
+    along = np.linalg.solve(information[seen], direction[seen][..., None])[..., 0]
+    variance[seen] = (direction[seen] * along).sum(-1)
+    return variance
+
+
+def _series(step: Ints, direction: Array, place: Array, variance: Array) -> Series:
+    """Return the way (n, 1 + K) along directions (n, 3) that may turn, from places (n, 3, 1 + K).
+
+    The white noise of the places stays white, unless the direction turns quickly.
+    """
+    middle = (direction[1:] + direction[:-1]) / 2
+    way = np.einsum("nd,ndk->nk", middle, np.diff(place, axis=0))
+    start = direction[0] @ place[0]
+    start[0] = 0.0
+    return Series(step, np.cumsum(np.vstack([start, way]), 0), variance)
 
 
 @dataclass(frozen=True)

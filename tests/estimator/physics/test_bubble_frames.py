@@ -64,6 +64,24 @@ def test_standard_deviations_are_those_of_a_monte_carlo() -> None:
         assert abs(many[name].mean() - one[name]) < 0.15 * stated, name
 
 
+def test_errors_that_cancel_along_the_slip() -> None:
+    """Drawn with so much less variance along the slip velocity."""
+    rng, count, (slow, calm) = np.random.default_rng(2), 20_000, (0.4, 0.1)
+    sharp = body(count).assign(sd_eq_mm=1e-9, s_aspect=1e-9)
+    one = frames_table(motion(), sharp, UP, G, WATER, (slow, calm)).iloc[0]
+    drawn, along = motion(count), np.array([60.0, -250.0, -20.0])
+    along /= np.linalg.norm(along)
+    for columns, sd, share in (
+        (["vx_mm_s", "vy_mm_s", "vz_mm_s"], 3.0, slow),
+        (["ax_mm_s2", "ay_mm_s2", "az_mm_s2"], 120.0, calm),
+    ):
+        off = sd * rng.standard_normal((count, 3))
+        drawn[columns] += off - (1 - np.sqrt(share)) * np.outer(off @ along, along)
+    many = frames_table(drawn, sharp, UP, G, WATER)
+    for name in ("reynolds", "weber", "drag", "slip_mm_s", "curvature_1_mm"):
+        assert many[name].std() == pytest.approx(one[f"s_{name}"], rel=0.04), name
+
+
 def test_numbers_by_hand() -> None:
     row = frames_table(motion(), body(), UP, G, WATER).iloc[0]
     speed = np.sqrt(60**2 + 250**2 + 20**2)

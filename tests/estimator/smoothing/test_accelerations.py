@@ -21,7 +21,7 @@ from telerig.estimator.smoothing.problem.problem import (
     ShakeModel,
     SmoothingProblem,
 )
-from telerig.estimator.smoothing.result import trajectories
+from telerig.estimator.smoothing.result import _along_path, trajectories
 from telerig.estimator.smoothing.verdict.purposes import uses
 from telerig.factors.bubble_motion import (
     BubbleModel,
@@ -76,11 +76,12 @@ def stepped(drift: Array, noise: Array, step_s: float) -> tuple[Array, Array]:
 
 def drawn_bubbles(
     rng: np.random.Generator, inertia_s: float, frames: int, bubbles: int, step_s: float,
-    stated: float = 1.0,
+    stated: float = 1.0, steady: bool = False,
 ) -> tuple[SmoothingProblem, Array]:  # fmt: skip
     """A problem of a still rig, and the true velocities and accelerations (2, bubbles, F, 3).
 
     stated : standard deviation of the pixels as stated, over the true one.
+    steady : whether the rise keeps the speed of each path constant.
     """
     drift, noise, start = axis_process(inertia_s)
     phi, q = stepped(drift, noise, step_s)
@@ -91,6 +92,14 @@ def drawn_bubbles(
         x[i] = x[i - 1] @ phi.T + rng.standard_normal((bubbles, 3, 5)) @ roots[1].T
     t = step_s * np.arange(frames)
     lab = x[..., 0].swapaxes(0, 1) + 100 * UP * t[:, None] + rng.uniform(-5, 5, (bubbles, 1, 3))
+    truth = np.stack([x[..., 1] + 100 * UP, x @ drift[1]]).swapaxes(1, 2)
+    if steady:
+        (vx, vz), (ax, az) = truth[..., [0, 2]].transpose(0, 3, 1, 2)
+        truth[0, ..., 1] = -np.sqrt(400.0**2 - vx**2 - vz**2)
+        truth[1, ..., 1] = -(vx * ax + vz * az) / truth[0, ..., 1]
+        v, a = truth[..., 1]
+        way = step_s * (v[:, 1:] + v[:, :-1]) / 2 + step_s**2 * (a[:, :-1] - a[:, 1:]) / 12
+        lab[:, 1:, 1] = lab[:, :1, 1] + np.cumsum(way, 1)
     item, frame, camera = (
         a.ravel() for a in np.meshgrid(np.arange(bubbles), np.arange(frames), [0, 1], indexing="ij")
     )
@@ -99,7 +108,6 @@ def drawn_bubbles(
     covariance = np.tile((stated * PIXEL) ** 2 * np.eye(2), (len(uv), 1, 1))
     seen = Observations(item, frame, camera, uv, covariance)
     tracks = tuple(Bubble(k, 0, frames - 1, lab[k, 0], lab[k]) for k in range(bubbles))
-    truth = np.stack([x[..., 1] + 100 * UP, x @ drift[1]]).swapaxes(1, 2)
     return SmoothingProblem(CAMERAS, t, UP, UP, tracks, seen), truth
 
 
@@ -196,6 +204,26 @@ def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learne
     mean = np.mean(squares, axis=(0, 2, 3))
     assert ((mean > 0.8) & (mean < 1.25)).all()
     assert 0.4 < np.mean(ways) < 1.8  # 27 of them
+
+
+@pytest.mark.parametrize("steady", [False, True])
+def test_errors_along_the_paths(steady: bool) -> None:
+    """As independent axes make them, or smaller: with a constant speed, forces are across it."""
+    problem, truth = drawn_bubbles(np.random.default_rng(4), 0.01, 250, 4, 0.004, steady=steady)
+    solution = solved(problem, model_of(None))
+    found = solution.accelerations
+    assert found is not None
+    velocity = truth[0].reshape(-1, 3)
+    path = velocity / np.linalg.norm(velocity, axis=-1, keepdims=True)
+    stated = _along_path(solution, found)
+    for name, value, true, variance in (
+        ("velocity", solution.velocities_mm_s, truth[0], solution.velocity_variances()),
+        ("acceleration", found.value_mm_s2, truth[1], found.sd_mm_s2**2),
+    ):
+        square = (((value - true.reshape(-1, 3)) * path).sum(-1) ** 2).mean()
+        share = square / (path**2 * variance).sum(-1).mean()
+        assert 0.7 < stated[name] / share < 1.5, (name, stated[name], share)
+        assert (stated[name] < 0.7) == steady
 
 
 @pytest.mark.parametrize("stated", [1.0, 4.0])

@@ -42,7 +42,7 @@ def block(lines: list[str]) -> list[str]:
             parts.append((f"- **{inline(item[1])}** : ", [item[2]]))
         elif bullet:
             parts.append(("- ", [bullet[1]]))
-        elif parts and (line.startswith(" ") or not parts[-1][0]):
+        elif parts and (line[0] == " " or not parts[-1][0] or parts[-1][1][-1][-1:] not in ".:"):
             parts[-1][1].append(line.strip())
         else:
             parts.append(("", [line.strip()]))

@@ -299,7 +299,7 @@ def _pixels(solution: Solution, span: Span) -> dict[str, Pixels]:
         step = 1 if whole else -(-len(square) // _SAMPLED) or 1
         out[source] = Pixels(
             source, int(np.count_nonzero(mine)), len(when), float(when.min(initial=np.inf)),
-            float(when.max(initial=-np.inf)), float(square.sum()), square[::step],
+            float(when.max(initial=-np.inf)), float(square.sum()), square[::step].copy(),
         )  # fmt: skip
     return out
 

@@ -98,7 +98,7 @@ class Motion:
 
 
 def _chosen(blocks: Array, which: Ints) -> Array:
-    """(M, i, j) blocks (U, i, j)[which]; one block is not copied."""
+    """Return blocks (M, i, j) of (U, i, j) by index; a single block is not copied."""
     if len(blocks) == 1:
         return np.broadcast_to(blocks[0], (len(which), *blocks.shape[1:]))
     return np.asarray(blocks[which])

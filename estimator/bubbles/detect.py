@@ -410,7 +410,7 @@ def _known(outlines: Outlines) -> Bools:
 
 
 def _defocused(outlines: Outlines, sharp_share: float) -> Bools:
-    """sharp_share : an edge narrower than this, against the radius, is sharp."""
+    """Return which outlines are out of focus; sharp_share : blur over radius of a sharp edge."""
     sharp = float(np.quantile(outlines.blur_px, 0.25))
     least = max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX)
     radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])

@@ -88,7 +88,7 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
 
 
 def _divisible(image: NDArray[Any]) -> NDArray[Any]:
-    """The image in a type that OpenCV divides without a copy, or else in single precision."""
+    """Return the image in a type that OpenCV divides without a copy, or in single precision."""
     return image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32, copy=False)
 
 

@@ -121,7 +121,7 @@ def _refined(t: Array, y: Array, f: float, around: float) -> float:
 
 
 def _density(t: Array, left: Array, f: float, duration: float) -> float:
-    """One-sided density at f, per component, as it enters a variance.
+    """Return the one-sided density at f by component, as it enters a variance.
 
     From the periodogram within 5 periods of the record, without the one about f that the fit has
     emptied. It is taken to fall with the power 2.5 of the frequency, as a velocity does between the

@@ -136,6 +136,6 @@ class _Sight:
         return self.box_mm3 * float(self._whole(self.pixels, extents).mean()), extents
 
     def whole(self, points_mm: Array, extents_px: Array) -> Array:
-        """(N,) whether bodies of these half widths are seen whole at points (N, 3) of the rig."""
+        """Return whether (N,) bodies of these half widths at points (N, 3) are seen whole."""
         pixels, _ = stacked_jacobian(self.cameras, points_mm)
         return self._whole(pixels, extents_px)

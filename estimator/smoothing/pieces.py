@@ -260,7 +260,7 @@ def _in_turn(
 def _conditional(
     one: _Constant, given: Sequence[_Constant], mean: Array, covariance: Array
 ) -> Known:
-    """What is known of one constant where others are given, from the (C, C) covariance of all."""
+    """Return what is known of one constant given others, from the covariance (C, C) of all."""
     key, at = one
     others = np.concatenate([np.zeros(0, np.int64), *(places for _, places in given)])
     cross = covariance[np.ix_(at, others)]
@@ -301,7 +301,7 @@ def _sizes(problem: SmoothingProblem, model: ShakeModel) -> Sizes:
 def _here(
     problem: SmoothingProblem, whole: SmoothingProblem, sizes: Sizes
 ) -> dict[ConstantFamily, Ints]:
-    """(N, n) places of a piece's constants among those of the run, by family."""
+    """Return the places (N, n) of a piece's constants among the run's, by family."""
     names = [a.name for a in whole.accelerometers]
     sensors = [names.index(a.name) for a in problem.accelerometers]
     clocks = clocks_of(whole)[sensors].tolist()
@@ -322,6 +322,6 @@ def _here(
 
 
 def _places(graph: GraphLayout, whole: SmoothingProblem, sizes: Sizes) -> Ints:
-    """(c,) places of a piece's constants, in the order of its keys, among those of the run."""
+    """Return the places (c,) of a piece's constants among the run's, in the order of its keys."""
     here = _here(graph.problem, whole, sizes)
     return np.concatenate([here[family].ravel() for family in _FAMILIES])

@@ -502,7 +502,7 @@ def _break(close: list[Branch], tracks: list[Track]) -> list[Broken]:
 
 
 def _agreed_links_from(paths: list[list[list[tuple[int, int]]]]) -> int:
-    """The first frame from which all branches tie the same measurements together."""
+    """Return the first frame from which all branches tie the same measurements together."""
     frames = sorted({frame for path in paths for h in path for frame, _ in h})
     by_frame = [[dict(h) for h in path] for path in paths]
     start = frames[-1]

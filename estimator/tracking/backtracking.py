@@ -623,7 +623,7 @@ def _row(
 
 
 def _outline_over(sight: Sight, camera: int, uv_px: Array, radius_px: float) -> float:
-    """Semi-axis (px) of the largest outline that covers a part of the disc; 0 if there is none."""
+    """Return the semi-axis (px) of the largest outline that covers a part of the disc, or 0."""
     long = sight.a_px[camera]
     away = np.linalg.norm(sight.centre_px[camera][:, :2] - uv_px, axis=1)
     covering = away < long + 0.5 * radius_px

@@ -115,7 +115,7 @@ def _look(
 
 
 def _find_dots(run: RunData, looks: Looks, batch: Batch) -> pd.DataFrame:
-    """Every dot in the images of some frames, `DOT_COLUMNS`."""
+    """Return every dot in the images of some frames, `DOT_COLUMNS`."""
     rows: list[tuple[Any, ...]] = []
     for frame in range(*batch):
         for name, look in looks.items():
@@ -129,7 +129,7 @@ def _find_dots(run: RunData, looks: Looks, batch: Batch) -> pd.DataFrame:
 def _sightings(
     run: RunData, followers: Mapping[str, Follower], store: DetectionStore
 ) -> pd.DataFrame:
-    """Every dot that a camera's follower gives a number, `REFERENCE_COLUMNS`."""
+    """Return every dot that a camera's follower gives a number, `REFERENCE_COLUMNS`."""
     parts = [pd.DataFrame(columns=REFERENCE_COLUMNS)]
     for batch in store.batches if followers else ():
         dots = read_batch(store.path(batch, "dots"))

@@ -204,7 +204,7 @@ class RowMaker:
             self._waiting += 1 + len(frame.pairs)
 
     def _flush(self, ahead: int) -> Linked:
-        """Rows of all closed frames but the last few, by which hidden bubbles are smoothed."""
+        """Return rows of closed frames but the last few, which hidden bubbles may need."""
         done = self._closed[: len(self._closed) - ahead]
         self._closed, self._waiting = self._closed[len(done) :], 0
         window = [*self._before, *done, *self._closed]
@@ -265,13 +265,13 @@ class RowMaker:
 
 
 def _starts(frames: Sequence[Frame]) -> Ints:
-    """(2, F) position of each frame's first detection in each camera's joined tables."""
+    """Return the position (2, F) of each frame's first detection in the cameras' tables."""
     many = np.array([[len(table) for table in f.tables] for f in frames], np.int64).reshape(-1, 2)
     return (np.cumsum(many, axis=0) - many).T
 
 
 def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
-    """(M, 2, 2, 2) per camera: share of the bubble's shape in its centre's covariance."""
+    """Return the share (M, 2, 2, 2) of the unknown shape in the centres' covariances, by camera."""
     out = np.zeros((len(bodies.points_mm), 2, 2, 2))
     known = np.isfinite(bodies.covariance_mm2).all((1, 2))
     share = (bodies.covariance_mm2 - bodies.silhouette_covariance_mm2)[known]
@@ -308,7 +308,7 @@ def pair_frame(sight: Sight, model: PairModel, predicted: Prediction | None) -> 
 
 
 def _others(rows: Ints, many: int) -> Ints:
-    """The numbers below ``many`` that are not among the rows."""
+    """Return the numbers below ``many`` that are not among the rows."""
     out = np.ones(many, bool)
     out[rows] = False
     return np.flatnonzero(out)
@@ -325,7 +325,7 @@ def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
 def _measured(
     pairs: Pairs, unpaired: tuple[Ints, Ints], pixels: tuple[Pixels, Pixels], offset_px: Array
 ) -> FrameMeasurements:
-    """The tracker's input; unpaired : rows of the detections without a partner."""
+    """Return the tracker's input; unpaired : rows of the detections without a partner."""
     (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, unpaired))
     singles = SingleMeasurements(
         np.repeat([0, 1], [len(i) for i in unpaired]).astype(np.int64),

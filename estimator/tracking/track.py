@@ -301,7 +301,7 @@ def tracking_stream(
 
 
 def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:
-    """In a run of fewer frames than confirm a track, all its frames do."""
+    """Return the settings; in a run too short to confirm a track, all of its frames do."""
     settings = options.tracker
     hits = max(1, min(settings.confirm_hits, run.frame_count))
     return replace(settings, confirm_hits=hits, confirm_frames=max(hits, settings.confirm_frames))

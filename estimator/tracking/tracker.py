@@ -502,7 +502,7 @@ class Tracker:
         return gains
 
     def _new(self, scan: Scan, column: int) -> Track:
-        """A track at a measurement, with the mean rise velocity once velocities are the lab's."""
+        """Start a track at a measurement, with the mean rise if velocities are the lab's."""
         velocity = np.array(self.axis) * (self.settings.rise_mm_s if self.stage.in_lab else 0.0)
         return born(scan, column, velocity, self.stage.in_lab, self._confirmed())
 

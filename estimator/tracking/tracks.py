@@ -232,14 +232,14 @@ def _read_part(
 
 
 def _with_texts(columns: Sequence[Column]) -> list[Column]:
-    """The columns, and those that have text where a table has them."""
+    """Return the columns, as text where a table has text."""
     texts = [Column(name, "text", required=False, blank=True) for name in ("flags", "reason")]
     named = {column.name for column in columns}
     return [*columns, *(column for column in texts if column.name not in named)]
 
 
 def _numbered(table: pd.DataFrame) -> pd.DataFrame:
-    """The table with whole numbers for ids of bubbles that are such."""
+    """Return the table with ids of bubbles as whole numbers where they are numbers."""
     table = table.reset_index(drop=True)
     if "particle" in table:
         ids = pd.to_numeric(table["particle"].replace("", np.nan), errors="coerce")

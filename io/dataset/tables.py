@@ -436,7 +436,7 @@ def _detections(
 
 
 def _pixel_columns(own: list[Column]) -> list[Column]:
-    """The columns of a table of pixels with ``own`` columns."""
+    """Return the columns of a table of pixels with ``own`` columns."""
     return [
         Column("frame", "whole"),
         Column("camera", "name"),

@@ -494,14 +494,14 @@ def _filled(sample: _Sample, layers: Layers, hidden: Bools, usable: Bools) -> La
 
 
 def _least_seen(frames: int) -> int:
-    """Frames that must show a pixel that a bubble usually hides before they are believed."""
+    """Return how many frames must show a usually hidden pixel before they are believed."""
     return max(_LEAST_SEEN, frames // 7)
 
 
 def _mean_rig(
     layers: Layers, marked: Bools, residuals: Float32, covered: Bools
 ) -> tuple[Layers, Float32]:
-    """The rig layer as the mean of the frames' unmarked pixels, and (H, W) their number.
+    """Return the rig layer as the mean of unmarked pixels, and their number (H, W).
 
     residuals : of the layers; they become those of the new layers.
     """

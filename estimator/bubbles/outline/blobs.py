@@ -91,7 +91,7 @@ def noise_share(ratio: Float32, field: Bools | None = None) -> float:
 
 
 def _band_step(ratio: Float32) -> int:
-    """Rows from one band to the next: all of a small image, a quarter of a large one."""
+    """Return the rows from one band to the next: all of a small image, a quarter of a large one."""
     return _BAND_ROWS - 2 if ratio.size < 4 * _NOISE_SAMPLES else 4 * _BAND_ROWS
 
 
@@ -318,7 +318,7 @@ def _sense(points: Array) -> float:
 
 
 def _turning(points: Array, arm: int) -> Array:
-    """Turn (n,) of the outline over ``arm`` points before and after, towards +v from +u."""
+    """Return the turn (n,) of the outline over ``arm`` points on both sides, towards +v from +u."""
     back = points - np.roll(points, arm, axis=0)
     ahead = np.roll(points, -arm, axis=0) - points
     cross = back[:, 0] * ahead[:, 1] - back[:, 1] * ahead[:, 0]
@@ -372,7 +372,7 @@ def _cut_open(contour: Array, sense: float) -> list[Array]:
 
 
 def _trimmed(points: Array, bounds: list[int]) -> list[Array]:
-    """Arcs between bounds, without the points that the notch's blur has moved."""
+    """Return arcs between bounds, without the points that the notch's blur has moved."""
     arcs = [points[low + 2 : high - 1] for low, high in itertools.pairwise(bounds)]
     return [arc for arc in arcs if len(arc) >= _SHORTEST_ARC]
 
@@ -453,7 +453,7 @@ def split_blobs(blobs: list[Blob], shape: tuple[int, ...], *, min_diameter_px: f
 
 
 def _in_image(blob: Blob) -> Array:
-    """The outline's points that are not on the image's edge."""
+    """Return the outline's points that are not on the image's edge."""
     return blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
 
 
@@ -464,7 +464,7 @@ def _tolerance(ellipse: Array) -> Array:
 def _split(
     contour: Array, arcs: list[Array], shape: tuple[int, ...], min_diameter_px: float
 ) -> list[Array]:
-    """Ellipses (5,) that explain the outline ``contour`` and its arcs; [] if none do."""
+    """Return ellipses (5,) that explain the outline ``contour`` and its arcs; [] for none."""
     if not arcs or len(arcs) > _MAX_ARCS:
         return []
     return _explained(_grouped(arcs, contour), contour, shape, min_diameter_px)
@@ -473,7 +473,7 @@ def _split(
 def _explained(
     groups: list[Array], contour: Array, shape: tuple[int, ...], min_diameter_px: float
 ) -> list[Array]:
-    """Ellipses (5,) along groups of arcs that explain the outline; [] if they do not explain it."""
+    """Return ellipses (5,) along groups of arcs if they explain the outline; else []."""
     if not groups:
         return []
     fitted, rms = fit_ellipses(groups)
@@ -555,7 +555,7 @@ def _explains(ellipses: list[Array], contour: Array) -> bool:
 
 
 def _filled(contour: Array, low: Ints, high: Ints) -> NDArray[np.uint8]:
-    """The outline filled, in the window of pixels (u, v) from ``low`` to before ``high``."""
+    """Fill the outline in the window of pixels (u, v) from ``low`` to before ``high``."""
     canvas = np.zeros((high - low)[::-1], np.uint8)
     cv2.fillPoly(canvas, [np.round(contour - low).astype(np.int32)[:, None]], 1)
     return canvas

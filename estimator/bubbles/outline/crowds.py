@@ -127,7 +127,7 @@ def _blob(rims: Rims, k: int) -> Blob:
 
 
 def _explained(shape: tuple[int, ...], ellipses: Array) -> NDArray[np.uint8]:
-    """What ellipses (N, 5) and the surroundings of their rims cover of an image is not 0."""
+    """Return an image that is not 0 where ellipses (N, 5) and their rims' surroundings are."""
     covered = np.zeros(shape, np.uint8)
     for u, v, a, b, angle in ellipses.tolist():
         margin = _EXPLAINED_SHARE * (a * b) ** 0.5 + _EXPLAINED_PX

@@ -50,7 +50,7 @@ class Judged(NamedTuple):
 
 @compiled
 def _level(image: Float32, u: float, v: float) -> float:
-    """Grey level between pixels, bilinear; beyond the image that of its edge."""
+    """Interpolate the grey level bilinearly; beyond the image it is that of the edge."""
     rows, columns = image.shape
     u, v = min(max(u, 0.0), columns - 1.001), min(max(v, 0.0), rows - 1.001)
     row, column = int(v), int(u)

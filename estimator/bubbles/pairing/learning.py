@@ -268,7 +268,7 @@ def _learnt(old: LogRatioModel, name: str, ratio: Array, weight: Array) -> LogRa
 
 
 def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
-    """Means and spreads of all detections; outliers count as 3 sd, few draw to the usual."""
+    """Return means and spreads of all detections; outliers count as 3 sd."""
     learnt: dict[str, LogRatioModel] = {}
     for name, usual in _USUAL.items():
         means, squares, count = [], _USUAL_WEIGHT * usual, _USUAL_WEIGHT

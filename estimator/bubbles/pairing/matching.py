@@ -800,7 +800,7 @@ def _track_density(
 def _unmatched_density(
     view: View, model: PairModel, predicted: Prediction, seen: tuple[Array, Array], c: int
 ) -> Array:
-    """(N, K) expected density of detections whose track only this camera sees, over the usual.
+    """Return the density (N, K) of detections of tracks that only this camera sees, relative.
 
     seen : the tracks' pixels (K, 4) in both cameras, and their derivatives (K, 4, 3).
     """

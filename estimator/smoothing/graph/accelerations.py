@@ -212,7 +212,7 @@ class _Chains:
         return np.asarray(own + ((last - first) ** 2).sum(-1) / draws)
 
     def _pooled(self, values: Array) -> Array:
-        """Means of values (rows, 3, 3) over neighbours in time, each bubble by itself."""
+        """Average values (rows, 3, 3) over neighbours in time, each bubble by itself."""
         from scipy.ndimage import uniform_filter1d
 
         t_s, first = self.graph.problem.t_s, self.graph.first_row

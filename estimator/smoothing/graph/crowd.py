@@ -307,7 +307,7 @@ def _mean_row(mean: GraphLayout) -> Ints:
 
 
 def _turn(one: GraphLayout, row: Ints, other: GraphLayout, to: Ints) -> Array | None:
-    """(n, D, D) from a basis of rows of one graph to that of rows of another; None: the same."""
+    """Return (n, D, D) from a basis of rows of one graph to another's; None for equal ones."""
     kind = one.row_basis[row] * (len(other.bubble_motion.basis) + 1) + other.row_basis[to]
     kinds, first, place = np.unique(kind, return_index=True, return_inverse=True)
     turns = np.linalg.solve(other.bubble_basis(to[first]), one.bubble_basis(row[first]))
@@ -381,7 +381,7 @@ def _step_roots(
     graph: GraphLayout, mean: GraphLayout, chains: BubbleChains, step: LinearFactors,
     alive: Ints, staying: Ints,
 ) -> Array:  # fmt: skip
-    """(M, D, D) that turn one bubble's whitened steps into those of the mean bubble."""
+    """Return matrices (M, D, D) from one bubble's whitened steps to those of the mean bubble."""
     frame = mean.frame_of_row[mean.moving_rows]
     size, stay = mean.bubble.size, staying[frame]
     noise = np.eye(size) / stay[:, None, None]

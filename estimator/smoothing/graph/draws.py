@@ -77,7 +77,7 @@ def _drawn(
     graph: GraphLayout, factors: Sequence[LinearFactors], root: EliminatedGraph | EliminatedCrowd,
     count: int, rng: Generator,
 ) -> Draws:  # fmt: skip
-    """The root is refined, because A^T A alone has too few digits."""
+    """Draw errors and residuals; the root is refined, since A^T A alone has too few digits."""
     noise = [rng.standard_normal((*f.rhs.shape, count)) for f in factors]
     starts = starts_of(graph)
     errors, left = np.zeros((int(starts[-1]), count)), noise

@@ -518,7 +518,7 @@ class GraphLayout:
         return read and model.encoder_scale_sigma > 0, read and model.encoder_delay_sigma_s > 0
 
     def by_encoder(self, by_scale: Array, by_delay: Array) -> Array:
-        """(..., n, 0 to 2) derivatives by those of the encoder's constants that are variables."""
+        """Return the columns (..., n, 0 to 2) of derivatives by the encoder's free constants."""
         return np.asarray(np.stack([by_scale, by_delay], -1)[..., np.array(self.encoder_flags)])
 
     @property

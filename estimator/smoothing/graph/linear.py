@@ -257,7 +257,7 @@ def _one_camera(
     graph: GraphLayout, state: State, obs: Observations, camera: int, mine: Ints,
     at_frames: Array, moving: _Moving,
 ) -> LinearFactors:  # fmt: skip
-    """Some pixels of one camera, all of weight 1. at_frames : (F, D) states of the shake."""
+    """Return factors of some pixels of one camera; at_frames : (F, D) states of the shake."""
     problem, layout, frame = graph.problem, graph.shake, obs.frame[mine]
     w = whitener_of(obs.covariance_px2[mine]) / graph.model.pixel_inflation
     shake = at_frames[frame]

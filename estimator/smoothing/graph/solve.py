@@ -320,7 +320,7 @@ def _check_variances(found: Covariances | None) -> None:
 
 
 def _warm(graph: GraphLayout, state: State, start: Solution) -> State:
-    """The first guess with whatever of another solution has the same meaning here."""
+    """Return the first guess with the values of another solution where they have one meaning."""
     same = {
         name: value
         for name, value in vars(start.state).items()
@@ -480,12 +480,12 @@ def _covariances(graph: GraphLayout, blocks: Blocks) -> Covariances:
 
 
 def _parts(count: int) -> list[Ints]:
-    """Some thousand numbers at a time, since what is worked out on the way takes memory."""
+    """Yield parts of some thousand numbers, to limit the memory for intermediate results."""
     return [np.arange(i, min(i + _AT_ONCE, count)) for i in range(0, count, _AT_ONCE)]
 
 
 def _frame_basis(graph: GraphLayout, frame: Ints) -> Array:
-    """(n, D, D) from the increments of the shake at its nodes to its states at frames (n,)."""
+    """Return (n, D, D) from increments of the shake at its nodes to its states at frames (n,)."""
     basis = graph.shake_basis(graph.nodes.of_frame[frame])
     return basis if graph.to_frames is None else graph.to_frames[frame] @ basis
 

@@ -185,7 +185,7 @@ _LAWS = {
 
 
 def _forces(config: RunConfig, population: Population, rng: Generator) -> Forces:
-    """The forces on each bubble.
+    """Return the forces on each bubble.
 
     Raises InputError for bubbles so small that the law does not hold.
     """

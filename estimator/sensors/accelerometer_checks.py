@@ -15,7 +15,7 @@ _FLOATING_M_S2 = 0.6
 _DOUBLED = (1.8, 2.2)
 _FIT = 1.5
 _PARTS, _CLEAR_SIGMAS = 8, 4.0
-"""A record tells its gravity to 4 times the standard error that the medians of 8 parts give."""
+"""A record determines gravity to 4 times the standard error that the medians of 8 parts give."""
 
 _TILTED_DEG = 20.0
 _FITS_DEG = 15.0

@@ -116,7 +116,7 @@ def solved_pieces(
 ) -> Iterator[tuple[Piece, Window, Solution]]:
     """Yield the solution of each piece of a run, one after the other.
 
-    constants : what the run tells of them; None where there are none.
+    constants : the run's information about them; None where there are none.
     chosen : which pieces; None for all.
     """
     for number in range(len(pieces)) if chosen is None else chosen:

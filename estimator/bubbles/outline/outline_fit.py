@@ -112,7 +112,7 @@ class Prior:
 
     @staticmethod
     def weak(harmonics: Array) -> Prior:
-        """Return the prior that says nothing of the flattening."""
+        """Return the prior without information on the flattening."""
         count = len(harmonics)
         return Prior(harmonics, np.zeros((count, 2)), np.full(count, np.inf))
 

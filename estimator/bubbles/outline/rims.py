@@ -239,8 +239,8 @@ def typical_heart(rims: Rims, min_diameter_px: float) -> float:
 def sole_owners(rims: Rims, evidence: Array, sure: int = 0) -> Index:
     """Return the positions of candidates no two of which claim the same rim, the surest first.
 
-    evidence : (N,) what speaks for each. sure : number of candidates, the first ones, that are
-        bubbles in any case.
+    evidence : (N,) of each, as `are_bubbles` returns it.
+    sure : number of candidates, the first ones, that are bubbles in any case.
     """
     rank = evidence + np.where(np.arange(len(rims)) < sure, 2.0, 0.0)
     order = np.argsort(-rank, kind="stable")
@@ -251,10 +251,10 @@ def sole_owners(rims: Rims, evidence: Array, sure: int = 0) -> Index:
 
 
 def are_bubbles(rims: Rims, heart: float, min_contrast: float) -> tuple[Bools, Array]:
-    """Return which candidates look like the bubbles of their image, and what speaks for each.
+    """Return which candidates look like the bubbles of their image, and the evidence for each.
 
-    heart : what `typical_heart` said. Where bubbles show bright hearts, a candidate that shows less
-        has to show more of its rim; so has every candidate where there are no hearts to tell, and
+    heart : result of `typical_heart`. Where bubbles show bright hearts, a candidate that shows less
+        has to show more of its rim; so has every candidate where no bubble has a heart, and
         one whose ring is uneven.
     """
     evidence = rims.agreement - _HEART_WEIGHT * np.maximum(heart - rims.heart, 0.0)

@@ -188,7 +188,7 @@ def ratio_log_odds(
     ratio, total : (E, K) differences and sums of the logarithms, less their means. NaN where
         unknown: such pairs get 0.
     axes, alike : (K, K), (K,) as in `LogRatioModel.uncorrelated`.
-    wrong : (E,) chance that a measurement says nothing about the bubble.
+    wrong : (E,) probability that a measurement is unrelated to the bubble.
     rare : limit of the bubble's rareness (standard deviations)
     freedom : that of the tails.
     """

@@ -745,7 +745,7 @@ def _ratio_log_odds(expected: LogRatioModel, ratio: Array, total: Array, wrong: 
     have correlation 1 - scatter / 2; the log odds are those of the two normal distributions. How
     rare a bubble is counts to ``_RARE`` standard deviations.
     ratio, total : (..., K) differences and sums of the logarithms.
-    wrong : (...) chance that one of the measurements says nothing about the bubble.
+    wrong : (...) probability that a measurement is unrelated to the bubble.
     """
     from telerig.estimator.bubbles.pairing import kernels
 

@@ -1,6 +1,6 @@
 """Grow a lattice from unordered dots: which of them lie on one grid, and at which places.
 
-The dots are circles, so their median ellipse tells the foreshortening. Mapping that ellipse to a
+The dots are circles, so their median ellipse gives the foreshortening. Mapping that ellipse to a
 circle gives the grid's cell its true shape to first order, however strong the tilt. From there the
 grid grows place by place, each predicted from the dots around it, so that perspective and
 distortion only have to be smooth.

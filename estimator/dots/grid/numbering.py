@@ -1,6 +1,6 @@
 """Number the dots of one image: which dot of the target is each.
 
-The lattice tells which dots are neighbours; the marks, the extent of a bounded grid and the pitch
+The lattice shows which dots are neighbours; the marks, the extent of a bounded grid and the pitch
 ratio tell which dot is which. Every placement of the target on the lattice gets a log-likelihood.
 One mark that is missed, or one dot that only looks like a mark, makes a numbering less likely but
 not impossible, so the evidence of each place is bounded on both sides. Where the evidence does not

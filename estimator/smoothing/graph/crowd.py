@@ -7,8 +7,8 @@ gradients: they are those of the joint graph.
 
 The preconditioner is a graph like the joint one with a single bubble, the mean of those in sight:
 its noise, of motion and of pixels, is smaller by the root of their number. For bubbles alike in
-noise that are all seen all the time it is the Schur complement itself, since differences between
-bubbles know nothing of the shake. Where bubbles come and go it is close. It gives the
+noise that are all seen all the time it is the Schur complement itself, since the shake cancels in
+differences between bubbles. Where bubbles come and go it is close. It gives the
 covariances: that of bubble k is what it would be were the rig known, plus what not knowing the rig
 adds to that of the mean bubble.
 """

@@ -18,7 +18,7 @@ _LEAST_SHARE = 0.08
 _SIGNIFICANT = 3.0
 _LEAST_SAMPLES = 32
 _BLUR = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
-"""One record's spectrum of a random vibration is speckled: a line is not one of its grains."""
+"""The spectrum of one record of a random vibration scatters; it is smoothed to find peaks."""
 _BLUR_HALF = 1.0
 _ALIKE = 0.7
 _STRONGER = 2.0

@@ -83,7 +83,7 @@ def unit_in(name: str) -> str:
 def axes_in(names: Iterable[str]) -> list[tuple[str, str, str]]:
     """Return every three channels whose names differ only in their axis x, y, z.
 
-    Names that speak of an acceleration go before plain ``x``, ``y``, ``z``; those of other
+    Names of an acceleration go before plain ``x``, ``y``, ``z``; those of other
     quantities are left out.
     """
     found: dict[bool, dict[str, dict[str, str]]] = {True: {}, False: {}}

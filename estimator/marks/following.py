@@ -120,7 +120,7 @@ _LEARN = 0.1
 _UNMATCHED, _MISSED, _SURE = 4.5, 2.5, 6.0
 _TOLERANCE, _SAME, _APART = 0.06, 0.5, 0.4
 _GATE, _PLACE_PX, _PLACE_GAIN = 5.0, 0.1, 0.3
-_CONFIRM, _FORGET = 3, 50
+_CONFIRM, _FORGET, _MOVED_PX = 3, 50, 2.0
 _FIRST_SHARE = 0.2
 _TOO_MANY_LOST = 2
 
@@ -237,8 +237,9 @@ class Follower:
     def brief(self, kept: list[Mark]) -> list[Mark]:
         """Return further dots of the strip, which were seen in too few frames to be kept.
 
-        They lie in line with the kept marks and were measured whenever they were whole in the
-        image. They occur at the beginning and at the end of a run.
+        They lie in line with the kept marks. They were measured whenever they were whole in the
+        image, or moved with the tank in three frames. They occur at the beginning and at the end of
+        a run.
         """
         if not kept:
             return []
@@ -248,7 +249,9 @@ class Follower:
         return [
             m
             for m in [*self.finished, *self.marks]
-            if m.number not in taken and low < m.place_mm[1] < high and m.always_seen
+            if m.number not in taken
+            and low < m.place_mm[1] < high
+            and (m.always_seen or (m.sightings >= _CONFIRM and m.travelled_px > _MOVED_PX))
         ]
 
     def _prediction(self, frame: int, place: Array, known: bool) -> tuple[Array, float]:

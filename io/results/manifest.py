@@ -39,6 +39,8 @@ RUN_RECORD = "run.json"
 LONGEST_COMMAND = 300
 """Characters of a command line that are kept; a batch may name thousands of datasets."""
 _SMOOTHED = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
+_MARKS = "references.csv"
+"""Without a manifest, smoothing would take the marks of an earlier tracking for new ones."""
 _LOCK_WITHIN_S = 30.0
 _MOST_TRIES = 20
 _LONGEST_NAME, _LONGEST_PATH = 255, 3000
@@ -337,6 +339,8 @@ def _replace(staged: Path, folder: Path, command: str, new: Section) -> None:
     sections = dict(_old(folder).sections)
     before, whole = sections.pop(command, None), True
     changing = set(new.files)
+    if not (folder / NAME).is_file() and command == "track" and (folder / _MARKS).is_file():
+        changing.add(_MARKS)
     if before is not None:
         changing |= set(before.files) | before.changing()
         try:

@@ -122,7 +122,9 @@ def test_no_dot_becomes_a_bubble_and_no_bubble_a_mark(data: Path) -> None:
             [f"{camera}_silhouette_u_px", f"{camera}_silhouette_v_px"]
         ].to_numpy()
         mine = detections[detections["camera"] == camera].sort_values("frame")
-        assert np.abs(mine[["u_px", "v_px"]].to_numpy() - place).max() < 1.0
+        whole = ~mine["flags"].astype(str).str.contains("border").to_numpy()
+        off = np.abs(mine[["u_px", "v_px"]].to_numpy() - place)
+        assert off[whole].max() < 1.0 and off.max() < 3.0
         mine = marks[marks["camera"] == camera]
         apart = mine[["u_px", "v_px"]].to_numpy() - place[mine["frame"]]
         assert np.linalg.norm(apart, axis=1).min() > 15

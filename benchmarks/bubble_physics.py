@@ -9,7 +9,8 @@ marks. Each run is calibrated, tracked (with given ids) and smoothed; bubbles.cs
 bubble_summary.csv are compared with the truth. A second table gives the same numbers for motion
 that is the truth plus the stated errors, so that shape and forces are tested by themselves.
 
-With --images a run of so many frames is rendered, and its outlines are found in the images.
+With --images a run of so many frames is rendered, its outlines are found in the images, and it is
+smoothed.
 
 For each number: root mean square error, median stated standard deviation, and NEES, the mean square
 of error over stated standard deviation: 1 where the statements are right.
@@ -28,7 +29,6 @@ import pandas as pd
 
 import telerig
 from telerig.arrays import Array
-from telerig.estimator.physics.bodies import bodies_table
 from telerig.estimator.physics.frames import frames_table
 from telerig.estimator.physics.summary import summary_table
 from telerig.io.rig_file.fluid import liquid_of
@@ -227,31 +227,26 @@ def case(config: RunConfig, seed: int) -> dict[str, list[tuple[str, str, Array, 
 
 
 def from_images(config: RunConfig, seed: int) -> list[tuple[str, str, Array, Array, Array]]:
-    """Errors of the bodies whose outlines were found in rendered images."""
+    """Errors of bubbles whose outlines were found in rendered images."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = telerig.simulate(config, rng=np.random.default_rng(seed), out=Path(folder) / "d")
         calibration, run = telerig.calibrate(dataset), dataset.runs[config.name].load()
         tracks = telerig.track(run, calibration)
-    bodies, _ = bodies_table(tracks, calibration.cameras, UP)
-    keys = ["frame", "particle"]
-    found = bodies.merge(tracks.table[[*keys, "x_mm", "y_mm", "z_mm"]], on=keys)
-    found = found.assign(y_mm=found["y_mm"] - run.position_mm[found["frame"]])
-    parts = []
-    for frame, truth in true_table(config, seed).groupby("frame"):
-        mine = found[found["frame"] == frame]
-        places = [t[["x_mm", "y_mm", "z_mm"]].to_numpy() for t in (mine, truth)]
-        away = np.linalg.norm(places[0][:, None] - places[1], axis=-1)
-        true = truth.iloc[away.argmin(1)] if len(mine) else truth[:0]
-        parts.append(true.assign(particle=mine["particle"].to_numpy()))
-    both = found.merge(pd.concat(parts), on=keys, suffixes=("", "_true"))
-    out = []
-    for name in ("d_eq_mm", "aspect", "tilt_deg"):
-        error, sd = both[name] - both[f"{name}_true"], both[sd_of(name)]
-        good = np.isfinite(error) & (both[name] > 3 * sd)
-        out.append(
-            ("frame", name, *(c[good].to_numpy() for c in (error, sd, both[f"{name}_true"])))
-        )
-    return out
+        smoothing = telerig.smooth(tracks, calibration, stage=run)
+    frames = telerig.bubble_table(smoothing)
+    truth = tracked_truth(frames, true_table(config, seed))
+    return errors(frames, telerig.bubble_summary(smoothing, frames), truth)
+
+
+def tracked_truth(frames: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
+    """Rows of the truth with the numbers of the tracks, which are the nearest in every frame."""
+    parts, place = [], ["x_mm", "y_mm", "z_mm"]
+    for frame, true in truth.groupby("frame"):
+        mine = frames[frames["frame"] == frame]
+        away = mine[place].to_numpy()[:, None] - true[place].to_numpy()
+        nearest = np.linalg.norm(away, axis=-1).argmin(1) if len(mine) else []
+        parts.append(true.iloc[nearest].assign(particle=mine["particle"].to_numpy()))
+    return pd.concat(parts)
 
 
 def pooled(cases: list[dict[str, list[tuple[str, str, Array, Array, Array]]]]) -> pd.DataFrame:

@@ -14,6 +14,8 @@ LARGEST_MAHALANOBIS2 = 60.0
 
 _TAIL, _LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
 _EXACT_SIDE = 11
+_LARGEST_EXPONENT = 600.0
+"""Of the product of all rows' odds to have no partner: exp(-745) is 0."""
 _SHIFT_PASSES = 4
 
 
@@ -124,6 +126,7 @@ def marginals(log_odds: Array, negligible: float) -> Array:
                         if possible[i, j] and turn == 0:
                             peak = max(peak, log_odds[i, j])
                         elif possible[i, j]:
+                            peak = min(peak, _LARGEST_EXPONENT / mine.size)
                             weight[a, b] = np.exp(log_odds[i, j] - peak)
                 alone[a] = np.exp(-peak)
             if not large:

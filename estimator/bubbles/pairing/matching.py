@@ -669,7 +669,7 @@ def match_candidates(
         gap,
         gap / np.sqrt(found.variance_px2[at] + uncertainty),
         np.exp(found.log_height_ratio[at]),
-        np.log(confidence) - np.log(np.maximum(1 - confidence, 1e-300)) < SAFE_LOG_ODDS,
+        confidence < (1 - confidence) * np.exp(SAFE_LOG_ODDS),
         shift,
     )
 

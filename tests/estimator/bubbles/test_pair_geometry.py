@@ -115,6 +115,12 @@ def test_probabilities_are_those_of_all_assignments(shape: tuple[int, int]) -> N
         np.testing.assert_allclose(marginals(odds), enumerated(odds), rtol=1e-10)
 
 
+def test_many_detections_around_a_few_are_no_overflow() -> None:
+    """The product of 200 rows' odds to have no partner was 0, and all probabilities NaN."""
+    odds = np.full((200, 2), 25.0)
+    np.testing.assert_allclose(marginals(odds), 1.0 / 200, rtol=1e-6)
+
+
 def test_large_clusters_are_near_the_exact_answer() -> None:
     rng = np.random.default_rng(5)
     odds = np.full((13, 13), -np.inf)

@@ -11,7 +11,14 @@ import numpy as np
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.fit.candidates import Polarity
-from telerig.estimator.dots.grid.seen_target import SeenTarget, agreed_target, seen_target
+from telerig.estimator.dots.grid.seen_target import (
+    SeenHexagon,
+    SeenTarget,
+    agreed_hexagon,
+    agreed_target,
+    seen_hexagon,
+    seen_target,
+)
 from telerig.estimator.dots.locate import measure_dots
 from telerig.io.images.read import list_images, read_image
 
@@ -52,7 +59,9 @@ def target_from_images(
             image = read_image(path)
             measured = measure_dots(image)
             try:
-                seen = seen_target(measured.dots, image.shape)
+                seen = seen_hexagon(measured.dots, image.shape) or seen_target(
+                    measured.dots, image.shape
+                )
             except DetectionError as error:
                 failures.append(f"{path}: {error.what}")
                 continue
@@ -63,7 +72,11 @@ def target_from_images(
         raise DetectionError(what, where=str(folder), todo=todo)
     polarity = Counter(p for *_, p, _ in found).most_common(1)[0][0]
     found = [one for one in found if one[2] == polarity]
-    agreed = agreed_target([seen for *_, seen in found])
+    hexagonal = 2 * sum(isinstance(seen, SeenHexagon) for *_, seen in found) > len(found)
+    found = [one for one in found if isinstance(one[3], SeenHexagon) == hexagonal]
+    hexagons = [seen for *_, seen in found if isinstance(seen, SeenHexagon)]
+    grids = [seen for *_, seen in found if isinstance(seen, SeenTarget)]
+    agreed = agreed_hexagon(hexagons) if hexagonal else agreed_target(grids)
     diameter_px = {
         name: float(np.median([seen.diameter_px for n, *_, seen in found if n == name]))
         for name in dict.fromkeys(n for n, *_ in found)
@@ -94,38 +107,48 @@ def _images_by_camera(folder: Path) -> dict[str, list[Path]]:
     return found
 
 
-def _lines(seen: SeenTarget, polarity: Polarity, pitch_mm: float) -> str:
+def _lines(seen: SeenTarget | SeenHexagon, polarity: Polarity, pitch_mm: float) -> str:
     """Return the lines of [target]."""
-    across_mm = round(pitch_mm * seen.pitch[1] / seen.pitch[0], 4)
-    square = abs(across_mm / pitch_mm - 1.0) < 0.02
     dot_mm = round(pitch_mm / seen.pitch[0], 4)
-    shape, rest = seen.lines()[:2], seen.lines()[2:]
+    if isinstance(seen, SeenHexagon):
+        (*shape,), rest, counted = seen.lines(pitch_mm), [], "in points_mm from 0"
+    else:
+        across_mm = round(pitch_mm * seen.pitch[1] / seen.pitch[0], 4)
+        square = abs(across_mm / pitch_mm - 1.0) < 0.02
+        pitch = f"pitch_mm = {pitch_mm if square else [pitch_mm, across_mm]}"
+        shape, rest = ['layout = "grid"', *seen.lines()[:2], pitch], seen.lines()[2:]
+        counted = "along the rows from 0"
     large = seen.mark_style == "large"
     return "\n".join([
-        'layout = "grid"',
         *shape,
-        f"pitch_mm = {pitch_mm if square else [pitch_mm, across_mm]}",
         f"dot_diameter_mm = {dot_mm}",
         f'polarity = "{polarity}"',
         *rest,
         *([f"mark_diameter_mm = {round(seen.mark_diameter * dot_mm, 4)}"] if large else []),
         "print_sigma_mm = 0.02              # how far a dot may be from its place in the plane",
         "flatness_sigma_mm = 0.02           # and out of it",
-        "# scale_dots = [0, 1]              # two dots, counted along the rows from 0 ...",
+        f"# scale_dots = [0, 1]              # two dots, counted {counted} ...",
         "# scale_distance_mm = 1.0          # ... whose distance was measured ...",
         "# scale_sigma_mm = 0.001           # ... so well",
     ])  # fmt: skip
 
 
-def _words(seen: SeenTarget, polarity: Polarity, images: int, pitch_px: float) -> Sequence[str]:
+def _words(
+    seen: SeenTarget | SeenHexagon, polarity: Polarity, images: int, pitch_px: float
+) -> Sequence[str]:
     """Return what was found as sentences."""
-    whole = "a grid" if seen.whole else "a grid that goes on beyond the images; seen at once:"
+    kind, size = "a hexagonal grid", f"{len(getattr(seen, 'points', ()))} dots"
+    if isinstance(seen, SeenTarget):
+        kind, size = "a grid", f"{seen.rows} rows, {seen.columns} columns"
+    whole = kind if seen.whole else f"{kind} that goes on beyond the images; seen at once:"
     marks = f"{len(seen.marks)} marks of the style {seen.mark_style}" if seen.marks else "no marks"
     words = [
-        f"{images} images show {whole} {seen.rows} rows, {seen.columns} columns, "
+        f"{images} images show {whole} {size}, "
         f"{polarity.replace('_', ' ')}, {marks}, dots {seen.diameter_px:.1f} px across, "
         f"{pitch_px:.1f} px apart"
     ]
+    if isinstance(seen, SeenHexagon) and not seen.whole:
+        words.append("add to points_mm the dots that no image shows, or photograph the whole plate")
     if not seen.marks:
         words.append(
             "without marks the whole grid must be in view, and its numbering stays ambiguous by "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from telerig.rig.target import Target
 
@@ -28,9 +29,12 @@ def draw(
     step = (np.arange(size_px * 4) + 0.5) / 4 - 0.5
     uv = np.stack(np.meshgrid(step, step), -1)
     places = (uv - offset) @ np.linalg.inv(affine).T
-    column = np.clip(np.round(places[..., 0] / target.pitch_mm[0]), 0, target.columns - 1)
-    row = np.clip(np.round(places[..., 1] / target.pitch_mm[1]), 0, target.rows - 1)
-    nearest = (row * target.columns + column).astype(int)
+    if target.layout == "points":
+        nearest = cKDTree(xy).query(places)[1]
+    else:
+        column = np.clip(np.round(places[..., 0] / target.pitch_mm[0]), 0, target.columns - 1)
+        row = np.clip(np.round(places[..., 1] / target.pitch_mm[1]), 0, target.rows - 1)
+        nearest = (row * target.columns + column).astype(int)
     away = np.linalg.norm(places - target.nominal_mm(nearest)[..., :2], axis=-1)
     inside = away < target.diameter_mm(nearest) / 2
     if target.mark_style == "ring":

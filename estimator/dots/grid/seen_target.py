@@ -11,7 +11,13 @@ import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import DetectionError
-from telerig.estimator.dots.grid.lattice import Cell, Lattice, grow_lattice, shape_matrix
+from telerig.estimator.dots.grid.lattice import (
+    NEIGHBOURS,
+    Cell,
+    Lattice,
+    grow_lattice,
+    shape_matrix,
+)
 from telerig.estimator.dots.grid.numbering import gaps, relative_diameter
 from telerig.rig.target import QUARTER_TURNS, MarkStyle, Target
 from telerig.statistics import robust_sd
@@ -22,6 +28,8 @@ _ENOUGH = 0.8
 """Share of the dots on a grid above which no other ratio of the pitches is tried."""
 _OBLIQUE = 0.25
 """Cosine of the angle between rows and columns above which a grid is no rectangular one."""
+_SIXTY_DEGREES, _EQUAL_PITCHES = 0.08, 1.08
+"""Departures of the cosine from 1/2, and of the pitches' ratio, that measuring explains."""
 _LARGER = 1.12
 _LARGER_SD = 6.0
 _MOST_MARKS = 12
@@ -85,6 +93,34 @@ class SeenTarget:
         return [*found, f'extent = "{"bounded" if self.whole else "unbounded"}"']
 
 
+@dataclass(frozen=True)
+class SeenHexagon:
+    """What an image shows of a target with a hexagonal grid of dots.
+
+    points : (N, 2) places of the dots, row by row, in units of the pitch.
+    whole : whether the image would show all dots next to these if there were any.
+    marks : positions of the marks in ``points``.
+    mark_style, mark_diameter, pitch, diameter_px : see `SeenTarget`.
+    """
+
+    points: Array
+    whole: bool
+    marks: tuple[int, ...]
+    mark_style: MarkStyle | None
+    mark_diameter: float
+    pitch: tuple[float, float]
+    diameter_px: float
+
+    def lines(self, pitch_mm: float) -> list[str]:
+        """Return the lines of rig.toml, table [target], that tell where the dots are."""
+        places = ", ".join(f"[{x:.4f}, {y:.4f}]" for x, y in pitch_mm * self.points)
+        found = ['layout = "points"', f"points_mm = [{places}]"]
+        if self.marks:
+            marks = ", ".join(f"[0, {mark}]" for mark in self.marks)
+            found += [f"marks = [{marks}]", f'mark_style = "{self.mark_style}"']
+        return found
+
+
 def _as_places(marks: Ints) -> Places:
     return tuple(sorted((int(row), int(column)) for row, column in marks))
 
@@ -98,19 +134,14 @@ def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
 
     dots : what `locate_dots` returns. image_shape : (rows, columns) of the image.
     """
-    points = dots[["u_px", "v_px"]].to_numpy(float)
-    shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
-    lattice = _best_lattice(points, shapes)
+    points, lattice = _best_lattice(dots)
     _refuse_oblique(lattice)
     places = lattice.places
     occupied = np.zeros(places.max(axis=0) + 3, bool)
     occupied[tuple((places + 1).T)] = True
     radius_px = float(np.median(dots["a_px"]))
     whole = _is_whole(points[lattice.index], lattice, image_shape, radius_px)
-    rings = dots["ring"].to_numpy(bool)[lattice.index]
-    size = relative_diameter(lattice)
-    plain = size[~rings] if np.any(~rings) else size
-    large = size > max(_LARGER, 1.0 + _LARGER_SD * float(robust_sd(plain - np.median(plain))))
+    rings, large, size = _unusual(dots, lattice)
     style, which = _marks(places, rings, large, np.argwhere(gaps(occupied, whole)) - 1)
     diagonal = np.median(np.diagonal(lattice.shape, axis1=1, axis2=2), axis=0)
     diameter = 2.0 * np.sqrt(diagonal)
@@ -128,8 +159,62 @@ def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
     )
 
 
-def _best_lattice(points: Array, shapes: Array) -> Lattice:
-    """Return the grid with the most dots among those with a usual ratio of the pitches."""
+def seen_hexagon(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenHexagon | None:
+    """Describe the hexagonal grid of dots that an image shows; None if its grid is another one.
+
+    The arguments and the error are those of `seen_target`.
+    """
+    points, lattice = _best_lattice(dots)
+    shape = np.median(lattice.shape, axis=0)
+    diameter = 2.0 * np.sqrt(0.75 * np.diagonal(shape))
+    cosine = -float(shape[0, 1] / np.sqrt(shape[0, 0] * shape[1, 1]))
+    if abs(abs(cosine) - 0.5) > _SIXTY_DEGREES or max(diameter) > _EQUAL_PITCHES * min(diameter):
+        return None
+    steps = np.array([[1.0, 0.0], [np.copysign(0.5, cosine), np.sqrt(0.75)]])
+    places = lattice.places @ steps
+    order = np.lexsort(np.round(places, 6).T)
+    rings, large, size = _unusual(dots, lattice)
+    style, which = _marks(np.arange(len(places)), rings, large, np.zeros(0, np.int64))
+    marked = np.isin(order, which) if style else np.zeros(len(order), np.bool_)
+    pitch = float(1.0 / np.mean(diameter))
+    return SeenHexagon(
+        (places - places.min(axis=0))[order],
+        _is_surrounded(points[lattice.index], lattice, steps, image_shape, dots["a_px"].median()),
+        tuple(np.flatnonzero(marked).tolist()),
+        style,
+        float(np.median(size[large])) if style == "large" else float("nan"),
+        (pitch, pitch),
+        2.0 * float(np.median(dots["a_px"].to_numpy()[lattice.index[order[~marked]]])),
+    )
+
+
+def _is_surrounded(
+    points_px: Array, lattice: Lattice, steps: Array, image_shape: tuple[int, ...], radius_px: float
+) -> bool:
+    """Whether all places next to dots would be inside the image. steps : (2, 2) pitch vectors."""
+    near = NEIGHBOURS[np.linalg.norm(NEIGHBOURS @ steps, axis=1) < 1.1]
+    beyond = points_px[:, None] + near @ lattice.basis_px
+    margin, size = radius_px + 2.0, np.array(image_shape[::-1])
+    inside = np.all((beyond > margin) & (beyond < size - 1 - margin), axis=-1)
+    taken = {*map(tuple, lattice.places.tolist())}
+    steps_out = (lattice.places[:, None] + near)[~inside]
+    return all(place in taken for place in map(tuple, steps_out.tolist()))
+
+
+def _unusual(dots: pd.DataFrame, lattice: Lattice) -> tuple[Bools, Bools, Array]:
+    """Return (n,) which dots of a lattice are rings, which are large, and their relative size."""
+    rings = dots["ring"].to_numpy(bool)[lattice.index]
+    size = relative_diameter(lattice)
+    plain = size[~rings] if np.any(~rings) else size
+    large = size > max(_LARGER, 1.0 + _LARGER_SD * float(robust_sd(plain - np.median(plain))))
+    return rings, large, size
+
+
+def _best_lattice(dots: pd.DataFrame) -> tuple[Array, Lattice]:
+    """Return the dots' places (N, 2) in px, and the grid with the most dots among those with a
+    usual ratio of the pitches."""
+    points = dots[["u_px", "v_px"]].to_numpy(float)
+    shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
     found: list[Lattice] = []
     failure: DetectionError | None = None
     for ratio in _RATIOS:
@@ -143,7 +228,7 @@ def _best_lattice(points: Array, shapes: Array) -> Lattice:
     if not found:
         assert failure is not None
         raise failure
-    return max(found, key=lambda lattice: len(lattice.index))
+    return points, max(found, key=lambda lattice: len(lattice.index))
 
 
 def _refuse_oblique(lattice: Lattice) -> None:
@@ -208,6 +293,13 @@ def agreed_target(seen: Sequence[SeenTarget]) -> SeenTarget:
         chosen[0], pitch=(float(middle[0]), float(middle[1])),
         diameter_px=float(middle[2]), mark_diameter=float(middle[3]),
     )  # fmt: skip
+
+
+def agreed_hexagon(seen: Sequence[SeenHexagon]) -> SeenHexagon:
+    """Return the hexagonal grid that most images show, of those that show it as a whole."""
+    some = [one for one in seen if one.whole] or list(seen)
+    votes = Counter((len(one.points), len(one.marks)) for one in some)
+    return max(some, key=lambda one: (votes[len(one.points), len(one.marks)], len(one.points)))
 
 
 def contradiction(seen: SeenTarget, target: Target) -> str:

@@ -118,14 +118,35 @@ def test_folders_without_a_target(tmp_path: Path) -> None:
         target_from_images(tmp_path, pitch_mm=None, scale_px_per_mm=1.0)
 
 
-def test_a_hexagonal_grid_is_not_proposed_as_a_square_one(tmp_path: Path) -> None:
-    """It was, with the corners of the hexagon as missing dots."""
-    image = np.full((520, 520), 30, np.uint8)
-    for row in range(-3, 4):
-        for column in range(-3, 4):
-            place = np.array([column + row / 2.0, row * np.sqrt(0.75)]) * 56.0 + 260.0
-            if abs(row + column) <= 3:
-                cv2.circle(image, tuple(np.round(16 * place).astype(int)), 160, 210, -1, 16, 4)
-    cv2.imwrite(str(tmp_path / "plate.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
-    with pytest.raises(DetectionError, match=r"cross at 60 degrees.*points_mm"):
-        target_from_images(tmp_path, pitch_mm=7.0, scale_px_per_mm=1.0)
+@pytest.mark.parametrize("style", ["ring", "large", "missing", None])
+def test_the_description_of_a_hexagonal_plate_numbers_its_images(
+    tmp_path: Path, style: Any
+) -> None:
+    """It was once proposed as a square grid, with the corners of the hexagon as missing dots."""
+    q, r = np.mgrid[-3:4, -3:4].reshape(2, -1)
+    places = 7.0 * np.stack([q + r / 2, r * np.sqrt(0.75)], -1)[np.abs(q + r) <= 3]
+    if style == "missing":
+        places = np.delete(places, [8, 9, 20], axis=0)
+    plate = Target(
+        layout="points", points_mm=places, dot_diameter_mm=2.4,
+        marks=((0, 8), (0, 9), (0, 20)) if style in ("ring", "large") else (),
+        mark_style="large" if style == "large" else "ring",
+        mark_diameter_mm=3.6 if style == "large" else None,
+    )  # fmt: skip
+    poses = ((10.0, 8.0), (40.0, 170.0))
+    images = [
+        draw(plate, pixel_from_mm(7.0, *pose, False), size_px=400, seed=5)[0] for pose in poses
+    ]
+    for k, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+    seen = target_from_images(tmp_path, pitch_mm=7.0, scale_px_per_mm=1.0)
+    assert "a hexagonal grid" in seen.words[0]
+    made = new_dataset(tmp_path / "new", [NewCamera(*c) for c in seen.cameras], target=seen.lines)
+    found = read_rig_toml(made[0]).target
+    assert len(found.points_mm) == len(places) and len(found.marks) == len(plate.marks)
+    assert found.dot_diameter_mm == pytest.approx(2.4, rel=0.02)
+    near = np.linalg.norm(found.points_mm[:, None] - found.points_mm, axis=-1)
+    np.fill_diagonal(near, np.inf)
+    np.testing.assert_allclose(near.min(axis=1), 7.0, atol=2e-4)
+    for image in images:
+        assert len(detect_target(image, found)) == len(places)

@@ -333,7 +333,7 @@ def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
         try:
             found = find_bubbles(
                 image, background=level, field=scene.fields.get(camera),
-                min_diameter_px=scene.min_diameter_px,
+                min_diameter_px=scene.min_diameter_px, crowds=True,
             ).accepted  # fmt: skip
         except InputError as error:
             raise InputError(

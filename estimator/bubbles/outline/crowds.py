@@ -19,6 +19,7 @@ from telerig.estimator.bubbles.outline.blobs import (
     Rejected,
     implausible_outlines,
 )
+from telerig.estimator.bubbles.outline.ellipse_geometry import rough_distance
 from telerig.estimator.bubbles.outline.outline_fit import Outlines
 from telerig.estimator.bubbles.outline.rims import (
     Rims,
@@ -37,6 +38,7 @@ _OPENED, _LEFT_AREA = 0.75, 0.5
 _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
 _LEAST_COVERAGE = 0.3
+_SEVERAL, _SMALLER, _FILLED = 3, 0.5, 0.3
 _DISAGREE = 1.0
 _UNLIKE = "its rim is unlike those of the sharp bubbles"
 
@@ -88,7 +90,10 @@ def resolved_crowd(
     kept, evidence = are_bubbles(every, heart, min_contrast)
     kept[: len(sure)] = True
     every = every[kept]
-    every = refitted(every[np.sort(sole_owners(every, evidence[kept], len(sure)))])
+    every = every[np.sort(sole_owners(every, evidence[kept], len(sure)))]
+    several = _over_several(every.ellipse)
+    several[: len(sure)] = False
+    every = refitted(every[~several])
     sure, rims = every[: len(sure)], every[len(sure) :]
     clusters, rejected, explained = [], [], _explained(ratio.shape, every.ellipse)
     for index, blob in enumerate(blobs):
@@ -100,6 +105,17 @@ def resolved_crowd(
     own = [_blob(rims, k) for k in range(len(rims))]
     found = [Part(ellipse, len(blobs) + k) for k, ellipse in enumerate(rims.ellipse)]
     return Crowd(own, found, rims, clusters, rejected)
+
+
+def _over_several(ellipse: Array) -> Bools:
+    """Return which ellipses (N, 5) hold the centres of several smaller ones that fill much of them.
+
+    Arcs of these bubbles look like its rim; a large bubble in front of so many is rare.
+    """
+    u, v, a, b, _ = ellipse.T
+    inside = rough_distance(ellipse[:, None], u[None], v[None]) < 0.0
+    inside &= a * b < _SMALLER * (a * b)[:, None]
+    return np.asarray((inside.sum(axis=1) >= _SEVERAL) & (inside @ (a * b) > _FILLED * a * b))
 
 
 def _within(blob: Blob, rims: Rims) -> Bools:

@@ -18,7 +18,7 @@ from telerig.estimator.bubbles.outline.rims import find_rims
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from bubble_outline_renderer import Drawn, draw
-from dense_bubbles import paired, swarm
+from dense_bubbles import ELLIPSE, paired, swarm
 
 WHITE = 3000.0
 
@@ -50,6 +50,21 @@ def centres(table: pd.DataFrame) -> Array:
 def misses(found: Array, bubbles: list[Drawn]) -> Array:
     truth = np.array([bubble.ellipse[:2] for bubble in bubbles])
     return np.asarray(np.linalg.norm(found[:, None] - truth, axis=2).min(axis=0))
+
+
+def test_crowded_images_of_a_run_are_searched_by_rims_and_sparse_ones_as_before() -> None:
+    for covered in (0.1, 0.35):
+        image, truth = swarm(covered, True, np.random.default_rng(70))
+        plain, found = (find_bubbles(image, crowds=crowds).accepted for crowds in (False, True))
+        if covered < 0.15:
+            pd.testing.assert_frame_equal(plain, found)
+            continue
+        assert plain["flags"].str.contains("merged").any()
+        assert not found["flags"].str.contains("merged").any()
+        right = [len(paired(t[ELLIPSE].to_numpy(float), truth)[0]) for t in (plain, found)]
+        assert right[1] > 1.2 * right[0]
+        kept = plain[~plain["flags"].str.contains("merged")]
+        assert kept["u_px"].isin(found["u_px"]).all()
 
 
 @pytest.mark.parametrize("heart", [0.0, 0.5])

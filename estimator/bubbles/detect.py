@@ -295,7 +295,7 @@ def crowded_words(where: str, covered: float) -> str:
     """
     return (
         f"{where}: bubbles cover {covered:.0%} of the images; beyond {COVERED_LIMIT:.0%} they hide "
-        "each other: of rendered runs with 17 to 36% covered, 12 to 22% of the bubbles have no "
+        "each other: of rendered runs with 17 to 36% covered, 12 to 21% of the bubbles have no "
         "point in space, and one point in 17 is wrong"
     )
 

@@ -137,7 +137,7 @@ def _words(
     seen: SeenTarget | SeenHexagon, polarity: Polarity, images: int, pitch_px: float
 ) -> Sequence[str]:
     """Return what was found as sentences."""
-    kind, size = "a hexagonal grid", f"{len(getattr(seen, 'points', ()))} dots"
+    kind, size = "a hexagonal grid", f"of {len(getattr(seen, 'points', ()))} dots"
     if isinstance(seen, SeenTarget):
         kind, size = "a grid", f"{seen.rows} rows, {seen.columns} columns"
     whole = kind if seen.whole else f"{kind} that goes on beyond the images; seen at once:"
@@ -152,6 +152,6 @@ def _words(
     if not seen.marks:
         words.append(
             "without marks the whole grid must be in view, and its numbering stays ambiguous by "
-            "the grid's symmetry"
+            "the grid's symmetry, if gaps do not break it"
         )
     return words

@@ -70,9 +70,7 @@ def track(
         run, folder = run.resolve(), folder.resolve()
     calibrated, files = calibration_for(run, calibration)
     chosen = options.chosen("--from", source, ("images", "detections"))
-    data = load_run(run, source=chosen, **cameras_without_rig(run, calibrated))
-    if frames is not None:
-        data = data.first(first_frames(frames))
+    count = None if frames is None else first_frames(frames)
     record = {
         "command": "track",
         "options": {"from": source, "min_diameter_px": min_diameter, "frames": frames},
@@ -81,6 +79,10 @@ def track(
     }
     chosen_cluster = nullcontext() if cluster is None else dask_executor(cluster, "--cluster")
     with chosen_cluster as executor, progress(quiet) as stage:
+        stage("reading the run", 0, 1)
+        data = load_run(run, source=chosen, **cameras_without_rig(run, calibrated))
+        if count is not None:
+            data = data.first(count)
         summary = write_tracking(
             data, calibrated, folder, options=TrackOptions(min_diameter_px=min_diameter),
             record=record, report=report, stage=stage, executor=executor,

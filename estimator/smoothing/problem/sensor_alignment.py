@@ -63,7 +63,9 @@ _FRAME_FACTORS = {
     0.5: "the stated frame rate is half the true one",
     2.0: "the stated frame rate is twice the true one",
 }
-_CLEAR_GAIN, _CLEAR_UNIT = 5.0, 4.0
+_CLEAR_GAIN, _CLEAR_UNIT, _DOUBTFUL_UNIT = 5.0, 4.0, 2.5
+_LEAST_LOG_RATIO = 1.0
+"""Two sensors contradict each other if other axes of one are so much likelier than the stated."""
 _CORRELATED = 10.0
 """So many neighbouring pixels of a mark count as one, because the shake moves them alike."""
 
@@ -668,9 +670,12 @@ def _mountings(
                 for n in [worst, *sorted(rivals, key=lambda n: -judged[n].lead)[:1]]
             }
             first, *second = sorted(likely, key=lambda n: -likely[n])
-            if likely[first] < log_evidence_with({}):
+            better = likely[first] - log_evidence_with({})
+            if better < 0:
                 break
             if second and likely[first] < likely[second[0]] + CLEAR_LOG_RATIO:
+                if better < _LEAST_LOG_RATIO:
+                    break
                 return [*findings, _one_of(first, second[0], judged)]
             worst = first
         axes[worst] = judged[worst].axes
@@ -828,12 +833,16 @@ def _encoder(
         gain = float(np.sum(weights * [g for g, _ in gains]) / weights.sum())
         sd = float(weights.sum() ** -0.5)
         usual = _USUAL_GAIN[0] < gain < _USUAL_GAIN[1]
-        finding = _gain_finding(gain, sd, where)
+        finding = _gain_finding(gain, sd, where, "its sign is turned", "it reads {}, not mm")
         scale = finding.code == Code.ENCODER_SCALE
         usual |= scale and marked is None and len(problem.t_s) < _LEAST_FRAMES  # arms that flex
         clear = _CLEAR_GAIN if scale else _CLEAR_UNIT
-        if min(abs(gain), abs(gain - 1)) > clear * sd and not usual:
+        sigmas = 0.0 if usual else min(abs(gain), abs(gain - 1)) / sd
+        if sigmas > clear:
             return [finding]
+        if sigmas > _DOUBTFUL_UNIT and not scale:
+            may = "its sign may be turned", "it may read {} in place of mm"
+            return [replace(_gain_finding(gain, sd, where, *may), code=None, fix={})]
     judged = clock is not None and clock.clear and len(problem.t_s) >= _LEAST_FRAMES
     if clock is not None and judged and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
         return [
@@ -905,11 +914,12 @@ def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
     return gain, max(float(np.sqrt(_CORRELATED * spread / square)), 1e-4)
 
 
-def _gain_finding(gain: float, sd: float, where: str) -> Finding:
+def _gain_finding(gain: float, sd: float, where: str, sign: str, unit: str) -> Finding:
     """Return a finding that names the sign or unit which explains a gain.
 
     gain, sd : true motion over the encoder's, and its standard deviation. A gain that no unit
         explains is proposed as a factor only if it is known to 1 %.
+    sign, unit : words for a turned sign, and for another unit with {} in place of its name.
     """
     units = {1000.0: "m", 25.4: "inches", 10.0: "cm", 0.001: "µm", 1.0: "mm"}
     size = min(units, key=lambda u: abs(np.log(abs(gain) / u)))
@@ -920,9 +930,9 @@ def _gain_finding(gain: float, sd: float, where: str) -> Finding:
     seen = f"images and sensors show {gain:.4g} ± {sd:.2g} times the motion that it reads"
     todo, fix = f"multiply position_mm by {factor:.6g}", {"encoder_factor": factor}
     if factor == -1.0:
-        words, code = f"{seen}: its sign is turned", Code.ENCODER_SIGN
+        words, code = f"{seen}: {sign}", Code.ENCODER_SIGN
     elif named:
-        words, code = f"{seen}: it reads {units[size]}, not mm", Code.ENCODER_UNIT
+        words, code = f"{seen}: {unit.format(units[size])}", Code.ENCODER_UNIT
     else:
         words, code = f"{seen}: its scale is wrong", Code.ENCODER_SCALE
         if not known:

@@ -130,6 +130,13 @@ def test_marks_show_the_unit_of_an_encoder_that_seems_to_stand() -> None:
     assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": 1e3}]
 
 
+def test_a_unit_that_is_likely_and_not_sure_is_a_warning() -> None:
+    """Inches, seen at 3.9 standard deviations by one bubble and two sensors."""
+    _, said = placed(907, "one", scenario="stick-slip", encoder=1 / 25.4)
+    (finding,) = [f for f in said if "the motion that it reads" in f.words]
+    assert finding.code is None and "may read inches" in finding.warning
+
+
 @pytest.mark.parametrize(("information", "known"), [("one", False), ("references", True)])
 def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
     information: str, known: bool
@@ -167,11 +174,13 @@ def test_an_arm_is_blamed_only_where_all_measurements_tell_it_from_the_other(
 
 
 @pytest.mark.parametrize(
-    ("scenario", "seed", "around_s"), [("S6", 951, 10.0), ("stick-slip", 950, 0.05)]
+    ("scenario", "seed", "around_s"),
+    [("S6", 951, 10.0), ("stick-slip", 950, 0.05), ("S1", 972, 0.05)],
 )
 def test_a_short_sound_run_is_no_fault(scenario: str, seed: int, around_s: float) -> None:
     """0.24 s. S6: other axes explain the accelerations better, and all measurements together worse.
-    Stick-slip: arms that flex accelerate 2.5 ± 0.2 times as much as the carriage.
+    Stick-slip: arms that flex accelerate 2.5 ± 0.2 times as much as the carriage. S1: other axes of
+    one arm are as likely as those stated, and no more.
     """
     _, said = placed(seed, "five", frames=120, scenario=scenario, around_s=around_s, clock="frames")
     assert all(f.code is None for f in said)

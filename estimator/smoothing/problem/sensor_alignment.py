@@ -64,8 +64,6 @@ _FRAME_FACTORS = {
     2.0: "the stated frame rate is twice the true one",
 }
 _CLEAR_GAIN, _CLEAR_UNIT, _DOUBTFUL_UNIT = 5.0, 4.0, 2.5
-_LEAST_LOG_RATIO = 1.0
-"""Two sensors contradict each other if other axes of one are so much likelier than the stated."""
 _CORRELATED = 10.0
 """So many neighbouring pixels of a mark count as one, because the shake moves them alike."""
 
@@ -670,11 +668,10 @@ def _mountings(
                 for n in [worst, *sorted(rivals, key=lambda n: -judged[n].lead)[:1]]
             }
             first, *second = sorted(likely, key=lambda n: -likely[n])
-            better = likely[first] - log_evidence_with({})
-            if better < 0:
+            if likely[first] < log_evidence_with({}):
                 break
             if second and likely[first] < likely[second[0]] + CLEAR_LOG_RATIO:
-                if better < _LEAST_LOG_RATIO:
+                if len(problem.t_s) < _LEAST_FRAMES:
                     break
                 return [*findings, _one_of(first, second[0], judged)]
             worst = first

@@ -175,12 +175,12 @@ def test_an_arm_is_blamed_only_where_all_measurements_tell_it_from_the_other(
 
 @pytest.mark.parametrize(
     ("scenario", "seed", "around_s"),
-    [("S6", 951, 10.0), ("stick-slip", 950, 0.05), ("S1", 972, 0.05)],
+    [("S6", 951, 10.0), ("stick-slip", 950, 0.05), ("S1", 972, 0.05), ("S1", 980, 0.05)],
 )
 def test_a_short_sound_run_is_no_fault(scenario: str, seed: int, around_s: float) -> None:
     """0.24 s. S6: other axes explain the accelerations better, and all measurements together worse.
     Stick-slip: arms that flex accelerate 2.5 ± 0.2 times as much as the carriage. S1: other axes of
-    one arm are as likely as those stated, and no more.
+    one arm are a little more likely than those stated.
     """
     _, said = placed(seed, "five", frames=120, scenario=scenario, around_s=around_s, clock="frames")
     assert all(f.code is None for f in said)

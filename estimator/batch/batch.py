@@ -33,7 +33,7 @@ from telerig.estimator.batch.jobs import Job, check_run_name, fingerprint
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
-from telerig.io.results.batch import BatchFile, verdict_counts
+from telerig.io.results.batch import BatchFile, verdict_and_flags, verdict_counts
 from telerig.io.results.manifest import is_whole, replaced_results
 
 Stage = Callable[[str, float, int], None]
@@ -241,7 +241,8 @@ def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
     )  # fmt: skip
     table = found.trajectories
     figures: dict[str, Any] = {
-        "verdict": " ".join([found.verdict.get("verdict", ""), *found.verdict.get("flags", [])]),
+        "verdict": found.verdict.get("verdict", ""),
+        "flags": list(found.verdict.get("flags", [])),
         "bubbles": found.summary["bubbles"],
         "frames": found.summary["frames"],
     }
@@ -260,7 +261,7 @@ def summary_line(job: Job, result: Mapping[str, Any], *, whole_path: bool = Fals
     """
     place = job.dataset if whole_path else Path(job.dataset).name
     what = f"{job.kind} {place}" + (f" {job.run}" if job.run else "")
-    verdict = result["figures"].get("verdict")
+    verdict = verdict_and_flags(result)
     first = "" if result["status"] == DONE else f": {str(result['words']).splitlines()[0]}"
     how = "done before" if result.get("resumed") else result["status"]
     return f"{what}: {how}" + (f", {verdict}" if verdict else "") + first
@@ -321,7 +322,7 @@ def table_of(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         rows.append(
             {name: record.get(name) for name in COLUMNS}
             | {name: figures.get(name) for name in FIGURES}
-            | {"verdict": figures.get("verdict"), "words": reason}
+            | {"verdict": verdict_and_flags(record) or None, "words": reason}
         )
     return pd.DataFrame(rows, columns=[*COLUMNS, *FIGURES, "words"])
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, field_validator
 
 from telerig.io.results.record import Part, Record
 
@@ -30,7 +30,7 @@ class JobRecord(Part):
     dataset, run : folder of the dataset, and name of the run; "" for a calibration.
     status : "done", "rejected", "failed", "crashed" or "left out".
     words : the result or the reason of a failure, in words.
-    figures : numbers of the result by name.
+    figures : numbers of the result by name, and its "verdict" and "flags" where it has them.
     seconds : duration; None if it is not known.
     host : name of the computer; None if it is not known.
     """
@@ -43,6 +43,13 @@ class JobRecord(Part):
     figures: dict[str, Any] | None = None
     seconds: float | None = None
     host: str | None = None
+
+    @field_validator("figures")
+    @classmethod
+    def _flags_apart(cls, figures: dict[str, Any] | None) -> dict[str, Any] | None:
+        """Versions before 0.2 wrote the flags behind the verdict, in one text."""
+        verdict, *flags = str((figures or {}).get("verdict") or "").split() or [""]
+        return figures | {"verdict": verdict, "flags": flags} if figures and flags else figures
 
 
 class BatchFile(Record):
@@ -59,8 +66,12 @@ class BatchFile(Record):
 
 def verdict_of(record: Mapping[str, Any]) -> str:
     """Return the verdict of a job without its flags; "" for a job without one."""
-    words = str((record.get("figures") or {}).get("verdict") or "").split()
-    return words[0] if words else ""
+    return str((record.get("figures") or {}).get("verdict") or "")
+
+
+def verdict_and_flags(record: Mapping[str, Any]) -> str:
+    """Return the verdict of a job and its flags as a text; "" for a job without one."""
+    return " ".join([verdict_of(record), *(record.get("figures") or {}).get("flags", ())])
 
 
 def verdict_counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:

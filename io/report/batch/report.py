@@ -22,7 +22,7 @@ from telerig.io.report.page.figures import (
     drawing,
 )
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
-from telerig.io.results.batch import BatchFile, verdict_counts, verdict_of
+from telerig.io.results.batch import BatchFile, verdict_and_flags, verdict_counts, verdict_of
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import Verdict
 from telerig.short_text import ABSENT, counted, is_number, number
@@ -144,7 +144,7 @@ def _calibration(job: Job, folder: Path) -> Line:
     found = job.get("figures") or {}
     share: Any = found.get("share_kept")
     cells = (
-        str(found.get("verdict") or job["status"]),
+        verdict_and_flags(job) or str(job["status"]),
         str(found.get("lens_model") or ABSENT),
         str(found.get("views") or ABSENT),
         f"{100 * share:.1f}%" if is_number(share) else ABSENT,
@@ -157,12 +157,12 @@ def _calibration(job: Job, folder: Path) -> Line:
 def _run(dataset: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
     tracked, smoothed = (kinds.get(k, {}).get("figures") or {} for k in ("track", "smooth"))
     failed = [j for j in kinds.values() if j["status"] != _DONE]
-    verdict = smoothed.get("verdict") or (
+    verdict = verdict_and_flags(kinds.get("smooth", {})) or (
         f"{failed[0]['kind']} {failed[0]['status']}" if failed else ABSENT
     )
     sd = [smoothed.get(f"s{x}_um") for x in "xyz"]
     cells = (
-        str(verdict),
+        verdict,
         _text(tracked.get("frames")),
         _text(tracked.get("tracks")),
         _text(tracked.get("points")),

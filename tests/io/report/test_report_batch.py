@@ -26,11 +26,12 @@ def _write(folder: Path, jobs: Any) -> Path:
 
 def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
     evil = "</script><b>no light"
+    flags = ["SHAKE_BELOW_NOISE"]
     jobs = [
         _job("calibrate", "", verdict="GOOD", lens_model="radial", views=12, share_kept=0.995,
              rms_px=0.0123),
         _job("track", "rise", frames=120, tracks=7, points=800),
-        _job("smooth", "rise", verdict="RESOLVED", sx_um=23.0, sy_um=13.0, sz_um=24.0),
+        _job("smooth", "rise", verdict="RESOLVED", flags=flags, sx_um=23.0, sy_um=13.0, sz_um=24.0),
         _job("track", "fall", "failed", evil),
         _job("smooth", "fall", "left out", "needs fall.track"),
     ]  # fmt: skip
@@ -43,7 +44,7 @@ def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
         "1 of 2 runs done, 1 dataset", "calibrated 1 of 1 1 GOOD",
         "smoothed 1 of 2 1 left out, 1 RESOLVED", "work 2.5 min longest job 30 s, 1 machine",
         "tank GOOD radial 12 99.5% 0.0123", "sd / µm",
-        "tank / rise RESOLVED 120 7 800 23.0, 13.0, 24.0", "tank / fall track failed",
+        "tank / rise RESOLVED SHAKE_BELOW_NOISE 120 7 800 23.0, 13.0, 24.0", "tank / fall track failed",
         f"/data/tank, run fall track failed {evil}",
     ):  # fmt: skip
         assert words in page.spaced, words
@@ -54,6 +55,7 @@ def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("verdicts", "colour", "words"),
     [
+        # flags behind the verdict, as versions before 0.2 wrote them
         (["RESOLVED"], "good", "Verdicts of 1 smoothed run: 1 RESOLVED."),
         (["RESOLVED", *["UNRESOLVED LABEL_AMBIGUOUS"] * 4], "usable",
          "Verdicts of 5 smoothed runs: 1 RESOLVED, 4 UNRESOLVED."),

@@ -62,8 +62,7 @@ def _row(
     row["slip_mm_s"] = _mean(mine["slip_mm_s"])
     # noise across the motion makes a mean speed too large
     noise = (mine[[f"sv{a}_mm_s" for a in AXES]] ** 2).sum(axis=1) / (2 * mine["slip_mm_s"])
-    terms = (row["s_rise_mm_s"], _turning_sd(t, mine), _mean(noise))
-    row["s_slip_mm_s"] = float(np.linalg.norm(terms))
+    row["s_slip_mm_s"] = float(np.hypot(row["s_rise_mm_s"], _mean(noise)))
     row |= _zigzag(t, mine, up)
     low = _ABOVE_ZIGZAG * row.get("zigzag_hz", 0.0)
     shape = dominant_oscillation(t, np.log(mine[["aspect"]].to_numpy(float)), low)
@@ -138,31 +137,6 @@ def _mean_rise(
     steady = np.sqrt(_along_variance(mine, "sv{}_mm_s", up)).mean() ** 2
     bound = np.fmin(ends, steady)
     return rise, float(np.sqrt(bound))
-
-
-def _turning_sd(t: Array, mine: pd.DataFrame) -> float:
-    """Return the standard deviation that a turning path adds to the mean speed.
-
-    The mean of v . u, u the direction of v, has the error of the mean of e . u, where e is the
-    error of v. Along the mean of u it is that of the way between both ends; here is the rest. The
-    errors s of a position and s_v of its velocity are those of a process with the covariance
-    s^2 exp(-lag^2 / (2 l^2)), where l = s / s_v.
-    """
-    velocity, sd, position_sd = (
-        np.stack([mine[name.format(a)].to_numpy(float) for a in AXES], -1)
-        for name in ("v{}_mm_s", "sv{}_mm_s", "s{}_mm")
-    )
-    unit = velocity / np.linalg.norm(velocity, axis=-1, keepdims=True)
-    if len(t) < 2 or not (np.isfinite(unit) & np.isfinite(sd) & (sd > 0)).all():
-        return 0.0
-    weight = (unit - unit.mean(0)) * sd
-    lag = (np.arange(len(t)) * (t[-1] - t[0]) / (len(t) - 1))[:, None]
-    ratio = (lag / (position_sd / sd).mean(0)) ** 2
-    correlation = (1 - ratio) * np.exp(-ratio / 2)
-    power = np.abs(np.fft.rfft(weight, 2 * len(t), axis=0)) ** 2
-    products = np.fft.irfft(power, 2 * len(t), axis=0)[: len(t)]
-    total = (2 * products * correlation).sum() - products[0].sum()
-    return float(np.sqrt(max(total, 0.0)) / len(t))
 
 
 def _along_variance(mine: pd.DataFrame, pattern: str, direction: Array) -> Array:

@@ -338,9 +338,10 @@ _LEAST_SINE = 0.05
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """Prior standard deviations of a movement of the second camera, along and about each axis.
+    """Prior standard deviations of how far the second camera has moved since the calibration.
 
-    They are wide. Raises InputError for values that are not positive.
+    The movement is that against the first camera, along and about each axis of the rig frame. The
+    defaults are larger than most movements. Raises InputError for values that are not positive.
     """
 
     rotation_rad: float = 5e-3
@@ -389,7 +390,8 @@ class RigChange:
     def size_words(self) -> str:
         """Return the identifiable part of the movement in words, with standard deviations."""
         offset, *turns = zip(1e6 * self.values, 1e6 * self.sigmas)
-        text = f"by {_rounded(offset[0] / 1000, offset[1] / 1000)} µm along the shared coordinate"
+        size = _rounded(offset[0] / 1000, offset[1] / 1000)
+        text = f"by {size} µm perpendicular to both optical axes"
         identified = self.sigmas[1:] < _NOT_IDENTIFIED * self.prior_sigmas[1:]
         each = zip(("rolled", "pitched"), turns, identified)
         turned = [f"{name} by {_rounded(*turn)} µrad" for name, turn, known in each if known]

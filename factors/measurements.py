@@ -39,10 +39,15 @@ def image_of_point(
     axis: Array,
     offset_mm: ArrayLike,
 ) -> ImagePrediction:
-    """Return the pixel of a bubble, or of a mark that is fixed to the tank, with its derivatives.
+    """Project a point in the laboratory frame: a bubble, or a mark that is fixed to the tank.
 
-    point_lab_mm, offset_mm : (..., 3) position in the laboratory, and offset of the camera.
-    position_mm : (...) position of the carriage along ``axis`` (3,).
+    Returns the pixel and its derivatives by the point, the camera's offset and the carriage's
+    position.
+
+    point_lab_mm : (..., 3) position in the laboratory frame.
+    position_mm : (...) position of the carriage.
+    axis : (3,) unit vector along which the carriage moves, in the rig frame.
+    offset_mm : (..., 3) displacement of the camera by shake, in the rig frame.
     """
     pose = camera.camera_from_rig
     position = np.asarray(position_mm, float)[..., None]

@@ -96,9 +96,10 @@ def track_and_compare(
     score = score_tracks(load_tracks(folder), truth, [c.name for c in calibration.cameras])
     passed = score.recall == 1 and score.precision == 1 and score.tracks == 1
     say(
-        f"{score.right} of {score.in_view} true positions found, {score.wrong} wrong ones, "
-        f"{score.tracks} track; the RMS error of its centre of volume in the images is "
-        f"{score.corrected_px:.2f} px ({score.centre_px:.2f} px for the centres of the outlines)"
+        f"{score.right} of the bubble's {score.in_view} true positions found, {score.wrong} false "
+        f"positions, {score.tracks} track(s). RMS error in the images: {score.corrected_px:.2f} px "
+        f"for the bubble's centre of volume, {score.centre_px:.2f} px if the centre of its outline "
+        "is taken for it"
     )
     say("PASSED: the bubble was followed throughout" if passed else "FAILED: see the report")
     say(f"report: {folder / 'report.html'}")

@@ -62,8 +62,9 @@ def simulate(
     accelerometers: Annotated[
         str | None,
         typer.Option(
-            help="What carries an accelerometer: names of cameras, for their arms, or carriage, "
-            "joined by commas; or none [none; S0 to S6: every arm]."
+            help="Where accelerometers are mounted, separated by commas: a camera's name stands "
+            "for its arm, 'carriage' for the carriage; or 'none' [none; in the presets S0 to S6: "
+            "every arm]."
         ),
     ] = None,
     devices: Annotated[

@@ -502,9 +502,10 @@ def fit(
         if limit == _SUSPECT and moved < 1e-3 and np.abs(step).max() < 1e-7:
             return state, weights, system
     raise CalibrationError(
-        "the fit of one straight travel to the views of the target does not converge",
+        "the fit of a straight stage axis to the views of the target does not converge",
         where="stage_axis",
-        todo="check that the target stood still and that positions.csv belongs to the views",
+        todo="check that the target stood still while the stage moved, and that the positions in "
+        "positions.csv are those of these views",
     )
 
 

@@ -51,14 +51,15 @@ def dominant_oscillation(
 ) -> Oscillation | None:
     """Return the strongest sinusoid of a series between two frequencies.
 
-    t_s : (N,).
-    values : (N, K), K = 1 or 2.
+    t_s : (N,) times, nearly uniform. Frequencies above 0.45 of the sampling rate are not sought.
+    values : (N, K), K = 1 or 2 components of one common frequency.
     significant : least amplitude over its standard deviation.
 
     The series is modelled as a straight line, a sinusoid of frequency f, and coloured noise. The
-    one-sided density S of the noise near f is taken from the residuals. A sinusoid of T seconds and
-    amplitude A then has the variances S / T of A and 3 S / (pi^2 A^2 T^3) of f, which are the
-    Cramer-Rao bounds for white noise of this density.
+    one-sided density S of the noise near f is taken from the residuals. In a record of T seconds a
+    sinusoid of amplitude A (of two components: the root of the sum of their squares) then has the
+    variances S / T of A and 3 S / (pi^2 A^2 T^3) of f, which are the Cramer-Rao bounds for white
+    noise of this density.
 
     Returns None if the record is shorter than 1.5 periods or 16 samples, or if the amplitude is
     not significant.

@@ -36,12 +36,14 @@ _RIDGE = 1e-5
 
 @dataclass(frozen=True)
 class Channel:
-    """An acceleration that some sensors have to explain.
+    """Hold one component of an acceleration that was derived from the images or the encoder.
+
+    The readings of some accelerometers are fitted to it, to find their clocks, units and axes.
 
     name : for messages.
-    values : (n,) acceleration in mm/s^2 on the grid of the images.
-    known : (n,) whether it is known.
-    sensors : indices of the sensors whose readings explain it.
+    values : (n,) acceleration in mm/s^2 at the times of the frames.
+    known : (n,) True where it is valid.
+    sensors : indices of the accelerometers whose readings are fitted to it.
     """
 
     name: str

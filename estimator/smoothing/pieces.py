@@ -95,9 +95,10 @@ def pieces_of(
 
 
 def margin_s(problem: SmoothingProblem, model: ShakeModel) -> float:
-    """Return twice as long as the slowest process of the rig remembers, or a bubble's speed.
+    """Return by how much neighbouring pieces of a run overlap on either side, in s.
 
-    Other processes of a bubble are seen in every frame, and those of the rig by all bubbles.
+    It is `_DECAY_TIMES` times the longest decay time of the rig's processes and of the bubbles'
+    velocity. A bubble's other processes need no overlap, because each frame determines them.
     """
     drifts = [part.drift for part in shake_layout(problem, model).components if part.drift.size]
     rates = np.concatenate([[0.0], *(-np.linalg.eigvals(drift).real for drift in drifts)])

@@ -130,8 +130,8 @@ def _moved(tracks: Tracks | StoredTracks | Any) -> list[str]:
         return []
     return [
         f"camera {change['camera']!r} had moved since the calibration with which the run was "
-        f"tracked (by {1e3 * change['offset_mm']:+.0f} µm along the shared coordinate), so all "
-        "positions are wrong by this movement. Calibrate again and track again, or smooth with "
+        f"tracked (by {1e3 * change['offset_mm']:+.0f} µm perpendicular to both optical axes), so "
+        "all positions are wrong by this movement. Calibrate again and track again, or smooth with "
         "--refine-rig"
     ]
 

@@ -349,13 +349,15 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Broken:
-    """A track that is cut, because its continuation through a conflict is not safe.
+    """Hold a track that is cut where its continuation is ambiguous.
 
-    track : its best continuation.
-    entries : all its measurements (frame, column) in the conflict.
-    kept : the safe ones at the beginning, which remain with the track.
-    new : those at the end that safely belong together and form a new track. The measurements in
-        between belong to no track.
+    A conflict is a run of frames in which several tracks compete for the same measurements.
+
+    track : the track with its most probable continuation.
+    entries : its measurements in the conflict, as (frame, index of the measurement in the frame).
+    kept : the unambiguous ones at the beginning, which remain with the track.
+    new : those at the end that unambiguously belong together and form a new track. The measurements
+        in between belong to no track.
     """
 
     track: Track

@@ -222,7 +222,7 @@ class Frame:
 
     @property
     def particle(self) -> Ints:
-        """The ids (M,) of the tracks of the M pairs, -1 for none."""
+        """The ids (M,) of the tracks of M pairs of a left and a right detection, -1 for none."""
         return self.pairs.particle
 
     def owners(self, camera: int) -> Ints:

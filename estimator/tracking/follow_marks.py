@@ -212,8 +212,9 @@ def _words(summary: Mapping[str, Mapping[str, Any]], run: RunData) -> list[str]:
             )
             continue
         out.append(
-            f"camera {name}: {found['marks']} marks of the strip, measured {found['sightings']} "
-            f"times with a standard deviation of {found['median_sigma_px']:.3f} px (median)"
+            f"camera {name}: {found['marks']} marks of the strip of dots, {found['sightings']} "
+            "measurements in all; standard deviation of one measurement "
+            f"{found['median_sigma_px']:.3f} px (median)"
         )
         out += [f"  left out {n} times: {reason}" for reason, n in found["left_out"].items()]
         breaks = found["breaks"]

@@ -228,7 +228,10 @@ def _scale_ids(t: TargetTable) -> tuple[int, int] | None:
 
 
 def _plate_problems(t: TargetTable) -> Iterator[Problem]:
-    what = "is missing, and two_sided = true needs it: the far side is seen through the plate"
+    what = (
+        "is missing. two_sided = true needs it, because the dots on the far face are seen by "
+        "refraction through the plate"
+    )
     for key in ("plate_thickness_mm", "plate_index"):
         if t.two_sided and getattr(t, key) is None:
             yield _problem(key, what, f"add {key} or remove two_sided", "two_sided")

@@ -90,10 +90,13 @@ class Rims:
 def find_rims(
     ratio: Float32, sigma: float, *, min_diameter_px: float, largest_radius_px: float
 ) -> Rims:
-    """Return all candidates of an image; `sole_owners` and `are_bubbles` tell which are bubbles.
+    """Return all closed rims in an image that may be outlines of bubbles.
+
+    The functions `sole_owners` and `are_bubbles` then decide which of them are bubbles.
 
     ratio : (rows, columns) grey levels divided by the background.
     sigma : noise of a pixel, as a share of the background.
+    min_diameter_px, largest_radius_px : limits of the rims' size.
     """
     levels = [np.ascontiguousarray(ratio, np.float32)]
     least = _LEAST_RADIUS_SHARE * max(min_diameter_px, _LEAST_DIAMETER_PX)

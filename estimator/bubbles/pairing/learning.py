@@ -314,7 +314,8 @@ def _span_px(cameras: tuple[Camera, Camera], axis: Array) -> float:
     low, high = max(min(s) for s in spans), min(max(s) for s in spans)
     if high <= low:
         raise InputError(
-            "the two cameras see no common range along their shared axis",
+            "the two cameras see no common range along the direction perpendicular to both "
+            "optical axes",
             todo="check that the calibration belongs to these cameras",
         )
     return float(high - low) * cameras[0]["scale_px_per_mm"]

@@ -139,11 +139,12 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
 
 
 def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
-    """Compute rays and sizes from the detections of one camera.
+    """Compute lines of sight and sizes in mm of the bubbles that one camera has detected.
 
-    table : table of `detect_bubbles`
+    table : as `detect_bubbles` returns it.
     camera : the calibrated camera.
-    axis : (3,) shared axis in the rig frame, see `shared_axis`.
+    axis : (3,) unit vector in the rig frame that is perpendicular to both optical axes, see
+        `shared_axis`. Positions and heights are measured along it, widths across it.
 
     Raises InputError if a column is missing, or if a centre or its covariance is not finite.
     """

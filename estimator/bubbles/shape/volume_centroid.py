@@ -650,12 +650,15 @@ _RUN_SHARE = 2.0  # harmonics' worth of the run's variances against a bubble's o
 
 
 def rim_excess(pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
-    """Return the log ratio (M,) of the outlines' size to the volume's, by third and fourth
-    harmonics.
+    """Return by how much the outlines of M bubbles exceed the size of their volumes.
 
-    Its standard deviation is as large as itself. It is 0 where no harmonics are known.
+    The result (M,) is the logarithm of the diameter from the outlines over the volume-equivalent
+    diameter. A body with modes of degree 3 and 4 exceeds it, because an outline is where the body
+    reaches farthest. The result's standard deviation is as large as the result. It is 0 for
+    outlines that are not whole.
 
-    sigma : (2,) of the run.
+    pair : the outlines in both views.
+    sigma : (2,) RMS of the third and fourth harmonics of all outlines of the run.
     """
     excess = np.zeros(len(pair[0].uv_px))
     whole = pair[0].whole & pair[1].whole

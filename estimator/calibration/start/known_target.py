@@ -329,10 +329,13 @@ def _place_by_scales(
 def perspective_from_maps(
     maps: dict[tuple[int, int], ImageMap], state: State, camera: int
 ) -> float:
-    """Return an estimate of a camera's kappa (1/mm) from the maps of its images.
+    """Return a first estimate of a camera's kappa, the relative change of scale with depth in 1/mm.
 
-    It is the weighted median over tilted views of the relative change of scale with depth.
-    maps : by (view, camera). camera : index of the camera.
+    It is the weighted median over the views in which the target is tilted; 0 if none is.
+
+    maps : homographies from the target's plane to the image, by (view, camera).
+    state : the poses of cameras and targets.
+    camera : index of the camera.
     """
     turn = state.rig_from_camera[camera, :3, :3].T
     kappas, weights = [], []

@@ -194,14 +194,14 @@ class Pixels:
 
     x, y : (D, P) offsets in px from the middle of the window.
     grey : (D, P) grey levels.
-    there : (D, P) False for padding.
+    there : (D, P) True for pixels, False for padding.
     counts : (D,) number of pixels of each fit.
-    columns, rows : (D, U), (D, V) offsets in px of the windows' columns and rows; those of smaller
-        windows are continued.
+    columns, rows : (D, U), (D, V) offsets in px of the windows' columns and rows; in smaller
+        windows they go on in steps of 1 px.
     cell : (D, P) index of each pixel in the grid of rows and columns, row by row.
     origin : (D, 2) middle of the window in px.
     radius : (D,) radius of the dot in px.
-    prior : (D,) with the fields of `Prior`.
+    prior : (D,) structured array with the fields of `Prior`.
     """
 
     x: Array

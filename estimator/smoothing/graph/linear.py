@@ -102,9 +102,10 @@ def bubble_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
 
 
 def constant_values(graph: GraphLayout, state: State) -> dict[str, Array]:
-    """Return the values (N, n) of all constants, by their kind.
+    """Return the estimates of all variables that are constant in time, by their kind.
 
-    Those of clocks are delays beyond the stated ones.
+    Each value is an array (N, n) of N variables with n components. Those of clocks are delays in s,
+    to be added to the stated ones.
     """
     clocks = state.clocks
     if graph.sensor_flags[1] and len(clocks):

@@ -250,8 +250,9 @@ _INDEPENDENT = 0.5
 def adapted(solution: Solution) -> ShakeModel | None:
     """Return the priors adapted to a first solution, or None if nothing changes.
 
-    Adapted are the pixel noise, the RMS of broad bands and of guessed modes, and the encoder's
-    scale; learned modes keep their RMS.
+    Adapted are the pixel noise, the RMS displacement of broad-band shake and of modes whose
+    frequency is a default, and the prior standard deviation of the encoder's scale. Modes that were
+    learned from the run keep their RMS.
     """
     model = solution.graph.model
     inflation = _noise_factor(solution)

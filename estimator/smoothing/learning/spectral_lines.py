@@ -73,10 +73,10 @@ def averaged(signal: Signal, factor: int) -> Signal:
 
 
 def averaging_factor(t_s: Array, highest_hz: float) -> int:
-    """Return over how many frames a signal may be averaged.
+    """Return the largest number of frames over which a signal may be averaged in blocks.
 
-    The amplitude of a line at ``highest_hz`` falls by at most 2 %; by at most 8 % while more than
-    500 blocks remain.
+    The amplitude of a spectral line at ``highest_hz`` then falls by at most 2 %, or by at most 8 %
+    if more than 500 blocks are left.
     """
     step = float(np.median(np.diff(t_s)))
     little, more = (int(s / (np.pi * highest_hz * step)) for s in (_SMEAR_RAD, _MOST_SMEAR_RAD))
@@ -403,13 +403,18 @@ def _is_half(mode: RigMode, model: ShakeModel) -> bool:
 
 
 def hidden_mode_weights(line: Zigzag, own: Sequence[RigMode]) -> Array:
-    """Return the prior weights of hidden modes with `_SHARES` (n,) of the line's RMS.
+    """Return prior weights (n,) of how much of a zigzag's spectral line is a mode of the rig.
 
+    A mode of the rig at the frequency of the bubbles' zigzag is hidden by it. The n cases are that
+    it has the fractions `_SHARES` of the line's RMS; the first one is 0, no hidden mode.
+
+    line : the zigzag.
     own : modes of the rig.
 
-    They are equal if the rig has no mode at another frequency. Otherwise a mode weaker than the
-    strongest of these would have to lie at the line's frequency by chance, and its weight is the
-    probability that one of `_MORE` modes does. The rest of the weight goes to the first share, 0.
+    The weights are equal if the carriage has no mode at another frequency. Otherwise a hidden mode
+    that is weaker than the strongest of those would lie at the line's frequency by chance. Its
+    weight is the probability that one of `_MORE` modes does, and what is left of the weight goes to
+    the first case.
     """
     away = [max(m.rms_mm) for m in own if m.camera == CARRIAGE and _is_elsewhere(m, line)]
     strongest = max(away, default=0.0)

@@ -492,11 +492,12 @@ def _placed(
         if shared and abs(clock.offset_s) > max(SAME_CLOCK_S, _DIFFERENT_SDS * clock.sd_s):
             findings.append(
                 Finding(
-                    f"its clock is {clock.offset_s:+.4f} ± {clock.sd_s:.4f} s off that of the "
-                    "frames, as the images show; its times are corrected",
+                    f"its clock is {abs(clock.offset_s):.4f} ± {clock.sd_s:.4f} s "
+                    f"{'ahead of' if clock.offset_s > 0 else 'behind'} that of the frames, judged "
+                    "by the motion in the images; its times have been corrected",
                     where,
-                    f"state clock = \"unknown\" in rig.toml [accelerometers.{sensor.name}] if it "
-                    "has one of its own",
+                    "if this accelerometer has a clock of its own, state clock = \"unknown\" in "
+                    f"rig.toml [accelerometers.{sensor.name}]",
                 )
             )  # fmt: skip
         return moved, findings
@@ -844,8 +845,9 @@ def _encoder(
     if clock is not None and judged and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
         return [
             Finding(
-                f"its clock is {clock.offset_s:+.4f} ± {clock.sd_s:.4f} s off that of the frames, "
-                "as the images show",
+                f"its clock is {abs(clock.offset_s):.4f} ± {clock.sd_s:.4f} s "
+                f"{'ahead of' if clock.offset_s > 0 else 'behind'} that of the frames, judged by "
+                "the motion in the images",
                 where,
                 f"subtract {clock.offset_s:.6g} s from its times",
                 Code.ENCODER_CLOCK,
@@ -1045,7 +1047,7 @@ def _frame_times(problem: SmoothingProblem, as_stated: float) -> Finding | None:
         f"the images agree with the sensors only if the times are multiplied by {best:g}: "
         + _FRAME_FACTORS[best],
         "times of the frames",
-        f"multiply t_s by {best:g}, or correct the frame rate",
+        f"multiply the times t_s of the frames by {best:g}, or correct the frame rate",
         Code.FRAME_TIMES,
         {"frame_time_factor": best},
     )

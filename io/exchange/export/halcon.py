@@ -158,8 +158,9 @@ def _halcon_camera(camera: Camera, points: Array) -> HalconCamera:
         )
     if camera["kappa_per_mm"] != 0 and not perspective:
         notes.append(
-            f"the residual perspective kappa = {camera['kappa_per_mm']:.4g} per mm is left out, "
-            "because a telecentric model has none"
+            "the residual perspective (relative change of scale with depth), kappa_per_mm = "
+            f"{camera['kappa_per_mm']:.4g}, is left out, because HALCON's telecentric model has no "
+            "such parameter"
         )
     if camera["image_convergence_per_mm"] != 0 and (camera["tilt_x"] or camera["tilt_y"]):
         notes.append("image_convergence_per_mm of the tilted sensor is left out")

@@ -125,11 +125,13 @@ def projected(matrix: Array, points_mm: Array) -> Array:
 def camera_matrices(
     cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[Matrices, ...]:
-    """Compute the matrices of every camera.
+    """Compute each camera's (3, 4) projection matrices and its arguments for OpenCV.
 
-    volume : misfits are computed over the part of this box that all cameras see; None takes
-    `working_volume`. Raises InputError if the cameras do not see the volume, and for an unknown
-    lens parameter.
+    volume : box in the rig frame. The misfits in px between matrices and cameras are computed over
+        the part of it that all cameras see. None takes `working_volume`.
+
+    Raises InputError if the cameras do not see the volume, or if a camera has a lens parameter that
+    OpenCV's model lacks.
     """
     refuse_unknown_parameters(cameras, "OpenCV")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)

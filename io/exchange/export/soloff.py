@@ -38,9 +38,9 @@ CHECK_POINTS_PER_EDGE = 34
 class Soloff:
     """Hold the polynomial that was fitted to one camera over a volume.
 
-    coefficients : (19, 2), or (20, 2) with the term `CUBIC_Z` last; the columns give u and v in px
-        for x, y, z in mm in the rig frame.
-    misfit : at points that were not used in the fit.
+    coefficients : (19, 2) in the order of `POWERS`, or (20, 2) with `CUBIC_Z` last. Columns give
+        u and v in px for x, y, z in mm in the rig frame.
+    misfit : error of the polynomial in px at points that were not used in the fit.
     """
 
     camera: str

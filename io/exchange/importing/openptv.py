@@ -120,7 +120,8 @@ def read_ptv_par(path: str | PathLike[str]) -> Sensor:
         raise InputError(
             f"has refraction (indices {', '.join(f'{n:g}' for n in indices)})",
             where=str(file),
-            todo="calibrate in the medium with telerig: a pinhole cannot stand for the glass wall",
+            todo="calibrate with telerig, with the target in the liquid: a pinhole model cannot "
+            "represent the refraction at the glass wall",
         )
     return Sensor((int(width), int(height)), (pixel_x, pixel_y))
 

@@ -224,15 +224,16 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
 _CALIBRATION = (
     "calibration_mm2",
     "Uncertainty: the calibration's share",
-    "One standard deviation in µm (all three axes together) of a point's position in the rig "
-    "frame, in the plane of the optical axes. Points of a run that lie near each other share this "
-    "error: it cancels in their differences.",
+    "Standard deviation in µm of a point's position in the rig frame due to the calibration alone, "
+    "√(sx² + sy² + sz²), for points in the plane that contains both optical axes. Points of a run "
+    "that lie near each other share this error: it cancels in their differences.",
 )
 _MEASUREMENT = (
     "measurement_mm2",
     "Uncertainty: the pixels' share",
-    "One standard deviation in µm of a point whose pixel noise is that of this calibration's "
-    "dots ({sigma} px). It is independent from point to point and proportional to the noise.",
+    "Standard deviation in µm of a point triangulated from both cameras, √(sx² + sy² + sz²), if "
+    "its pixel noise is that of this calibration's dots ({sigma} px). These errors are independent "
+    "from point to point, and proportional to the pixel noise.",
 )
 
 

@@ -77,9 +77,12 @@ def render(
     rig: tuple[tuple[Camera, Camera] | None, str] = (None, ""),
     outdated: Sequence[str] = (),
 ) -> str:
-    """The page as text.
+    """Return the report of a run as the text of an HTML page.
 
-    rig : the two cameras, or None and why they are not known. outdated : what `stale` found.
+    results : of the tracking.
+    smoothing : None for a page without it.
+    rig : the two cameras and "", or None and the reason why they are not known.
+    outdated : the results that are older than their inputs, in words, from `stale`.
     """
     in_space = _in_space(results, smoothing)
     scene = track_scene_json(in_space)

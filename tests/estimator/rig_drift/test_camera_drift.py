@@ -335,7 +335,7 @@ def test_numbers_are_cut_where_their_deviation_has_two_digits() -> None:
         "right", six, np.diag(six), six[:3], values, sigmas, np.array([0.2, 5e-3, 5e-3]), 0.0, 100
     )
     assert change.size_words() == (
-        "by +88.50 ± 0.95 µm along the shared coordinate, rolled by -2025 ± 50 µrad, "
+        "by +88.50 ± 0.95 µm perpendicular to both optical axes, rolled by -2025 ± 50 µrad, "
         "pitched by +50 ± 54 µrad"
     )
 

@@ -168,7 +168,7 @@ def test_halcon_states_the_residual_perspective_it_leaves_out() -> None:
     cameras = pair(kappa_per_mm=2e-6)
     for ours in halcon_cameras(cameras):
         assert ours.kind == "area_scan_telecentric_division"
-        assert "kappa = 2e-06" in ours.notes[0] and 1e-3 < ours.misfit.max_px < 0.05
+        assert "kappa_per_mm = 2e-06" in ours.notes[0] and 1e-3 < ours.misfit.max_px < 0.05
 
 
 def test_halcon_distortion_without_inverse_is_an_error() -> None:

@@ -44,7 +44,8 @@ def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
         "1 of 2 runs done, 1 dataset", "calibrated 1 of 1 1 GOOD",
         "smoothed 1 of 2 1 left out, 1 RESOLVED", "work 2.5 min longest job 30 s, 1 machine",
         "tank GOOD radial 12 99.5% 0.0123", "sd / µm",
-        "tank / rise RESOLVED SHAKE_BELOW_NOISE 120 7 800 23.0, 13.0, 24.0", "tank / fall track failed",
+        "tank / rise RESOLVED SHAKE_BELOW_NOISE 120 7 800 23.0, 13.0, 24.0",
+        "tank / fall track failed",
         f"/data/tank, run fall track failed {evil}",
     ):  # fmt: skip
         assert words in page.spaced, words

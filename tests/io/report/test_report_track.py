@@ -128,7 +128,7 @@ def test_shake_learnt_from_the_run_accounts_for_the_ray_miss(folder: Path) -> No
     results = read_track_results(_edit(folder, pairs=pairs))
     assert learnt_sd_mm(results) == pytest.approx(np.hypot(1.5, 0.2) / SCALE, rel=2e-3)
     assert not verdict(results).warnings
-    assert "shake against each other (1.5 px from frame to frame)" in verdict(results).sentences[-1]
+    assert "against each other (1.5 px from frame to frame)" in verdict(results).sentences[-1]
 
 
 def test_covariances_too_small_and_few_partners_are_warned_of(folder: Path) -> None:

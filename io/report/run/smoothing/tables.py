@@ -399,7 +399,8 @@ def _constants(values: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 _SOURCES = {
-    "default": "fixed priors, with noise and size of the shake adapted to the data.",
+    "default": "default frequencies and damping; only the pixel noise and the RMS of the shake are "
+    "estimated from this run.",
     "learned": "found from this run by maximum likelihood.",
     "given": "given by the user.",
 }
@@ -474,11 +475,12 @@ def whiteness_words(results: SmoothingResults) -> str:
         )
     if any(v.get("verdict") == "correlated" for v in known):
         out.append(
-            "Residuals of neighbouring frames are not alike as the model leaves them: motion that "
-            "it does not hold, centres that wander with the bubbles' shapes, or noise that is not "
-            "as stated. The standard deviations cannot be relied on."
+            "Residuals of consecutive frames are correlated in another way than a correct model "
+            "leaves them. Causes may be motion that the model does not contain, centres that "
+            "wander with the bubbles' shapes, or pixel noise that is not as stated. The standard "
+            "deviations cannot be relied on."
         )
     return " ".join(out) or (
-        "Residuals are as large, and neighbouring frames' as alike, as the fit leaves them where "
-        "the model is right: what the images hold of the motion is in the trajectories."
+        "The size of the residuals and their correlation between consecutive frames agree with "
+        "what a correct model leaves: the residuals show no unexplained motion."
     )

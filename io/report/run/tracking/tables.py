@@ -98,10 +98,11 @@ def _miss_words(results: TrackResults) -> str:
     whole = ray_miss_ratio(results, _with_learnt(results), centred=True)
     if ratio > _MISS_TOO_LARGE and whole is not None and whole < _MISS_TOO_LARGE:
         text += (
-            f" The cameras' shake against each other ({number(results.pairs.frame_px, 2)} "
-            f"px from frame to frame) and the scatter of the pairs "
-            f"({number(results.pairs.scatter_px, 2)} px), as learnt from this run, account "
-            "for that; they are not in the covariances of tracks.csv."
+            " The vibration of the cameras against each other "
+            f"({number(results.pairs.frame_px, 2)} px from frame to frame) and the "
+            f"scatter of single pairs of outlines ({number(results.pairs.scatter_px, 2)} px), "
+            "both estimated from this run, explain the difference. The covariances in tracks.csv "
+            "do not contain them."
         )
     return text
 
@@ -117,7 +118,7 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
     if results.pairs.calibration_problem:
         offsets = ", ".join(number(b) for b in _as_list(results.pairs.bias_px))
         words.append(
-            "The two cameras disagree along their shared axis"
+            "The two cameras disagree along the direction perpendicular to both optical axes"
             + (f" (offset {offsets} px)" if offsets else "")
             + ": this is a calibration problem. Calibrate again before you use these tracks."
         )
@@ -200,7 +201,7 @@ def pair_rows(results: TrackResults) -> list[tuple[str, str]]:
         return []
     stages = ("as it is", "after a constant", "after the whole bias", "for pairs left out of it")
     bias = [number(b) for b in _as_list(pairs.bias_px)]
-    rows = [("offset along the shared axis, px", ", ".join(bias) or ABSENT)]
+    rows = [("offset perpendicular to both optical axes, px", ", ".join(bias) or ABSENT)]
     rows += [("scatter of a pair, px", number(pairs.scatter_px))]
     rows += [("shift common to a frame, px", number(pairs.frame_px))]
     return rows + [(f"RMS {stage}, px", number(rms)) for stage, rms in zip(stages, pairs.rms_px)]

@@ -48,8 +48,8 @@ def record(
     rig: Annotated[
         Path | None,
         typer.Option(
-            help="The rig file [default: DATASET/rig.toml]; with --replay, its devices replace "
-            "those in the recording."
+            help="The rig file [default: DATASET/rig.toml]; with --replay, its settings of the "
+            "devices are used instead of those stored in the recording."
         ),
     ] = None,
     replay: Annotated[

@@ -236,8 +236,8 @@ def _nominal(
     unknown = sorted(set(given) - set(names[1:]))
     if unknown:
         raise InputError(
-            f"nominal rotations are given for {', '.join(unknown)}, which the rig does not have or "
-            "which is its first camera",
+            f"nominal rotations are given for {', '.join(unknown)}: a rotation is needed for each "
+            "camera of the rig except the first one, to which the rotations refer",
             todo="give nominal rotations for: "
             f"{', '.join(names[1:]) or 'no camera, because there is only one'}",
         )

@@ -54,19 +54,20 @@ class TrackerSettings:
         which the velocity oscillates.
     shake_sd_mm, shake_time_s : sd and correlation time of the offset that all bubbles of a frame
         share.
-    stage_acceleration_mm_s2 : acceleration of the stage in frames without an encoder position.
+    stage_acceleration_mm_s2 : RMS acceleration of the stage in frames without an encoder position.
     size_scatter : relative sd of d_eq_mm (equivalent diameter) from frame to frame.
     size_cap_log_ratio : largest penalty of a wrong size, as a difference of log-likelihoods.
     detection_probability : probability that a bubble is detected in a frame.
     missed_again_probability : probability that a bubble which was missed in the frame before is
         missed again.
     end_probability : probability that a bubble leaves for good in a frame. Because of it, a track
-        that was missed for long hardly claims a measurement.
+        that was missed for many frames is less likely to be given a measurement.
     new_per_mm3, new_per_px2 : density of false detections and new bubbles in space (1/mm^3) and in
         one image (1/px^2).
     gate_probability : probability that the true continuation of a track lies inside its gate.
     margin_log_ratio : smallest log-likelihood ratio between the best and the second-best hypothesis
-        for which the best one counts as safe when the window ends.
+        for which the best one counts as unambiguous when the window ends; below it, the tracks are
+        cut.
     prune_log_ratio : a hypothesis whose log-likelihood is smaller than the best one's by more than
         this is dropped at once.
     window_frames : number of frames for which a conflict (tracks that compete for the same

@@ -52,8 +52,8 @@ def _new_folder(out: str | PathLike[str] | None) -> Path:
     folder = Path(out)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            "is in use: a simulated dataset is written into a new or empty folder",
+            "exists and is not empty: a simulated dataset is written into a new or empty folder",
             where=str(folder),
-            todo="choose another --out, or remove it",
+            todo="choose another folder with --out, or delete this one first",
         )
     return folder

@@ -122,9 +122,13 @@ class Prior:
 
 
 def learnt_prior(outlines: Outlines, partial: Bools, *, flattening: bool) -> Prior:
-    """Return for partly hidden outlines the shapes of the frame's whole ones, else a weak prior.
+    """Return a prior of each outline's shape.
 
-    partial : (B,) which outlines are partly hidden. flattening : whether it is learnt, too.
+    That of partly hidden outlines is estimated from the whole outlines of the same frame. All
+    others get a weak prior, and all do if too few outlines are whole.
+
+    partial : (B,) True for outlines that are partly hidden.
+    flattening : whether the flattening is estimated from the whole outlines, too.
     """
     prior = Prior.weak(np.where(partial, learnt_spread(outlines), _FREE))
     if flattening:

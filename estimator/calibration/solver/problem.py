@@ -56,9 +56,12 @@ DOTS_FREE = ("3d", "plane", "nominal")
 
 
 def checked_outlier_sd(outlier_sd: float) -> float:
-    """Return ``outlier_sd`` unchanged.
+    """Check the limit beyond which a dot is an outlier, and return it unchanged.
 
-    Raises InputError if it is not finite, or so small that many correct dots would be left out.
+    outlier_sd : limit of a residual, in its standard deviations.
+
+    Raises InputError if it is not finite, or smaller than `LEAST_OUTLIER_SD`: many correct dots
+    would be left out.
     """
     if not LEAST_OUTLIER_SD <= outlier_sd < np.inf:
         raise InputError(

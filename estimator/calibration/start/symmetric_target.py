@@ -76,7 +76,11 @@ def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:
         ids[rows] = label[ids[rows]]
     known = np.searchsorted(problem.dot_ids, ids)
     if not np.array_equal(problem.dot_ids[known], ids):
-        raise CalibrationError("a turned numbering names dots that no image shows")
+        raise CalibrationError(
+            "the target is symmetric, and if it is turned into another orientation some of its "
+            "dots get numbers that were found in no image",
+            todo="put marks on the target, or leave out views that show only a part of it",
+        )
     return replace(problem, dot=known)
 
 

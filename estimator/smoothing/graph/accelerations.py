@@ -194,9 +194,11 @@ class _Chains:
         return value, covariance + self._pooled(by_rig)
 
     def displacement_variances(self) -> Array:
-        """Return variances (bubbles, 3) of the way from the first frame to the last one.
+        """Return variances (bubbles, 3) in mm^2 of the displacement over each bubble's track.
 
-        The chains' own errors at the two ends count as independent; those of the rig are not.
+        It is the displacement from the track's first frame to its last one. The errors of the
+        bubble's own motion at both ends are taken as independent; the correlation of the rig's
+        errors between both ends is included.
         """
         graph = self.graph
         ends = np.stack([graph.first_row[:-1], graph.first_row[1:] - 1])

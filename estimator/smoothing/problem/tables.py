@@ -74,9 +74,10 @@ def accelerometers_of(
 
 
 def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = MARGIN_S) -> Accelerometer:
-    """Return the sensor with the samples within a margin of the frames, possibly none.
+    """Return the sensor with the samples from before the first frame to after the last one.
 
     t_s : (F,) times of the frames.
+    margin_s : how long before and after. If there is no such sample, the result has none.
     """
     return sensor.of(_near(sensor.t_s - sensor.delay_s, t_s, margin_s))
 

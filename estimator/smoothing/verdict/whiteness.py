@@ -168,8 +168,10 @@ class Stretch:
     inner: tuple[int, int]
 
     def columns(self, linear: LinearFactors) -> Ints:
-        """Return for each block of the factors its first column (M, keys), -1 if its state is
-        fixed.
+        """Return the first column of each factor's blocks in the stacked Jacobian.
+
+        The result is (M, K) for M factors of K variables each; it is -1 where a variable is held
+        constant.
         """
         count = len(linear.rhs)
         moving = len(self.column)

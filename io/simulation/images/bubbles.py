@@ -98,7 +98,11 @@ class Silhouette:
 
 @dataclass(frozen=True)
 class Patch:
-    """Part of an image: absorption (rows, columns) whose first pixel is (row, column)."""
+    """Hold the light that bubbles absorb in a rectangular part of an image.
+
+    row, column : position of the part's first pixel in the image.
+    absorption : (M, N) share of the light that is absorbed in each of its pixels, 0 to 1.
+    """
 
     row: int
     column: int

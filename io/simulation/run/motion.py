@@ -40,10 +40,11 @@ class LinearProcess:
         return np.asarray(solve_continuous_lyapunov(self.drift, -noise))
 
     def discretised(self, step_s: float) -> tuple[Array, Array]:
-        """Return transition (n, n) and a square root (n, n) of the noise covariance of a step.
+        """Return the transition over a step and a square root of its noise covariance, both (n, n).
 
-        Van Loan's exponential holds e^(-F t), huge for fast states: it is taken for a part of the
-        step, and doubled.
+        The root is symmetric. Van Loan's method contains e^(-F t), which is too large to compute
+        with if states decay fast. It is therefore applied to a small fraction of the step, which is
+        then doubled repeatedly.
         """
         doublings = max(
             0, int(np.ceil(np.log2(np.linalg.norm(self._rates(), 2) * step_s + 1e-300)))

@@ -149,9 +149,10 @@ def velocities(results: SmoothingResults, axis: int) -> Picture:
     smooth, naive, rts = (column(table, kind + name) for kind in ("", "naive_", "rts_"))
     sd = column(table, f"s{name}")
     caption = (
-        "The naive velocity (differences of raw positions) is "
-        f"{number(rms(naive - smooth), 3)} mm/s RMS off the smoothed one, whose standard deviation "
-        f"is {number(median(sd), 3)} mm/s (median). {_BANDS}{_marks(table)} {where} "
+        "The naive velocity (differences of raw positions) differs by "
+        f"{number(rms(naive - smooth), 3)} mm/s RMS from the smoothed one, whose estimated "
+        f"uncertainty is {number(median(sd), 3)} mm/s (1 sd, median over the frames). "
+        f"{_BANDS}{_marks(table)} {where} "
         f"{_upside_down(results, axis)}"
     )
     title, label = f"Velocity in {AXES[axis]}", f"v{AXES[axis]} / (mm/s)"

@@ -99,6 +99,7 @@ def measured(
 
     found = smooth(table, calibration, t_s=problem.t_s, progress=progress).trajectories
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    found = found.sort_values(["particle", "frame"])
     off = found[["x_mm", "y_mm", "z_mm"]].to_numpy() - lab
     sd = found[["sx_mm", "sy_mm", "sz_mm"]].to_numpy()
     um, sd_um = ((1e3 * np.sqrt((a**2).mean(0))).tolist() for a in (off, sd))

@@ -167,10 +167,14 @@ class _Stack:
         return start, start + size
 
 
+_NOT_GREY = (0, 3)
+"""Photometric interpretations of TIFF: white stored as 0, and a palette."""
+
+
 def _contiguous_stack(tiff: Any, pages: int, path: Path) -> _Stack | None:
     """Return the stack if the file's description counts more frames than there are page headers."""
     page = tiff.pages[0]
-    if page.samplesperpixel != 1 or page.photometric == 0:
+    if page.samplesperpixel != 1 or page.photometric in _NOT_GREY:
         return None
     described = tiff.is_imagej or tiff.is_shaped or tiff.is_ome
     if page.subifds is not None or not described:  # a damaged file can count billions of subifds
@@ -178,6 +182,8 @@ def _contiguous_stack(tiff: Any, pages: int, path: Path) -> _Stack | None:
     count = int(np.prod(tiff.series[0].shape)) // max(page.size, 1)
     count = max(count, int((tiff.imagej_metadata or {}).get("images", 0)))
     if count <= pages or not page.is_contiguous:
+        return None
+    if pages > 1 and tiff.pages[1].dataoffsets[0] != page.dataoffsets[0] + page.nbytes:
         return None
     dtype = np.dtype(tiff.byteorder + np.dtype(page.dtype).char)
     refuse_too_large(page.imagewidth, page.imagelength, dtype.itemsize, path)

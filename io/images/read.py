@@ -165,6 +165,7 @@ def _jpeg(data: bytes, file: Path) -> NDArray[Any]:
 
 def _tiff(data: bytes, file: Path) -> NDArray[Any]:
     """Decode a TIFF file; OpenCV where tifffile needs imagecodecs (LZW, 12 packed bits)."""
+    bits, orientation = 0, 1
     try:
         with decoding(file), tiff_reader().TiffFile(file) as tiff:
             if len(tiff.pages) == 0:
@@ -178,11 +179,24 @@ def _tiff(data: bytes, file: Path) -> NDArray[Any]:
                     where=str(file),
                     todo="save one image per file here; multi-page files belong in runs/",
                 )
+            bits, orientation = int(np.max(page.bitspersample)), _orientation(page)
             return page_pixels(page, len(data), file)
     except InputError as error:
-        if "imagecodecs" in str(error.__cause__):
-            return _opencv(data, file)
-        raise
+        if "imagecodecs" not in str(error.__cause__):
+            raise
+        if orientation != 1:
+            raise InputError(
+                f"is compressed, and its tag Orientation ({orientation}) would turn or mirror it",
+                where=str(file),
+                todo="save it without compression",
+            ) from error
+        pixels = _opencv(data, file)
+        return pixels >> 4 if bits == 12 and not np.any(pixels & 15) else pixels
+
+
+def _orientation(page: Any) -> int:
+    tag = page.tags.get("Orientation")
+    return 1 if tag is None else int(tag.value)
 
 
 def tiff_reader() -> Any:
@@ -191,6 +205,10 @@ def tiff_reader() -> Any:
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)
     return tifffile
+
+
+_PALETTE = 3
+"""Photometric interpretation of a TIFF whose pixels are places in a table of colours."""
 
 
 def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
@@ -213,6 +231,8 @@ def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
             todo="save it again with black as 0",
         )
     pixels = np.asarray(page.asarray())
+    if page.photometric == _PALETTE:
+        return np.moveaxis(page.colormap >> 8, 0, -1).astype(np.uint8)[pixels]
     return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
+from telerig.io.dataset.tables import read_accelerometer_csv
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.recording.replay import (
     GAP_INTERVALS,
@@ -32,6 +33,7 @@ _LONGEST_LINE = 200
 _MOST_FRAMES = 100
 """More frames than so many for each line that reports one cannot be right."""
 REFUSED_NAME = "refused.csv"
+_READINGS = ("ax_m_s2", "ay_m_s2", "az_m_s2")
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def _stage(records: Sequence[DeviceRecord]) -> Iterator[str]:
 
 
 def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
-    yield "t_s,sensor,ax_m_s2,ay_m_s2,az_m_s2\n"
+    yield f"t_s,sensor,{','.join(_READINGS)}\n"
     for record in records:
         if len(record.t_s):
             unit = record.device.unit_m_s2
@@ -147,16 +149,11 @@ def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
 
 def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
     """Return the rows of an existing table whose sensors are not in this recording."""
-    if not file.is_file():
-        return
-    with file.open(encoding="utf-8") as stream:
-        names = next(stream, "").strip().split(",")
-        if names[:2] != ["t_s", "sensor"]:
-            return
-        for line in stream:
-            cells = line.split(",", 2)
-            if len(cells) == 3 and cells[1] not in recorded:
-                yield line if line.endswith("\n") else line + "\n"
+    if file.is_file():
+        found = read_accelerometer_csv(file, None)
+        others = found[~found["sensor"].isin(recorded)]
+        columns = [others[n].to_numpy() for n in ("t_s", "sensor", *_READINGS)]
+        yield from _rows("%r,%s,%r,%r,%r\n", columns)
 
 
 def _frames(frames: FrameTimes) -> Iterator[str]:

@@ -81,6 +81,31 @@ def test_multi_page_tiff(kind: str, bits: int, run_folder: Path) -> None:
     np.testing.assert_array_equal(run.image("right", 5), frames[5])
 
 
+@pytest.mark.parametrize("counted", [6, 8])
+def test_pages_with_gaps_between_them_are_not_read_as_one_block(
+    counted: int, run_folder: Path
+) -> None:
+    """A recorder writes each page's header beside its pixels; its count may be of what was asked."""
+    frames = movie(6)
+    for camera in CAMERAS:
+        with tifffile.TiffWriter(run_folder / f"{camera}.tif") as writer:
+            for k, frame in enumerate(frames):
+                words = f"ImageJ=1.53\nimages={counted}\nframes={counted}\n" if k == 0 else None
+                writer.write(
+                    frame, contiguous=False, metadata=None, description=words, software=False
+                )
+    assert_frames(load_run(run_folder), "left", frames)
+
+
+def test_pages_with_a_palette_are_what_they_show(run_folder: Path) -> None:
+    frames = movie(3)
+    inverse = np.stack([(255 - np.arange(256)) * 257] * 3).astype(np.uint16)
+    for camera in CAMERAS:
+        file = run_folder / f"{camera}.tif"
+        tifffile.imwrite(file, 255 - frames, photometric="palette", colormap=inverse, metadata=None)
+    assert_frames(load_run(run_folder), "left", frames)
+
+
 VIDEOS = [
     ("avi", "rawvideo", "gray", 8),
     ("avi", "rawvideo", "bgr24", 8),

@@ -143,12 +143,19 @@ def test_a_replay_in_place_keeps_sensors_that_were_imported(
     write_tables(copy)
     file = tmp_path / "accelerometer.csv"
     before = file.read_bytes()
-    imported = b"0.5,carriage,1,2,3\n0.6,carriage,4,5,6"
-    file.write_bytes(before + imported)
+    head, rows = before.split(b"\n", 1)
+    kept = b"0.5,carriage,1.0,2.0,3.25\n0.6,carriage,4.0,5.0,6.0\n"
+    file.write_bytes(before + b"0.5,carriage,1,2,3.25\n0.6,carriage,4,5,6")
+    for _ in range(2):
+        write_tables(copy)
+        assert file.read_bytes() == before + kept
+    # a byte order mark, columns in another order, and one more column, as spreadsheets leave them
+    turned = (
+        b"sensor,az_m_s2,t_s,ay_m_s2,ax_m_s2,note\ncarriage,3.25,0.5,2,1,a\ncarriage,6,0.6,5,4,\n"
+    )
+    file.write_bytes(b"\xef\xbb\xbf" + turned)
     write_tables(copy)
-    assert file.read_bytes() == before + imported + b"\n"
-    write_tables(copy)
-    assert file.read_bytes() == before + imported + b"\n"
+    assert file.read_bytes() == before + kept
 
 
 @pytest.mark.parametrize("protocol", ["stream", "packets"])

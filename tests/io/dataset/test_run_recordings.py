@@ -85,7 +85,7 @@ def test_multi_page_tiff(kind: str, bits: int, run_folder: Path) -> None:
 def test_pages_with_gaps_between_them_are_not_read_as_one_block(
     counted: int, run_folder: Path
 ) -> None:
-    """A recorder writes each page's header beside its pixels; its count may be of what was asked."""
+    """A recorder may write each page beside its header, and the count that was asked for."""
     frames = movie(6)
     for camera in CAMERAS:
         with tifffile.TiffWriter(run_folder / f"{camera}.tif") as writer:

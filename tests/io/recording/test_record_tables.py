@@ -143,7 +143,6 @@ def test_a_replay_in_place_keeps_sensors_that_were_imported(
     write_tables(copy)
     file = tmp_path / "accelerometer.csv"
     before = file.read_bytes()
-    head, rows = before.split(b"\n", 1)
     kept = b"0.5,carriage,1.0,2.0,3.25\n0.6,carriage,4.0,5.0,6.0\n"
     file.write_bytes(before + b"0.5,carriage,1,2,3.25\n0.6,carriage,4,5,6")
     for _ in range(2):

@@ -232,7 +232,8 @@ def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
         )
     pixels = np.asarray(page.asarray())
     if page.photometric == _PALETTE:
-        return np.moveaxis(page.colormap >> 8, 0, -1).astype(np.uint8)[pixels]
+        colours = np.moveaxis(np.asarray(page.colormap), 0, -1) >> 8
+        return np.asarray(colours.astype(np.uint8)[pixels])
     return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
 
 

@@ -27,6 +27,14 @@ def test_a_column_without_a_name_gets_one(tmp_path: Path) -> None:
     assert list(read_table(file, [Column("t_s")], extra=True)) == ["t_s", "Unnamed: 1", "x"]
 
 
+def test_a_row_that_is_too_long_does_not_make_up_for_one_that_is_too_short(tmp_path: Path) -> None:
+    file = tmp_path / "t.csv"
+    columns = [Column("t_s"), Column("z_mm"), Column("note", "text", required=False, blank=True)]
+    file.write_text("t_s,z_mm,note\n0.0,9,\n0.1,10,5,x\n0.2,11.0\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"row 3: has 4 cells, the header has 3 \(and 1 more"):
+        read_table(file, columns)
+
+
 def test_a_particle_that_is_infinite_is_a_name(tmp_path: Path) -> None:
     file = tmp_path / "tracks.csv"
     file.write_text("frame,particle,t_s,x_mm,y_mm,z_mm\n0,inf,0,1,2,3\n", encoding="utf-8")

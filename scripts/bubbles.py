@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -47,7 +48,8 @@ def bubbles(
     if not files:
         raise InputError("holds no image", where=str(images[0]), todo="give images or a folder")
     corners = _corners(region)
-    again = typed_command() or f"telerig bubbles {images[0]} --out {out}"
+    whole = ["telerig", "bubbles", *map(str, images), "--out", str(out)]
+    again = typed_command() or shlex.join(whole)
     with progress(quiet) as stage:
         inputs = fingerprints(out, files if mask is None else [*files, mask])
         with replaced_results(out, "bubbles", again=again, inputs=inputs) as staged:

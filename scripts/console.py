@@ -19,8 +19,11 @@ from typing import Any, NoReturn
 
 import typer
 
+import telerig
 from telerig.errors import TelerigError, TelerigWarning
 from telerig.progress import Steps, steps_shown
+
+_PACKAGE = Path(telerig.__file__).resolve().parent
 
 EXIT_REJECTED = 1
 EXIT_BAD_INPUT = 2
@@ -45,7 +48,9 @@ def say(text: str) -> None:
 def typed_command() -> str:
     """Return the command line as it was typed; "" when another program called the command."""
     program = Path(sys.argv[0])
-    if program.stem == "telerig" or program.resolve().parent == Path(__file__).resolve().parent:
+    here = Path(__file__).resolve().parent
+    module = program.name == "__main__.py" and program.resolve().parent == _PACKAGE  # python -m
+    if module or program.stem == "telerig" or program.resolve().parent == here:
         return shlex.join(["telerig", *sys.argv[1:]])
     return ""
 

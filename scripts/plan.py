@@ -37,7 +37,13 @@ def plan(
     views: Annotated[
         int, typer.Option(help="Number of views of the target, if it is not calibrated yet.")
     ] = 12,
-    calibration: options.GivenCalibration = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="A calibration.json to use [the dataset's own; before it is calibrated, the one "
+            "that --views views of its target are expected to give]."
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="CSV file for the table [none].")] = None,
     quiet: options.Quiet = False,
 ) -> None:

@@ -56,15 +56,16 @@ def simulate(
     references: Annotated[
         int | None,
         typer.Option(
-            help="Number of dots that each camera sees of a strip that is fixed to the tank [0]."
+            help="Number of dots that each camera sees of a strip that is fixed to the tank [0; in "
+            "the presets S0 to S6 and forces: 4, as a table that is not drawn into the images]."
         ),
     ] = None,
     accelerometers: Annotated[
         str | None,
         typer.Option(
             help="Where accelerometers are mounted, separated by commas: a camera's name stands "
-            "for its arm, 'carriage' for the carriage; or 'none' [none; in the presets S0 to S6: "
-            "every arm]."
+            "for its arm, 'carriage' for the carriage; or 'none' [none; in the presets S0 to S6 "
+            "and forces: every arm]."
         ),
     ] = None,
     devices: Annotated[

@@ -283,7 +283,7 @@ def _generic(dataset: Dataset, count: int) -> str:
     """Return what to do first, before a calibration can say more."""
     names = list(dataset.rig.cameras)
     if len(names) < 2:
-        return "tilt the target by 20 to 50 degrees, about another axis than before"
+        return "tilt the target by 20 to 60 degrees, about another axis than before"
     rotvecs = {names[0]: (0.0, 0.0, 0.0), **dataset.rig.rotvec_from_first_deg}
     at = count % (len(names) - 1)  # each camera and the next one in turn
     first, second = names[at], names[at + 1]

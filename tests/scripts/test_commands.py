@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.estimator.calibration.calibrate import run_calibration
+from telerig.scripts import console
 from telerig.scripts.calibrate import calibrate as calibrate_command
 from telerig.scripts.main import app
 
@@ -309,3 +311,35 @@ def test_bubbles_of_single_images(tmp_path: Path) -> None:
     assert "--region, one.tif: is no polygon" in text and not (tmp_path / "bad").exists()
     (tmp_path / "none").mkdir()
     assert "holds no image" in run("bubbles", tmp_path / "none", code=2)
+
+
+def test_the_manifest_has_the_whole_command_line(tmp_path: Path) -> None:
+    for name in ("one.png", "number two.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((60, 80), 200, np.uint8))
+    line = ["bubbles", "one.png", "number two.png", "--out", "found", "--min-diameter", "9"]
+    subprocess.run(
+        [sys.executable, "-m", "telerig", *line], cwd=tmp_path, timeout=120, check=True
+    )  # fmt: skip
+    assert section_of(tmp_path / "found", "bubbles")["again"] == shlex.join(["telerig", *line])
+    images = [str(tmp_path / name) for name in ("one.png", "number two.png")]
+    run("bubbles", *images, "--out", tmp_path / "here", "--quiet")
+    again = shlex.join(["telerig", "bubbles", *images, "--out", str(tmp_path / "here")])
+    assert section_of(tmp_path / "here", "bubbles")["again"] == again
+
+
+def section_of(folder: Path, command: str) -> dict[str, object]:
+    content = json.loads((folder / "manifest.json").read_text())
+    section = content["sections"][command]
+    assert isinstance(section, dict)
+    return section
+
+
+def test_only_telerigs_own_command_line_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    package = Path(telerig.__file__).parent
+    rest = ["track", "a run", "--quiet"]
+    for program in ("/usr/bin/telerig", str(package / "__main__.py"), inspect.getfile(console)):
+        monkeypatch.setattr(sys, "argv", [program, *rest])
+        assert console.typed_command() == "telerig track 'a run' --quiet"
+    for program in ("/lib/pytest/__main__.py", "/home/lab/nightly.py"):
+        monkeypatch.setattr(sys, "argv", [program, *rest])
+        assert console.typed_command() == ""

@@ -112,7 +112,7 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
         if len(mine) and mine.max() < SMALL_TILT_DEG:
             words = (
                 f"camera {camera.name!r}: no view is tilted by more than {mine.max():.0f} degrees, "
-                "so its scale along the depth is poorly determined; add views tilted by 20-40 "
+                "so its scale along the depth is poorly determined; add views tilted by 20-60 "
                 "degrees"
             )
             notes.append(Note("small tilts", words, affects_verdict=True))
@@ -296,7 +296,7 @@ def _refuse_parallel(
             f"all views are parallel: the target's tilt differs by {spread:.1f} degrees at most. "
             "Then a larger depth with a smaller tilt gives nearly the same images (bas-relief "
             "ambiguity), so the scale along the depth is not determined",
-            todo="tilt the target differently in every view, by 20-40 degrees about several axes",
+            todo="tilt the target differently in every view, by 20-60 degrees about several axes",
         )
 
 

@@ -201,7 +201,7 @@ def tilts(results: CalibrationResults) -> Picture:
     span = f"from {min(every):.0f} to {max(every):.0f} degrees" if every else "unknown"
     caption = (
         f"One mark per view: distance from the middle is the tilt ({span}), direction is where the "
-        "target leans in the image; marks should go round the disc at 20 to 70 degrees."
+        "target leans in the image; marks should go round the disc at 20 to 60 degrees."
     )
     return Picture("Tilts of the target", sheet.source, caption)
 

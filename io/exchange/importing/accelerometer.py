@@ -187,6 +187,11 @@ def _is_text(recording: Recording, name: str) -> bool:
     return values.dtype.kind not in "iufb" and 2 * sum(map(_is_number, some)) <= len(some)
 
 
+def _is_blank(recording: Recording, name: str) -> bool:
+    values = recording.channels[name]
+    return values.dtype.kind == "f" and bool(np.isnan(values).all())
+
+
 def _values(recording: Recording, name: str) -> Array:
     values = recording.channels[name]
     if values.ndim != 1 or _is_text(recording, name):
@@ -194,9 +199,12 @@ def _values(recording: Recording, name: str) -> Array:
             f"channel {name!r} is no column of numbers", "name another channel with --channels"
         )
     if values.dtype.kind not in "iufb":
-        bad = next(i for i, cell in enumerate(values) if not _is_number(str(cell)))
-        what = f"reading {bad} of {name!r} is {str(values[bad])!r:.60}, no number"
-        raise recording.error(what, "correct or remove the row", bad)
+        cells = [str(cell).replace(",", ".") or "nan" for cell in values]
+        bad = next((i for i, cell in enumerate(cells) if not _is_number(cell)), None)
+        if bad is not None:
+            what = f"reading {bad} of {name!r} is {str(values[bad])!r:.60}, no number"
+            raise recording.error(what, "correct or remove the row", bad)
+        return np.array(cells, float)
     return np.asarray(values, float)
 
 
@@ -220,7 +228,7 @@ def _times(recording: Recording, layout: Layout, rows: int) -> tuple[Array, list
             )
         return _times_in(recording, layout, name)
     if layout.rate_hz is None:
-        named = [name for name in there if is_time(name)] or [
+        named = [name for name in there if is_time(name) and not _is_blank(recording, name)] or [
             name
             for name in there
             if _is_text(recording, name) and _stamps(recording, name) is not None
@@ -231,7 +239,9 @@ def _times(recording: Recording, layout: Layout, rows: int) -> tuple[Array, list
     rate = layout.rate_hz if layout.rate_hz is not None else recording.rate_hz
     if rate is None or not rate > 0:
         raise recording.error(
-            "contains neither times nor a sampling rate" if rate is None else f"rate is {rate} Hz",
+            "contains neither times nor a sampling rate that can be read without doubt"
+            if rate is None
+            else f"rate is {rate} Hz",
             "name the channel of times with --time, or give the sampling rate with --rate-hz 1600",
         )
     counted = _counted(recording, rows)
@@ -271,7 +281,7 @@ def _times_in(recording: Recording, layout: Layout, name: str) -> tuple[Array, l
         raise InputError(f"--time-unit {unit}: there is no such unit", todo=todo)
     t_s = values * TIME_UNITS[unit]
     said = [f"times are taken from the channel {name!r} in {unit}"]
-    step = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    step = _step(t_s)
     stated = recording.rate_hz
     if stated and step > 0 and abs(1 / step / stated - 1) > _SAME_RATE:
         said.append(
@@ -282,21 +292,36 @@ def _times_in(recording: Recording, layout: Layout, name: str) -> tuple[Array, l
 
 
 def _stamps(recording: Recording, name: str) -> Array | None:
-    """Return the times in s of a channel of stamps; a channel of dates is put before them."""
-    stamps = [str(cell) for cell in recording.channels[name]]
-    t_s = None if is_date(name) else seconds_of(stamps)
+    """Return the times in s of a channel of stamps, to which a channel of dates may belong.
+
+    They are NaN where the channel is blank; None is returned if other cells are no time stamps.
+    """
+    cells = [str(cell).strip() for cell in recording.channels[name]]
+    filled = [i for i, cell in enumerate(cells) if cell]
+    found = None if is_date(name) else seconds_of([cells[i] for i in filled])
     dates = next((n for n in recording.channels if is_date(n) and n != name), None)
-    if dates is None or not _is_text(recording, dates):
-        return t_s
-    joined = seconds_of([f"{d} {s}" for d, s in zip(recording.channels[dates], stamps)])
-    return t_s if joined is None else joined
+    if dates is not None and _is_text(recording, dates):
+        days = recording.channels[dates]
+        joined = seconds_of([f"{days[i]} {cells[i]}" for i in filled])
+        found = found if joined is None else joined
+    if found is None:
+        return None
+    t_s = np.full(len(cells), np.nan)
+    t_s[filled] = found
+    return t_s
+
+
+def _step(times: Array) -> float:
+    """Return the median difference between times in a row, 0 if there are fewer than two."""
+    steps = np.diff(times[np.isfinite(times)])
+    return float(np.median(steps)) if len(steps) else 0.0
 
 
 def _unit_of_times(recording: Recording, values: Array, name: str) -> str:
     """Return the unit of times that state none: by the stated rate, from 1970, or seconds."""
-    step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+    step = _step(values)
     if step > 0:
-        rates = {unit: 1 / (step * TIME_UNITS[unit]) for unit in ("s", "ms", "us", "ns")}
+        rates = {unit: 1 / (step * TIME_UNITS[unit]) for unit in TIME_UNITS}
         stated = recording.rate_hz
         agreeing = [u for u, r in rates.items() if stated and abs(r / stated - 1) < _SAME_RATE]
         possible = [u for u, r in rates.items() if _PLAUSIBLE_HZ[0] <= r <= _PLAUSIBLE_HZ[1]]

@@ -27,10 +27,11 @@ _SPELLINGS = {
 _OTHER_UNITS = {"deg", "°", "deg/s", "°/s", "dps", "rad/s", "rad", "v", "mv", "t", "ut", "mt",
                 "gauss", "pa", "hpa", "kpa", "c", "°c", "degc", "f", "°f", "%", "-", "n", "mm",
                 "count", "counts", "lsb", "lux", "hz", "nounits", "n/a", "1"}  # fmt: skip
-_WRITTEN = {"²": "^2", "⁻": "-", "\u2212": "-", "µ": "u", "μ": "u", "sec^": "s^", "/sec": "/s",
-            "**": "^"}  # fmt: skip
+_WRITTEN = {"⁻²": "^-2", "²": "^2", "⁻": "-", "\u2212": "-", "µ": "u", "μ": "u", "sec^": "s^",
+            "/sec": "/s", "**": "^"}  # fmt: skip
 _BRACKETS = re.compile(r"[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]")
-_SUFFIX = re.compile(r"[_ ](m_s2|mm_s2|cm_s2|m_s\^2|mps2|[mu]?g|[mun]?s|sec|msec|usec|seconds)$")
+_SUFFIX = re.compile(r"[_ ](m_s2|mm_s2|cm_s2|m_s\^2|mps2|[mu]?g|[mun]?s|sec|msec|usec|seconds|"
+                     r"min|minutes|h|hr|hours)$")  # fmt: skip
 _UNIT_LIKE = re.compile(r"[^\W\d][\w/^²·*%-]{0,11}")
 
 _TIME_WORDS = {"time", "timestamp", "timestamps", "datetime", "elapsed", "epoch", "epoc", "utc",
@@ -136,7 +137,7 @@ def _plain(text: str) -> str:
     text = text.lower()
     for written, meant in _WRITTEN.items():
         text = text.replace(written, meant)
-    return re.sub(r"[\s·⋅*]", "", text)
+    return re.sub(r"[\s·⋅*.]", "", text)
 
 
 def _words(name: str) -> str:

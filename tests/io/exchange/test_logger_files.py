@@ -306,6 +306,102 @@ def test_times_since_1970_say_their_unit(unit_s: float, tmp_path: Path) -> None:
     check(write(tmp_path, lines(["timestamp,ax_g,ay_g,az_g"], first)))
 
 
+@pytest.mark.parametrize(
+    "stated",
+    [
+        "Sampling rate (kHz): 0.1", "Sampling rate: 0.1 kS/s", "Sample rate: 0.1 kSps",
+        "Sample rate: 100 samples/s", "Sampling frequency: 0.0001 MHz", "sample_rate_hz: 100",
+        '"Sample rate","100","Hz"', "Sampling rate: 0,1 kHz", "fs = 100 Hz",
+        "Sampling interval (ms): 10", "Sampling interval: 10 milliseconds",
+        "Sample interval [us]: 10000", "Sampling period: 10000 µs", "Sampling interval: 0.01",
+        "LIS2DW12, FS = 16 g, ODR = 100 Hz", "Low-pass filter at 40 Hz, sample rate 100 Hz",
+        "ODR 100 Hz, sampling interval 10 ms",
+        "Sampled at 100 Hz, low-pass filter at 40 Hz",
+    ],
+)  # fmt: skip
+def test_a_stated_rate_or_interval_has_the_unit_that_is_written(
+    stated: str, tmp_path: Path
+) -> None:
+    check(write(tmp_path, lines([f"# {stated}", "x (g),y (g),z (g)"], [None] * 300)))
+    milliseconds = [f"{1e3 * t:.3f}" for t in T_S]
+    check(write(tmp_path, lines([f"# {stated}", "time,x (g),y (g),z (g)"], milliseconds)))
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        "Sampling rate: 1,600 Hz", "Sampling rate 10 240 Hz", "Low-pass filter at 40 Hz",
+        "LIS2DW12, FS = 16 g", "fs: 100", "Oversampling rate: 16", "Data rate: 921600 baud",
+        "Sampling interval: 625 ticks", "Sampling rate: 1/1600 s",
+    ],
+)  # fmt: skip
+def test_a_rate_that_can_be_doubted_is_asked_for(stated: str, tmp_path: Path) -> None:
+    path = write(tmp_path, lines([f"# {stated}", "x (g),y (g),z (g)"], [None] * 300))
+    with pytest.raises(InputError, match=r"neither times nor a sampling rate[\s\S]*--rate-hz"):
+        read_accelerations(path, "arm")
+
+
+@pytest.mark.parametrize(
+    ("name", "unit_s"),
+    [("time_min", 60), ("Time min", 60), ("time_h", 3600), ("Time (h)", 3600)],
+)
+def test_times_in_minutes_and_hours(name: str, unit_s: float, tmp_path: Path) -> None:
+    check(write(tmp_path, lines([f"{name},x (g),y (g),z (g)"], seconds(unit_s, 12))))
+
+
+@pytest.mark.parametrize("unit", ["m·s⁻²", "m s⁻²", "ms⁻²", "m.s-2"])
+def test_units_with_a_negative_exponent(unit: str, tmp_path: Path) -> None:
+    head = ",".join(["Time (s)", *(f"{axis} ({unit})" for axis in "xyz")])
+    check(write(tmp_path, lines([head], seconds(), G * A_G)))
+
+
+def test_decimal_commas_in_quotes(tmp_path: Path) -> None:
+    rows = lines([], seconds(), mark=";").replace(".", ",").splitlines()
+    quoted = [",".join(f'"{cell}"' for cell in row.split(";")) for row in rows]
+    check(write(tmp_path, "\n".join(["Time (s),X (g),Y (g),Z (g)", *quoted])))
+
+
+def test_separators_of_thousands_are_not_decimal_commas(tmp_path: Path) -> None:
+    whole = np.array([[3, -5, 999], [3, -5, 1000], [3, -5, 1002]])
+    for head, mark in (("Time (ms)\tX (mg)\tY (mg)\tZ (mg)", "\t"), ("t_ms;x_mg;y_mg;z_mg", ";")):
+        rows = [mark.join([str(i), *(f"{v:,}" for v in row)]) for i, row in enumerate(whole)]
+        path = write(tmp_path, "\n".join([head, *rows]))
+        column = head.split(mark)[3]
+        with pytest.raises(InputError) as error:
+            read_accelerations(path, "arm")
+        words = f"row 3: the column {column!r} does not tell whether '1,000' is 1000 or 1.000"
+        assert words in str(error.value)
+    quoted = [f'"{10 * i:,}",0.1,0.2,0.9' for i in range(300)]
+    path = write(tmp_path, "\n".join(["Time (ms),X (g),Y (g),Z (g)", *quoted]))
+    with pytest.raises(InputError, match=r"row 102: the column 'Time \(ms\)'"):
+        read_accelerations(path, "arm")
+    metres = [f"0,{i:03d};0,100;-0,200;9,806" for i in range(10)]
+    path = write(tmp_path, "\n".join(["Time (s);X (m/s2);Y (m/s2);Z (m/s2)", *metres]))
+    assert read_accelerations(path, "arm")["az_m_s2"].tolist() == [9.806] * 10
+
+
+@pytest.mark.parametrize("first", [seconds(), stamps("%Y-%m-%d %H:%M:%S")])
+def test_blank_rows_and_a_blank_last_column(first: list[str], tmp_path: Path) -> None:
+    head = "Time,X (g),Y (g),Z (g)"
+    rows = lines([head], first).splitlines()
+    check(write(tmp_path, "\n".join([*rows, *[",,,"] * 400])))
+    check(write(tmp_path, "\n".join([*rows[:50], ",,,", *rows[50:]])))
+    check(write(tmp_path, lines([head], first, more=",")))
+
+
+def test_a_labview_file_without_a_column_of_times(tmp_path: Path) -> None:
+    end = "***End_of_Header***\t\t\t\t"
+    head = [
+        "LabVIEW Measurement\t", "X_Columns\tNo", end, "Channels\t3\t\t\t",
+        "Samples\t300\t300\t300\t", "Delta_X\t0.01\t0.01\t0.01\t", end,
+        "X_Value\tX (g)\tY (g)\tZ (g)\tComment",
+    ]  # fmt: skip
+    check(write(tmp_path, lines(head, [""] * 300, mark="\t"), name="a.lvm"))
+    no_step = [line for line in head if "Delta_X" not in line]
+    with pytest.raises(InputError, match=r"neither times nor a sampling rate[\s\S]*--rate-hz"):
+        read_accelerations(write(tmp_path, lines(no_step, [""] * 300, mark="\t")), "arm")
+
+
 def test_what_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
     two = lines(
         ["t_s,LN_X (g),LN_Y (g),LN_Z (g),WR_X (g),WR_Y (g),WR_Z (g)"], seconds(), more=",1,2,3"

@@ -29,7 +29,7 @@ PAGES = [
     if page not in docs_pages.ELSEWHERE and docs_pages.blocks_of(page)
 ]
 ALONE = (
-    "docs/tutorial.md", "docs/tutorial-images.md", "docs/recording.md",
+    "docs/index.md", "docs/tutorial.md", "docs/tutorial-images.md", "docs/recording.md",
     *(page for page in PAGES if page.startswith("docs/notebooks/")),
 )  # fmt: skip
 """Pages that begin in an empty folder."""

@@ -168,7 +168,7 @@ def _zigzag(t: Array, mine: pd.DataFrame, up: Array) -> dict[str, float]:
 
 def _numbers(row: dict[str, Any], mine: pd.DataFrame, liquid: Liquid | None) -> dict[str, float]:
     """Dimensionless numbers of the means, and the mean drag coefficient."""
-    d, slip = row["d_eq_mm"], row["slip_mm_s"]
+    d, slip = row["d_eq_mm"], row["slip_mm_s"] or float("nan")
     size, speed = row["sd_eq_mm"] / d, row["s_slip_mm_s"] / slip
     out = {}
     if "zigzag_hz" in row:

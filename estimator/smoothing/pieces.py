@@ -23,6 +23,7 @@ from telerig.estimator.smoothing.graph.layout import (
 )
 from telerig.estimator.smoothing.graph.linear import constant_priors, constant_values
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
+from telerig.estimator.smoothing.learning.window import most_seen
 from telerig.estimator.smoothing.problem.problem import (
     ConstantFamily,
     Known,
@@ -92,6 +93,30 @@ def pieces_of(
         low, high = max(low, 2 * first - end, 0), min(high, 2 * end - first, count)
         out.append(Piece(first, end, min(low, first), max(high, end)))
     return out
+
+
+def with_clock_numbers(problem: SmoothingProblem) -> SmoothingProblem:
+    """Return the problem with sensors that share a clock in every piece if they do in the run.
+
+    Within a piece two records may have the same times although one of them lacks samples elsewhere.
+    """
+    numbered = zip(problem.accelerometers, clocks_of(problem).tolist())
+    return replace(
+        problem, accelerometers=tuple(replace(a, clock_number=number) for a, number in numbered)
+    )
+
+
+def piece_with_most(problem: SmoothingProblem, pieces: Sequence[Piece]) -> int:
+    """Return the index of the piece in the middle, or of one with far more observations.
+
+    Observations outside the encoder's record do not count.
+    """
+    frames, stage = problem.observations.frame, problem.stage
+    if stage is not None:
+        t = problem.t_s[frames]
+        frames = frames[(t >= stage.t_s[0]) & (t <= stage.t_s[-1])]
+    edges = [pieces[0].first, *(piece.end for piece in pieces)]
+    return most_seen(np.histogram(frames, edges)[0])
 
 
 def margin_s(problem: SmoothingProblem, model: ShakeModel) -> float:

@@ -244,7 +244,12 @@ def _surroundings(smoothing: Smoothing, fluid: Any) -> tuple[Array, float, Any]:
     return up, gravity, (summary.get("fluid") or None) if fluid is None else fluid
 
 
-def summary_of(solution: Solution, evidence: Evidence, frames: int | None = None) -> dict[str, Any]:
+def summary_of(
+    solution: Solution,
+    evidence: Evidence,
+    frames: int | None = None,
+    sensors: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Return the content of smoothing.json without the verdict.
 
     It holds the hyper-parameters, the estimated constants with their standard deviations, and
@@ -252,6 +257,7 @@ def summary_of(solution: Solution, evidence: Evidence, frames: int | None = None
 
     evidence : of the run.
     frames : of a run of which the solution is the piece in the middle; None for a whole run's.
+    sensors : estimates of sensors that are not in this piece, from `sensors_of` of others.
     """
     from telerig.io.results.smoothing import SmoothingFile
 
@@ -282,7 +288,10 @@ def summary_of(solution: Solution, evidence: Evidence, frames: int | None = None
         "accelerometer_spectra": accelerometer_spectra(solution),
         "encoder": _encoder(solution),
         "travel": _travel(solution),
-        "accelerometers": _sensors(solution, evidence),
+        "accelerometers": {
+            name: found | {"masked_samples": evidence.lost[name].masked}
+            for name, found in {**(sensors or {}), **sensors_of(solution)}.items()
+        },
         "bubble_means": _means(evidence),
         **_accelerations(solution),
     }
@@ -366,7 +375,8 @@ def _travel(solution: Solution) -> dict[str, Any]:
     }
 
 
-def _sensors(solution: Solution, evidence: Evidence) -> dict[str, Any]:
+def sensors_of(solution: Solution) -> dict[str, Any]:
+    """Return the estimates of bias, scale and clock of each sensor by its name."""
     graph = solution.graph
     names = ["bias_x_mm_s2", "bias_y_mm_s2", "bias_z_mm_s2"]
     names += ["scale"] * graph.sensor_flags[0]
@@ -377,7 +387,6 @@ def _sensors(solution: Solution, evidence: Evidence) -> dict[str, Any]:
         found["delay_s"] = float(solution.delays_s[i])
         if clocks is not None and graph.sensor_flags[1]:
             found["sdelay_s"] = float(np.sqrt(clocks[graph.clock_of[i], 0, 0]))
-        found["masked_samples"] = evidence.lost[sensor.name].masked
         found["delay_s"] += sensor.offset_s
         found["offset_s"] = found["delay_s"]
         found["offset_sd_s"] = found.get("sdelay_s", sensor.offset_sd_s)
@@ -516,7 +525,8 @@ def trajectories(
 
     graph, problem = solution.graph, solution.graph.problem
     if not problem.bubbles:
-        return pd.DataFrame({name: [] for name in ("frame", "particle", "t_s")})
+        none = np.zeros(0, np.int64)
+        return pd.DataFrame({"frame": none, "particle": none, "t_s": np.zeros(0)})
     layout, covariances = graph.bubble, solution.covariances
     states = solution.state.bubbles
     columns: dict[str, Any] = {

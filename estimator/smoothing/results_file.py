@@ -92,8 +92,9 @@ class ResultsFile:
     def widen(self, inflation: Sequence[float]) -> None:
         """Multiply the standard deviations of the tables by factors (3,) along each axis."""
         for name in TABLES:
-            for column, data in self.file.get(name, {}).items():
-                factor = _factor(column, inflation)
+            table = self.file.get(name, {})
+            for column, data in table.items():
+                factor = _factor(column, inflation) if column[1:] in table else 1.0
                 for first in range(0, len(data) * (factor != 1), _ROWS_AT_ONCE):
                     mine = slice(first, first + _ROWS_AT_ONCE)
                     data[mine] = data[mine] * factor

@@ -31,9 +31,16 @@ from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.learning.likelihood import (
     with_hyperparameter_uncertainty,
 )
-from telerig.estimator.smoothing.learning.window import MOST_FRAMES
+from telerig.estimator.smoothing.learning.window import MOST_FRAMES, first_of_most_seen
 from telerig.estimator.smoothing.phases import Phases
-from telerig.estimator.smoothing.pieces import Constants, Piece, pieces_of, solved_pieces
+from telerig.estimator.smoothing.pieces import (
+    Constants,
+    Piece,
+    piece_with_most,
+    pieces_of,
+    solved_pieces,
+    with_clock_numbers,
+)
 from telerig.estimator.smoothing.problem.problem import (
     Bubble,
     Observations,
@@ -63,7 +70,13 @@ from telerig.estimator.smoothing.refined_pose import (
     refinement_of,
     with_wander,
 )
-from telerig.estimator.smoothing.result import Smoothing, states_of, summary_of, trajectories
+from telerig.estimator.smoothing.result import (
+    Smoothing,
+    sensors_of,
+    states_of,
+    summary_of,
+    trajectories,
+)
 from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.results_file import StoredTables, Tables, results_file
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
@@ -173,6 +186,7 @@ def smooth(
     """
     accepted, phases = accepted_codes(accept), Phases(progress)
     _check_kinds(tracks, calibration, rig)
+    folder = None if folder is None else Path(folder)
     with phases.phase("checks", "checking tracks and sensors"):
         table = getattr(tracks, "table", tracks)
         calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
@@ -195,6 +209,8 @@ def smooth(
             learned, more = learning_record(problem, chosen)
             warnings = [*warnings, *more]
     given, pieces = isinstance(model, ShakeModel), pieces_of(problem, chosen, options.frames)
+    if len(pieces) > 1:
+        problem = with_clock_numbers(problem)
     run = _Run(problem, calibration, tracks, tracked, chosen, given, options, phases)
     if len(pieces) == 1:
         done = run.smoothed()
@@ -204,7 +220,8 @@ def smooth(
     from telerig.estimator.smoothing.verdict.contradiction import sample_warnings, speed_warnings
 
     verdict, evidence, solution = done.verdict, done.evidence, done.solution
-    summary = summary_of(solution, evidence, None if len(pieces) == 1 else len(problem.t_s))
+    frames = None if len(pieces) == 1 else len(problem.t_s)
+    summary = summary_of(solution, evidence, frames, done.sensors)
     summary["accepted"] = sorted(accepted)
     summary["warnings"] = [
         *warnings, *sample_warnings(evidence), *speed_warnings(problem, evidence.mean_velocities)
@@ -231,6 +248,7 @@ class _Done(NamedTuple):
 
     deviations : of the bubbles' shapes; None without tracks.
     swarm : what `swarm_numbers` returns.
+    sensors : estimates of every sensor by its name, from all pieces.
     """
 
     verdict: dict[str, Any]
@@ -239,6 +257,7 @@ class _Done(NamedTuple):
     tables: Tables | StoredTables
     deviations: Deviations | None
     swarm: dict[str, Any] | None
+    sensors: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -281,7 +300,7 @@ class _Run:
             bodies, deviations = self._bodies(tracks)
             swarm = self._swarm(solution, paths, bodies, Span.whole(solution))
         tables = Tables(paths, offsets, states_of(solution), bodies)
-        return _Done(verdict, evidence, solution, tables, deviations, swarm)
+        return _Done(verdict, evidence, solution, tables, deviations, swarm, {})
 
     def _bodies(self, tracks: Any) -> tuple[pd.DataFrame | None, Deviations | None]:
         """Return the bubbles' bodies, and their deviations; None without tracks."""
@@ -321,15 +340,17 @@ class _Run:
         """Smooth it piece by piece, each of which is written as it comes.
 
         Hyper-parameters that are not given are set by the piece in the middle, which is solved
-        again at the end for what the verdict takes from the middle of a run. The low-pass of the
+        again at the end for what the verdict takes from the middle of a run. If far more is seen in
+        another piece, it takes the place of that in the middle. The low-pass of the
         accelerations is that of the first piece with enough bubbles.
         """
         from telerig.estimator.smoothing.verdict.judge import judge
 
         problem, model, parts = self.problem, self.model, list[Evidence]()
+        sensors = dict[str, Any]()
         deviations = swarm = low_passes = moved = None
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
-            middle = len(pieces) // 2
+            middle = piece_with_most(problem, pieces)
             if not self.given:
                 step("a piece in the middle", 0.0)
                 model = self._solved(pieces[middle].cut(problem).problem, _silent).graph.model
@@ -345,6 +366,7 @@ class _Run:
                         low_passes = solution.accelerations.low_passes
                     span = Span(piece.own, piece.low, problem.t_s)
                     parts.append(Evidence.of(solution, drawn(solution), span))
+                    sensors |= sensors_of(solution)
                     paths, offsets = self._tables(piece, window, solution, span)
                     bodies, found = self._bodies(
                         frames_between(self.tracks, piece.first, piece.end)
@@ -368,7 +390,7 @@ class _Run:
                 file.widen(inflation)
                 file.finish(inflation)
         solution = replace(solution, draws=None)
-        return _Done(verdict, evidence, solution, tables, deviations, swarm)
+        return _Done(verdict, evidence, solution, tables, deviations, swarm, sensors)
 
     def _tables(
         self, piece: Piece, window: Window, solution: Solution, span: Span
@@ -613,10 +635,11 @@ def _adapted_solution(
     problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress | None
 ) -> Solution:
     """Return the solution whose noise, RMS and delays have been set from a first solution, which
-    uses few samples of the sensors. The RMS of guessed modes is set by the frames in the middle.
+    uses few samples of the sensors. The RMS of guessed modes is set by frames in which much is
+    seen, in the middle if possible.
     """
     if guessed_modes(model):
-        begin = max(0, (len(problem.t_s) - _SIZED_FRAMES) // 2)
+        begin = first_of_most_seen(problem, _SIZED_FRAMES)
         middle, found = all_of(problem, begin, begin + _SIZED_FRAMES).problem, None
         for _ in range(_SIZING_PASSES):
             found = solve(middle, model, options, progress, start=found)

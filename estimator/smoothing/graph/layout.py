@@ -598,9 +598,12 @@ def clocks_of(problem: SmoothingProblem) -> Ints:
 
     Sensors whose samples have the same times were sampled together and share a clock.
     """
-    known: dict[tuple[bytes, float], int] = {}
+    known: dict[Any, int] = {}
     numbers = [
-        known.setdefault((a.t_s.tobytes(), a.delay_s), len(known)) for a in problem.accelerometers
+        known.setdefault(
+            (a.t_s.tobytes(), a.delay_s) if a.clock_number is None else a.clock_number, len(known)
+        )
+        for a in problem.accelerometers
     ]
     return np.array(numbers, np.int64)
 

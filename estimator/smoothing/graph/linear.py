@@ -320,6 +320,8 @@ def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
     else:
         t = problem.t_s
         inside = (t >= stage.t_s[0] - 1e-9) & (t <= stage.t_s[-1] + 1e-9)
+        if not inside.any():
+            return []
         node = nodes.of_frame[inside]
         reading = graph.nominal_mm[node]
         rows = np.tile(layout.position, (len(node), 1))

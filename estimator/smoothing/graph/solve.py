@@ -671,11 +671,12 @@ def in_large_stack(task: Callable[[], T]) -> T:
     try:
         thread = threading.Thread(target=run, name="telerig-smoother")
         thread.start()
+        threading.stack_size(before)
+        thread.join()
     finally:
         threading.stack_size(before)
-    thread.join()
-    if collecting:
-        gc.enable()
+        if collecting:
+            gc.enable()
     give_back_freed_memory()
     if fault:
         raise fault[0]

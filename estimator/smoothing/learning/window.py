@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.learning.lines_of_sight import (
     MOST_BUBBLES,
     PRESENT,
@@ -142,6 +142,24 @@ def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tup
         if each.sum() > most:
             most, found, there = int(each.sum()), first, len(each)
     return found, there
+
+
+def most_seen(observations: Ints) -> int:
+    """Return the index of the largest count, or of the middle one if it is at least half as large.
+
+    What a run's middle says is kept where it can, so that it does not depend on chance.
+    """
+    middle, most = len(observations) // 2, int(np.argmax(observations))
+    return most if observations[most] > 2 * observations[middle] else middle
+
+
+def first_of_most_seen(problem: SmoothingProblem, length: int) -> int:
+    """Return the first frame of a window in which much is seen, by the rule of `most_seen`."""
+    free = max(len(problem.t_s) - length, 0)
+    firsts = np.linspace(0, free, 2 * _PLACES + 1).astype(np.int64)
+    frames = np.sort(problem.observations.frame)
+    begin, end = np.searchsorted(frames, firsts), np.searchsorted(frames, firsts + length)
+    return int(firsts[most_seen(end - begin)])
 
 
 def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Window]:

@@ -249,6 +249,8 @@ class Accelerometer:
     offset_s, drift_ppm : clock offset and drift that the alignment subtracted from the times.
     offset_sd_s : standard deviation of the offset; None if none was found.
     confirmed : whether the images confirm its clock; None if this was not tested.
+    clock_number : sensors with the same number were sampled together; None to tell that from their
+        times.
     """
 
     name: str
@@ -266,6 +268,7 @@ class Accelerometer:
     offset_sd_s: float | None = None
     drift_ppm: float = 0.0
     confirmed: bool | None = None
+    clock_number: int | None = None
 
     def of(self, which: NDArray[Any]) -> Accelerometer:
         """Return the sensor with some of its samples: (N,) booleans, indices, or a slice."""

@@ -18,6 +18,7 @@ from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.learning.learn import Learning, groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.learning.spectral_lines import attributions
+from telerig.estimator.smoothing.learning.window import first_of_most_seen
 from telerig.estimator.smoothing.problem.problem import (
     CarriageModel,
     Observations,
@@ -198,10 +199,12 @@ def _lines(
 
 
 def window_of(solution: Solution) -> Window:
-    """Return the middle of a solved run with its longest tracks, without outliers."""
+    """Return a part of a solved run with its longest tracks, without outliers.
+
+    It is the middle of the run, unless far more is seen elsewhere.
+    """
     problem = solution.graph.problem
-    count = len(problem.t_s)
-    first = max(0, (count - _MOST_FRAMES) // 2)
+    count, first = len(problem.t_s), first_of_most_seen(problem, _MOST_FRAMES)
     return cut_out(
         problem, first, min(count, first + _MOST_FRAMES), solution.weights, _MOST_BUBBLES
     )

@@ -228,6 +228,9 @@ def test_a_bubble_is_summarised() -> None:
     assert row["drag"] == pytest.approx(frames["drag"].mean())
     alone = summary_table(frames_table(motion(1), None, UP, G), UP)
     assert alone.loc[0, "rise_mm_s"] == 250.0 and alone.loc[0, "s_rise_mm_s"] == 3.0
+    still = motion(1).assign(vx_mm_s=0.0, vy_mm_s=0.0, vz_mm_s=0.0)
+    once = summary_table(frames_table(still, body(1), UP, G, WATER), UP, liquid[0]).iloc[0]
+    assert once["d_eq_mm"] == pytest.approx(3.0) and np.isnan(once["reynolds"])
     assert not len(summary_table(frames.iloc[:0], UP))
 
 

@@ -16,14 +16,20 @@ from shake_learning_data import run, true_model, with_comings_and_goings
 
 import telerig
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
+from telerig.estimator.smoothing.graph.layout import clocks_of
 from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
-from telerig.estimator.smoothing.pieces import Constants, pieces_of, solved_pieces
+from telerig.estimator.smoothing.pieces import (
+    Constants,
+    pieces_of,
+    solved_pieces,
+    with_clock_numbers,
+)
 from telerig.estimator.smoothing.problem.problem import (
     CalibrationShare,
     ShakeModel,
     SmoothingProblem,
 )
-from telerig.estimator.smoothing.results_file import StoredTables
+from telerig.estimator.smoothing.results_file import StoredTables, results_file
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
 
 Array = NDArray[np.float64]
@@ -196,3 +202,53 @@ def test_a_shake_without_bubbles_is_smoothed_in_pieces(tmp_path: Path) -> None:
     assert not len(found.trajectories)
     found.save(tmp_path)
     assert len(telerig.load_smoothing(tmp_path).shake) == 600
+
+
+@pytest.mark.parametrize("frames", [None, 100], ids=["whole", "pieces"])
+def test_bubbles_that_come_late_are_judged(frames: int | None, tmp_path: Path) -> None:
+    problem, _ = crowded()
+    calibration = calibration_from_cameras(list(problem.cameras), name="truth")
+    table = tracks_of(problem)
+    found = telerig.smooth(
+        table[table["frame"] >= 430].reset_index(drop=True), calibration, t_s=problem.t_s,
+        model="default", options=Options(frames=frames), folder=str(tmp_path),
+    )  # fmt: skip
+    assert found.verdict["verdict"] in ("RESOLVED", "PARTIAL", "UNRESOLVED")
+    assert found.summary["acceleration_bandwidth_hz"]
+    assert set(found.trajectories[["frame", "particle"]].dtypes) == {np.dtype(np.int64)}
+
+
+def test_an_encoder_that_covers_a_part_of_the_run() -> None:
+    problem, _ = crowded()
+    calibration = calibration_from_cameras(list(problem.cameras), name="truth")
+    t = problem.t_s[:240]
+    words = [
+        telerig.smooth(
+            tracks_of(problem), calibration, stage={"t_s": t, "position_mm": 0.2 * t},
+            t_s=problem.t_s, model="default", options=Options(frames=n),
+        ).verdict["verdict"]
+        for n in (None, 100)
+    ]  # fmt: skip
+    assert words == ["UNRESOLVED", "UNRESOLVED"]
+
+
+def test_sensors_share_clocks_in_pieces_as_they_do_in_the_run() -> None:
+    problem, model = sensed("arms")
+    left, right = problem.accelerometers
+    short = replace(problem, accelerometers=(left, right.of(slice(0, -1))))
+    pieces = pieces_of(short, model, 200)
+    assert clocks_of(short).tolist() == [0, 1]
+    assert clocks_of(pieces[0].cut(short).problem).tolist() == [0, 0], "the reason for the numbers"
+    numbered = with_clock_numbers(short)
+    for piece in pieces:
+        assert clocks_of(piece.cut(numbered).problem).tolist() == [0, 1]
+
+
+def test_only_standard_deviations_are_widened(tmp_path: Path) -> None:
+    names = ["front_y_mm", "side_y_mm", "sfront_y_mm", "sside_y_mm"]
+    shake = pd.DataFrame({name: np.ones(3) for name in names})
+    with results_file(tmp_path) as file:
+        file.append(shake.iloc[:0], shake, {}, None)
+        file.widen((2.0, 3.0, 4.0))
+        found = [float(file.file["shake"][name][0]) for name in names]
+    assert found == [1.0, 1.0, 3.0, 3.0]

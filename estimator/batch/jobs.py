@@ -335,7 +335,8 @@ def _used_results(job: Job) -> list[Path]:
     if job.kind == "calibrate":
         return []
     own = Path(job.dataset) / "results" / "calibration" / "calibration.json"
-    used = [Path(job.calibration) if job.calibration else own]
+    given = Path(job.calibration) if job.calibration else own
+    used = [given / own.name if given.is_dir() else given]
     if job.kind == "track":
         return used
     tracks = Path(job.tracks) if job.tracks else job.results

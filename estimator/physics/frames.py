@@ -21,6 +21,7 @@ AXES = ("x", "y", "z")
 _M = 1e-3
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def frames_table(
     trajectories: pd.DataFrame,
     bodies: pd.DataFrame | None,
@@ -85,7 +86,8 @@ def _errors(sd: Array, direction: Array, share: float) -> Array:
 
     sd : (N, 3) along the axes. share : of the variance along the directions (N, 3) that is left.
     """
-    unit = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    unit = np.divide(direction, length, out=np.full_like(direction, np.nan), where=length > 0)
     away = np.eye(3) - (1 - np.sqrt(share)) * unit[:, :, None] * unit[:, None, :]
     return np.asarray(sd[..., None] * away)
 

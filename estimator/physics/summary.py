@@ -188,7 +188,7 @@ def _numbers(row: dict[str, Any], mine: pd.DataFrame, liquid: Liquid | None) -> 
     out["drag"] = _mean(mine["drag"])
     # The mean of the acceleration is a difference of two velocities over the lifetime.
     ends = mine["s_slip_mm_s"].to_numpy(float)[[0, -1]]
-    inertia = float(np.hypot(*ends)) / row["lifetime_s"] if row["lifetime_s"] else np.inf
+    inertia = float(np.hypot(*ends)) / (row["lifetime_s"] or float("nan"))
     inertia *= _mean(mine["added_mass"]) * 1e-3 / liquid.gravity
     out["s_drag"] = abs(out["drag"]) * float(np.linalg.norm((size, 2 * speed, inertia)))
     return out

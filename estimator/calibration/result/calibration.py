@@ -607,7 +607,8 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
             )
         return load_calibration(default), [default]
     if len(files) == 1 and files[0].suffix != ".txt":
-        return load_calibration(files[0]), [p for p in files if p.is_file()]
+        only = files[0]
+        return load_calibration(only), [only / "calibration.json" if only.is_dir() else only]
     if len(files) == 2 and all(p.suffix == ".txt" for p in files):
         from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 

@@ -288,6 +288,9 @@ def write_halcon(
                 names.append(_write(place / f"{camera.camera}.dat", _parameters_text(camera)))
             names.append(_write(place / f"{camera.camera}_pose.dat", _pose_text(camera)))
         names.append(_write(place / "cameras.hdev.txt", hdevelop_lines(cameras, remarks)))
+    for camera in cameras:
+        if f"{camera.camera}.dat" not in names:  # of an earlier export
+            (Path(folder) / f"{camera.camera}.dat").unlink(missing_ok=True)
     return names
 
 

@@ -23,7 +23,7 @@ from telerig.io.exchange.export.volume import (
     seen_points,
     working_volume,
 )
-from telerig.io.files.atomic import atomic_path
+from telerig.io.files.atomic import write_text_atomic
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import COEFFICIENTS
 from telerig.rig.projection import turned_wall
@@ -172,34 +172,32 @@ def write_opencv(
     """Write one YAML file for OpenCV with an entry for each camera; floats keep every digit."""
     import cv2
 
-    with atomic_path(path) as temporary:
-        mode = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML
-        storage: Any = cv2.FileStorage(str(temporary), mode)
-        try:
-            storage.write("frame", "rig: the first camera's frame, mm")
-            storage.write("pixel_origin", "centre of the top-left pixel is (0, 0)")
-            if remarks:
-                storage.write("remarks", " ".join(remarks))
-            storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
-            for one in matrices:
-                storage.startWriteStruct("", cv2.FILE_NODE_MAP)
-                content: dict[str, Any] = {
-                    "name": one.camera,
-                    "image_width": one.image_size_px[0],
-                    "image_height": one.image_size_px[1],
-                    "undistorted": one.undistorted,
-                    "undistorted_rms_px": one.undistorted_misfit.rms_px,
-                    "undistorted_max_px": one.undistorted_misfit.max_px,
-                    "affine": one.affine,
-                    "affine_rms_px": one.affine_misfit.rms_px,
-                    "affine_max_px": one.affine_misfit.max_px,
-                }
-                if one.camera_matrix is not None and one.distortion is not None:
-                    content["camera_matrix"] = one.camera_matrix
-                    content["distortion_coefficients"] = one.distortion.reshape(1, -1)
-                for name, value in content.items():
-                    storage.write(name, value)
-                storage.endWriteStruct()
-            storage.endWriteStruct()
-        finally:
-            storage.release()
+    # in memory, because OpenCV does not say when it cannot write a file
+    mode = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML | cv2.FILE_STORAGE_MEMORY
+    storage: Any = cv2.FileStorage("", mode)
+    storage.write("frame", "rig: the first camera's frame, mm")
+    storage.write("pixel_origin", "centre of the top-left pixel is (0, 0)")
+    if remarks:
+        storage.write("remarks", " ".join(remarks))
+    storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
+    for one in matrices:
+        storage.startWriteStruct("", cv2.FILE_NODE_MAP)
+        content: dict[str, Any] = {
+            "name": one.camera,
+            "image_width": one.image_size_px[0],
+            "image_height": one.image_size_px[1],
+            "undistorted": one.undistorted,
+            "undistorted_rms_px": one.undistorted_misfit.rms_px,
+            "undistorted_max_px": one.undistorted_misfit.max_px,
+            "affine": one.affine,
+            "affine_rms_px": one.affine_misfit.rms_px,
+            "affine_max_px": one.affine_misfit.max_px,
+        }
+        if one.camera_matrix is not None and one.distortion is not None:
+            content["camera_matrix"] = one.camera_matrix
+            content["distortion_coefficients"] = one.distortion.reshape(1, -1)
+        for name, value in content.items():
+            storage.write(name, value)
+        storage.endWriteStruct()
+    storage.endWriteStruct()
+    write_text_atomic(Path(path), storage.releaseAndGetString())

@@ -7,6 +7,7 @@ numbers in base64; VTK itself is not needed to write them.
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -176,10 +177,10 @@ def _array(name: str, values: NDArray[np.generic]) -> str:
 
 def _pvd(names: Sequence[str], t_s: Array, comment: str) -> str:
     """Return the .pvd file of a series: the time of each file, with paths relative to it."""
-    lines = (f'<DataSet timestep="{t:.9g}" part="0" file="{n}"/>' for n, t in zip(names, t_s))
+    lines = (f'<DataSet timestep="{t:.15g}" part="0" file="{n}"/>' for n, t in zip(names, t_s))
     return "\n".join([
         '<?xml version="1.0"?>',
-        "<!-- " + comment.replace("--", "- -") + " -->",
+        "<!-- " + re.sub("-(?=-)", "- ", comment) + " -->",
         '<VTKFile type="Collection" version="1.0" byte_order="LittleEndian">',
         "<Collection>", *lines, "</Collection>", "</VTKFile>", "",
     ])  # fmt: skip

@@ -123,7 +123,7 @@ def test_accelerometers_whose_clock_does_not_overlap_are_aligned_with_the_images
     for sensor in found.summary["accelerometers"].values():
         assert sensor["confirmed"]
         assert sensor["offset_s"] == pytest.approx(1000.0, abs=2e-3)
-    assert any("its times are corrected" in w for w in found.summary["warnings"])
+    assert any("its times have been corrected" in w for w in found.summary["warnings"])
 
 
 def test_accelerometers_of_another_time_are_refused(run: Path) -> None:

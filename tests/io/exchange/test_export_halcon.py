@@ -177,6 +177,13 @@ def test_halcon_distortion_without_inverse_is_an_error() -> None:
         ours.project([[2000.0, 1500.0, 0.0]])
 
 
+def test_a_camera_with_a_tilted_sensor_leaves_no_old_parameters(tmp_path: Path) -> None:
+    flat, tilted = pair(SQUARE_ON), pair(SQUARE_ON, tilt_x=0.02)
+    assert "left.dat" in write_halcon(halcon_cameras(flat), tmp_path)
+    names = write_halcon(halcon_cameras(tilted), tmp_path)
+    assert sorted(names) == sorted(p.name for p in tmp_path.iterdir())
+
+
 def test_halcon_files(tmp_path: Path) -> None:
     cameras = pair(SQUARE_ON, **DISTORTED)
     exported = halcon_cameras(cameras)

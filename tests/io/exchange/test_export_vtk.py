@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,13 @@ def test_frames_without_bubbles_are_empty_and_old_frames_go(tmp_path: Path) -> N
     assert {p.name for p in (tmp_path / "frames").iterdir()} == {
         "bubbles_000004.vtp", "bubbles_000005.vtp",
     }  # fmt: skip
+
+
+def test_times_since_1970_stay_apart(tmp_path: Path) -> None:
+    results = swarm()
+    late = replace(results, points=results.points.assign(t_s=results.points["t_s"] + 1.7e9))
+    write_vtk(late, tmp_path / "out", two_cameras())
+    assert len(series(tmp_path / "out")) == 5
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
-from telerig.io.dataset.tables import read_accelerometer_csv
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
+from telerig.io.files.csv_table import Column, read_table
 from telerig.io.recording.replay import (
     GAP_INTERVALS,
     REGULAR_CLOCK,
@@ -150,7 +150,8 @@ def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
 def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
     """Return the rows of an existing table whose sensors are not in this recording."""
     if file.is_file():
-        found = read_accelerometer_csv(file, None)
+        known = [Column("t_s"), Column("sensor", "name"), *map(Column, _READINGS)]
+        found = read_table(file, known, extra=True, empty=True)
         others = found[~found["sensor"].isin(recorded)]
         columns = [others[n].to_numpy() for n in ("t_s", "sensor", *_READINGS)]
         yield from _rows("%r,%s,%r,%r,%r\n", columns)

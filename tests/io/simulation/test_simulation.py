@@ -293,7 +293,7 @@ def test_refusals(tmp_path):
         simulate(preset("paper", border_px=150.0), rng=np.random.default_rng(0), out=tmp_path / "b")
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "mine.txt").write_text("x")
-    with pytest.raises(InputError, match="in use"):
+    with pytest.raises(InputError, match="exists and is not empty"):
         simulate("paper", rng=np.random.default_rng(0), out=tmp_path / "c")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c"]
 

@@ -341,7 +341,7 @@ class DriftPrior:
     """Prior standard deviations of how far the second camera has moved since the calibration.
 
     The movement is that against the first camera, along and about each axis of the rig frame. The
-    defaults are larger than most movements. Raises InputError for values that are not positive.
+    defaults are wide. Raises InputError for values that are not positive.
     """
 
     rotation_rad: float = 5e-3

@@ -11,6 +11,7 @@ import typer
 
 from telerig.scripts import options
 from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, run_file, say
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -97,9 +98,9 @@ def track_and_compare(
     passed = score.recall == 1 and score.precision == 1 and score.tracks == 1
     say(
         f"{score.right} of the bubble's {score.in_view} true positions found, {score.wrong} false "
-        f"positions, {score.tracks} track(s). RMS error in the images: {score.corrected_px:.2f} px "
-        f"for the bubble's centre of volume, {score.centre_px:.2f} px if the centre of its outline "
-        "is taken for it"
+        f"positions, {counted(score.tracks, 'track')}. RMS error in the images: "
+        f"{score.corrected_px:.2f} px for the bubble's centre of volume, "
+        f"{score.centre_px:.2f} px if the centre of its outline is taken for it"
     )
     say("PASSED: the bubble was followed throughout" if passed else "FAILED: see the report")
     say(f"report: {folder / 'report.html'}")

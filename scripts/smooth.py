@@ -140,7 +140,7 @@ def _smooth_one(
     if titled:
         say(f"{run}:")
     say(smoothing_words(found))
-    say_written(folder, (folder / "report.html").is_file())
+    say_written(folder, report and (folder / "report.html").is_file())
     if titled:
         say("")
 

@@ -23,7 +23,7 @@ from telerig.estimator.smoothing.graph.layout import (
 )
 from telerig.estimator.smoothing.graph.linear import constant_priors, constant_values
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
-from telerig.estimator.smoothing.learning.window import most_seen
+from telerig.estimator.smoothing.learning.window import frames_of_observations, most_seen
 from telerig.estimator.smoothing.problem.problem import (
     ConstantFamily,
     Known,
@@ -107,16 +107,9 @@ def with_clock_numbers(problem: SmoothingProblem) -> SmoothingProblem:
 
 
 def piece_with_most(problem: SmoothingProblem, pieces: Sequence[Piece]) -> int:
-    """Return the index of the piece in the middle, or of one with far more observations.
-
-    Observations outside the encoder's record do not count.
-    """
-    frames, stage = problem.observations.frame, problem.stage
-    if stage is not None:
-        t = problem.t_s[frames]
-        frames = frames[(t >= stage.t_s[0]) & (t <= stage.t_s[-1])]
+    """Return the index of a piece in which much is seen, by the rule of `most_seen`."""
     edges = [pieces[0].first, *(piece.end for piece in pieces)]
-    return most_seen(np.histogram(frames, edges)[0])
+    return most_seen(np.histogram(frames_of_observations(problem), edges)[0])
 
 
 def margin_s(problem: SmoothingProblem, model: ShakeModel) -> float:

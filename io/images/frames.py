@@ -17,6 +17,8 @@ from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.images.high_speed import HIGH_SPEED_EXTENSIONS, open_high_speed
 from telerig.io.images.read import (
+    PALETTE,
+    WHITE_IS_0,
     Image,
     damaged,
     decoding,
@@ -167,14 +169,10 @@ class _Stack:
         return start, start + size
 
 
-_NOT_GREY = (0, 3)
-"""Photometric interpretations of TIFF: white stored as 0, and a palette."""
-
-
 def _contiguous_stack(tiff: Any, pages: int, path: Path) -> _Stack | None:
     """Return the stack if the file's description counts more frames than there are page headers."""
     page = tiff.pages[0]
-    if page.samplesperpixel != 1 or page.photometric in _NOT_GREY:
+    if page.samplesperpixel != 1 or page.photometric in (WHITE_IS_0, PALETTE):
         return None
     described = tiff.is_imagej or tiff.is_shaped or tiff.is_ome
     if page.subifds is not None or not described:  # a damaged file can count billions of subifds

@@ -207,8 +207,8 @@ def tiff_reader() -> Any:
     return tifffile
 
 
-_PALETTE = 3
-"""Photometric interpretation of a TIFF whose pixels are places in a table of colours."""
+WHITE_IS_0, PALETTE = 0, 3
+"""Photometric interpretations of TIFF; a palette's pixels are places in a table of colours."""
 
 
 def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
@@ -224,14 +224,14 @@ def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
     end = max((o + n for o, n in zip(page.dataoffsets, page.databytecounts)), default=0)
     if end > file_size or 0 in page.databytecounts:
         raise damaged(file, f"it has {file_size} bytes, its tags ask for {end}")
-    if page.photometric == 0:
+    if page.photometric == WHITE_IS_0:
         raise InputError(
             "stores white as 0 (photometric MINISWHITE)",
             where=str(file),
             todo="save it again with black as 0",
         )
     pixels = np.asarray(page.asarray())
-    if page.photometric == _PALETTE:
+    if page.photometric == PALETTE:
         colours = np.moveaxis(np.asarray(page.colormap), 0, -1) >> 8
         return np.asarray(colours.astype(np.uint8)[pixels])
     return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels

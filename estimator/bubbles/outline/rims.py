@@ -90,7 +90,7 @@ class Rims:
 def find_rims(
     ratio: Float32, sigma: float, *, min_diameter_px: float, largest_radius_px: float
 ) -> Rims:
-    """Return all closed rims in an image that may be outlines of bubbles.
+    """Return all candidates for bubbles in an image, with what is seen of their rims.
 
     The functions `sole_owners` and `are_bubbles` then decide which of them are bubbles.
 

@@ -653,12 +653,12 @@ def rim_excess(pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
     """Return by how much the outlines of M bubbles exceed the size of their volumes.
 
     The result (M,) is the logarithm of the diameter from the outlines over the volume-equivalent
-    diameter. A body with modes of degree 3 and 4 exceeds it, because an outline is where the body
+    diameter. It grows with the body's modes of degree 3 and 4, because an outline is where the body
     reaches farthest. The result's standard deviation is as large as the result. It is 0 for
     outlines that are not whole.
 
     pair : the outlines in both views.
-    sigma : (2,) RMS of the third and fourth harmonics of all outlines of the run.
+    sigma : (2,) standard deviations of the shapes' coefficients of degree 3 and 4 in the run.
     """
     excess = np.zeros(len(pair[0].uv_px))
     whole = pair[0].whole & pair[1].whole

@@ -283,7 +283,13 @@ class Calibration(ShortText):
                 todo="give two arrays (N, 2), or a mapping of arrays by camera",
             )
         if isinstance(sigma, Mapping):
-            sigma = tuple(sigma[camera.name] for camera in self.cameras[:2])
+            sigma = tuple(sigma[c.name] for c in self.cameras[:2] if c.name in sigma)
+        if isinstance(sigma, tuple) and len(sigma) != 2:
+            names = " and ".join(camera.name for camera in self.cameras[:2])
+            raise InputError(
+                "sigma_px is not of the two cameras whose pixels are given",
+                todo=f"give one value for both, or one for each of {names}",
+            )
         two = self if len(self.cameras) == 2 else self.pair(0, 1)
         pair = (two.cameras[0], two.cameras[1])
         found = triangulate(pair, (uv_first_px, uv_second_px), sigma, method)

@@ -318,8 +318,7 @@ def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
             rates = np.einsum("i,mij->mj", layout.velocity, graph.to_encoder)
         speed = (state.shake[node] * rates).sum(-1)
     else:
-        t = problem.t_s
-        inside = (t >= stage.t_s[0] - 1e-9) & (t <= stage.t_s[-1] + 1e-9)
+        inside = problem.in_encoder_record
         if not inside.any():
             return []
         node = nodes.of_frame[inside]

@@ -157,9 +157,15 @@ def first_of_most_seen(problem: SmoothingProblem, length: int) -> int:
     """Return the first frame of a window in which much is seen, by the rule of `most_seen`."""
     free = max(len(problem.t_s) - length, 0)
     firsts = np.linspace(0, free, 2 * _PLACES + 1).astype(np.int64)
-    frames = np.sort(problem.observations.frame)
+    frames = np.sort(frames_of_observations(problem))
     begin, end = np.searchsorted(frames, firsts), np.searchsorted(frames, firsts + length)
     return int(firsts[most_seen(end - begin)])
+
+
+def frames_of_observations(problem: SmoothingProblem) -> Ints:
+    """Return the frame of each observation of a bubble within the encoder's record."""
+    frames = problem.observations.frame
+    return frames[problem.in_encoder_record[frames]]
 
 
 def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Window]:

@@ -376,6 +376,14 @@ class SmoothingProblem:
         return np.asarray(np.interp(self.t_s, self.stage.t_s, self.stage.position_mm))
 
     @property
+    def in_encoder_record(self) -> Bools:
+        """Whether each frame (F,) is within the encoder's record; True without an encoder."""
+        if self.stage is None:
+            return np.ones(len(self.t_s), bool)
+        first, last = self.stage.t_s[[0, -1]]
+        return np.asarray((self.t_s >= first - 1e-9) & (self.t_s <= last + 1e-9))
+
+    @property
     def arms_with_sensor(self) -> set[int]:
         """Indices of the cameras whose arm carries an accelerometer."""
         return {a.camera for a in self.accelerometers} - {CARRIAGE}

@@ -98,7 +98,11 @@ def axis_verdict(
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
-    """Return standard deviations (n, 3) of positions: as they are, and with known shake."""
+    """Return standard deviations (n, 3) of positions: as they are, and with known shake.
+
+    Frames outside the encoder's record do not count: there both contain a carriage whose position
+    is not known, so that their ratio says nothing about the shake.
+    """
     still = solve(
         without_sensors(window.problem),
         replace(
@@ -109,6 +113,8 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
     assert still.covariances is not None and solution.covariances is not None
     ours, whole = still.graph, solution.graph
     rows = _inner_rows(window)
+    inside = whole.problem.in_encoder_record[ours.frame_of_row[rows] + window.first]
+    rows = rows[inside] if inside.any() else rows
     bubble, frame = ours.bubble_of_row[rows], ours.frame_of_row[rows] + window.first
     same = whole.row(window.bubbles[bubble], frame)
     known = _position_sigma(still, rows)

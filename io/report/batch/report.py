@@ -239,7 +239,7 @@ def _by_job(
         for job in none:
             sheet.axes.axvline(job, color=LEFT_OUT, lw=0.8)
         sheet.axes.set_ylim(0, 1.1 * max(float(np.nanmax(c.y)) for c in curves if len(c.y)))
-        sheet.axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        sheet.axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
     return Picture(title, sheet.source, caption)
 
 

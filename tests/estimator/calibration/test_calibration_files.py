@@ -12,7 +12,11 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import Calibration, load_calibration
+from telerig.estimator.calibration.result.calibration import (
+    Calibration,
+    calibration_for,
+    load_calibration,
+)
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +97,12 @@ def test_the_file_says_what_others_rely_on(calibration: Calibration, saved: Path
         calibration.sd("left.scale")
     with pytest.raises(InputError, match=r"did you mean left\.k1"):
         calibration.sd("left.K1_")
+
+
+def test_a_folder_is_an_input_by_its_file(saved: Path) -> None:
+    folder = saved if saved.is_dir() else saved.parent
+    _, used = calibration_for(folder, [folder])
+    assert used == [folder / "calibration.json"] and used[0].is_file()
 
 
 def test_tables(calibration: Calibration, saved: Path) -> None:

@@ -39,6 +39,12 @@ def calibrated(count: int) -> Calibration:
     return replace(found, free=free, covariance_names=tuple(names), covariance=root @ root.T)
 
 
+@pytest.mark.parametrize("sigma", [{"left": 0.1}, (0.1,), (0.1, 0.1, 0.1)], ids=str)
+def test_standard_deviations_of_other_cameras_are_refused(sigma: Any) -> None:
+    with pytest.raises(InputError, match="one for each of left and middle"):
+        calibrated(2).triangulate([[250.0, 250.0]], [[250.0, 250.0]], sigma_px=sigma)
+
+
 def moved(calibration: Calibration, offset: Any) -> tuple[Camera, ...]:
     """The cameras with the components of the rig block moved."""
     change = dict(zip(calibration.covariance_names, offset))

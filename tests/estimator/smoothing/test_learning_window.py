@@ -15,12 +15,13 @@ from telerig.estimator.smoothing.learning.likelihood import with_hyperparameter_
 from telerig.estimator.smoothing.learning.lines_of_sight import pooled
 from telerig.estimator.smoothing.learning.window import (
     MOST_FRAMES,
+    first_of_most_seen,
     learning_parts,
     learning_signals,
     learning_window,
     other_windows,
 )
-from telerig.estimator.smoothing.problem.problem import SmoothingProblem
+from telerig.estimator.smoothing.problem.problem import SmoothingProblem, Stage
 
 
 def _long(frames: int) -> SmoothingProblem:
@@ -52,6 +53,21 @@ def test_a_long_run_is_learned_from_where_the_bubbles_are_seen_most() -> None:
                 bubble.guess_mm, whole[one.first : one.first + len(bubble)]
             )
     assert [w.first for w in other_windows(fewer, window, 5)] == [0, MOST_FRAMES]
+
+
+@pytest.mark.parametrize(
+    ("seen_from", "recorded_to", "first"),
+    [(0, 1000, 400), (300, 1000, 400), (800, 1000, 800), (0, 350, 0)],
+)
+def test_a_window_lies_where_bubbles_and_encoder_tell_most(
+    seen_from: int, recorded_to: int, first: int
+) -> None:
+    """Of 1,000 frames 200 are chosen: the middle, unless far more is known elsewhere."""
+    problem = _long(1000)
+    seen = problem.observations
+    stage = Stage(problem.t_s[:recorded_to], np.zeros(recorded_to))
+    known = replace(problem, observations=seen.of(seen.frame >= seen_from), stage=stage)
+    assert abs(first_of_most_seen(known, 200) - first) <= 50
 
 
 def _coming_and_going(frames: int, track: int, bubbles: int = 8) -> SmoothingProblem:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import threading
 import weakref
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,7 +15,7 @@ from scipy.linalg import expm
 from telerig.estimator.smoothing.graph import layout
 from telerig.estimator.smoothing.graph import solve as solver
 from telerig.estimator.smoothing.graph.layout import graph_layout
-from telerig.estimator.smoothing.graph.solve import Options, solve
+from telerig.estimator.smoothing.graph.solve import Options, in_large_stack, solve
 from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
     BroadBand,
@@ -383,3 +385,16 @@ def test_a_pass_is_freed_before_the_next(
     found = solve(given, MODEL)
     assert found.weights[0][5] == 0
     assert len(alive) > 2 and not any(alive)
+
+
+def test_an_interruption_gives_the_garbage_collector_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = threading.Event()
+
+    def interrupted(_self: threading.Thread, _timeout: float | None = None) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "join", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            in_large_stack(done.set)
+    assert done.wait(10) and gc.isenabled()

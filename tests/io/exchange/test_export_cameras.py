@@ -38,6 +38,18 @@ def _scalar(node: cv2.FileNode, key: str) -> bool:
     return not node.getNode(key).isMap()
 
 
+def test_opencv_file_that_cannot_be_written_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_self: Path, _data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_opencv(camera_matrices(pair()), tmp_path / "rig.yml")
+    assert not list(tmp_path.iterdir())
+
+
 def in_homogeneous(matrix: Array, points: Array) -> Array:
     image = np.c_[points, np.ones(len(points))] @ matrix.T
     return np.asarray(image[:, :2] / image[:, 2:])

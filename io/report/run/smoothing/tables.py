@@ -399,7 +399,7 @@ def _constants(values: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 _SOURCES = {
-    "default": "default frequencies and damping; only the pixel noise and the RMS of the shake are "
+    "default": "default frequencies and damping; the pixel noise and the RMS of the shake are "
     "estimated from this run.",
     "learned": "found from this run by maximum likelihood.",
     "given": "given by the user.",

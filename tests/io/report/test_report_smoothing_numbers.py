@@ -125,6 +125,12 @@ def test_constants_without_sd_are_shown_bare(folder: Path) -> None:
     ]  # fmt: skip
 
 
+def test_words_and_answers_of_sensors_are_shown(folder: Path) -> None:
+    found = {"scale_from": "assumed", "confirmed": True}
+    rows = constant_rows(read(changed(folder, accelerometers={}, encoder=found)))
+    assert [row.cells[1:] for row in rows] == [("scale from", "assumed"), ("confirmed", "yes")]
+
+
 def test_axis_table_is_complete_without_a_verdict(folder: Path) -> None:
     heads, rows = axis_table(read(changed(folder, "axes")))
     assert heads == ["", "x", "y (down)", "z"]

@@ -392,8 +392,10 @@ def _constants(values: Mapping[str, Any]) -> list[tuple[str, str]]:
             continue
         shown, factor = name_with_unit(name, {"s": ("ms", 1e3)})
         sd: Any = values.get("s" + name)
-        text = with_sd(value * factor, sd * factor) if is_number(value) and is_number(sd) else (
-            number(value * factor, 4) if is_number(value) else ABSENT)  # fmt: skip
+        text = ABSENT if value is None else _cell(name, value)
+        if is_number(value):
+            text = with_sd(value * factor, sd * factor if is_number(sd) else None)
+            text = text if is_number(sd) else number(value * factor, 4)
         out.append((shown, text))
     return out
 

@@ -20,6 +20,7 @@ from smoothed_folder import (
 )
 
 from telerig.io.report.plot.spectrum import evenly
+from telerig.io.report.run.smoothing.figures import density_limits
 from telerig.io.report.run.smoothing.results import (
     axis_sd,
     shake_rms_um,
@@ -123,6 +124,13 @@ def test_constants_without_sd_are_shown_bare(folder: Path) -> None:
     assert [row.cells for row in rows] == [
         ("a", "bias x, mm/s²", "12.35"), ("a", "scale", "not available"), ("a", "delay, ms", "0"),
     ]  # fmt: skip
+
+
+def test_every_density_is_within_the_limits_of_its_picture() -> None:
+    readings, left, noise = np.geomspace(1, 1e-9, 60), np.full(60, 1e-13), np.full(60, 5e-8)
+    assert density_limits([readings, left, noise]) == (1e-13, 1.0)
+    assert density_limits([readings]) == pytest.approx((1e-6, 1.0))
+    assert density_limits([np.zeros(3)]) == (1.0, 1.0)
 
 
 def test_words_and_answers_of_sensors_are_shown(folder: Path) -> None:

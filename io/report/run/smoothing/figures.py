@@ -324,9 +324,7 @@ def _spectra(
     """Draw densities on logarithmic axes, with dotted lines at ``marked_hz``."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    values = np.concatenate([curve.y for curve in curves])
-    top = float(values.max()) if len(values) and values.max() > 0 else 1.0
-    bottom = max(float(values[values > 0].min(initial=top)), top * 10**-_DECADES)
+    bottom, top = density_limits([curve.y for curve in curves])
     limits = min(curve.x[0] for curve in curves), max(curve.x[-1] for curve in curves)
     settings: dict[str, Any] = {
         "xlabel": "frequency / Hz",
@@ -343,6 +341,14 @@ def _spectra(
         sheet.axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         sheet.axes.xaxis.set_minor_formatter(NullFormatter())
     return Picture(title, sheet.source, caption)
+
+
+def density_limits(densities: Sequence[Array]) -> tuple[float, float]:
+    """Return the least and the largest density to draw: six decades, or more to show each curve."""
+    positive = [y[y > 0] for y in densities if (y > 0).any()] or [np.ones(1)]
+    top, least = (float(end(np.concatenate(positive))) for end in (np.max, np.min))
+    half_seen = min(float(np.median(y)) for y in positive)
+    return max(least, min(half_seen, top * 10**-_DECADES)), top
 
 
 def _modes_hz(results: SmoothingResults) -> list[float]:

@@ -214,7 +214,8 @@ def words_of_refusals(file: SmoothingFile) -> list[str]:
         by_shake = (axis.q or 1.0) > HARDLY_WIDER
         shaken.add(by_shake)
         text = f"Along {name}, {' and '.join(what)}: "
-        text += "mostly because of the shake" if by_shake else "because of the pixels' noise"
+        part = "mostly" if (axis.q or 1.0) ** 2 > 2 else "partly"
+        text += f"{part} because of the shake" if by_shake else "because of the pixels' noise"
         if by_shake and axis.sigma_mm and axis.sigma_shake_known_mm:
             text += (
                 f" (standard deviation of a position {1e3 * axis.sigma_mm:.3g} µm; "
@@ -223,7 +224,7 @@ def words_of_refusals(file: SmoothingFile) -> list[str]:
         path = any(use.quantity == Quantity.PATH and use.below_hz is None for use in refused)
         text += ". At no frequency is the path nine times the power of its errors." if path else "."
         lines.append(text)
-    if True in shaken:
+    if True in shaken and (file.remedies or file.remedy):
         lines.append(to_resolve(remedy_words(file.remedies) or file.remedy))
     if False in shaken:
         lines.append(_LESS_NOISE)

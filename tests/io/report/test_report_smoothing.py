@@ -213,6 +213,10 @@ def test_the_page_says_why_it_is_not_good_for_more_and_what_to_add(folder: Path)
         "path nine times the power of its errors."
     )
     assert "accelerometer on each camera arm" in remedies[0] and "pixels per mm" in remedies[1]
+    axes["y"] |= {"q": 1.3, "sigma_mm": 0.0208, "sigma_shake_known_mm": 0.016}
+    changed(folder, usable_for=[path | {"axis": "y"}], axes=axes, remedies=[])
+    (by_shake,) = words_of_refusals(read(folder).file)  # strip and accelerometers are there
+    assert "partly because of the shake (standard deviation of a position 20.8" in by_shake
     changed(folder, usable_for=[path | {"axis": "y", "grade": "good"}])
     assert words_of_refusals(read(folder).file) == []
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -183,7 +184,7 @@ def _link(job: Job, folder: Path, results: str) -> str:
     if not target.is_file():
         return ""
     try:
-        return Path(os.path.relpath(target, Path(folder).resolve())).as_posix()
+        return quote(Path(os.path.relpath(target, Path(folder).resolve())).as_posix())
     except ValueError:
         return target.as_uri()
 
@@ -238,7 +239,7 @@ def _by_job(
         draw_curves(sheet, curves)
         for job in none:
             sheet.axes.axvline(job, color=LEFT_OUT, lw=0.8)
-        sheet.axes.set_ylim(0, 1.1 * max(float(np.nanmax(c.y)) for c in curves if len(c.y)))
+        sheet.axes.set_ylim(0, 1.1 * np.nanmax(np.concatenate([c.y for c in curves])))
         sheet.axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
     return Picture(title, sheet.source, caption)
 

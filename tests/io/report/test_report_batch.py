@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import pytest
 from report_page import Page
@@ -98,3 +99,19 @@ def test_a_batch_that_cannot_be_read_is_named(
         write_batch_report(tmp_path)
     assert "batch.json" in str(caught.value) and "->" in str(caught.value)
     assert list(tmp_path.iterdir()) == before
+
+
+def test_links_reach_datasets_of_any_name(tmp_path: Path) -> None:
+    page = tmp_path / "tank #2, 50%" / "results" / "rise" / "report.html"
+    page.parent.mkdir(parents=True)
+    page.write_text("")
+    job = _job("track", "rise") | {"dataset": str(page.parents[2])}
+    found = Page(write_batch_report(_write(tmp_path / "out", [job]))).loads
+    links = [unquote(urlsplit(load).path) for load in found if not load.startswith("data:")]
+    assert links == ["../tank #2, 50%/results/rise/report.html"]
+
+
+def test_an_axis_without_a_number_is_left_out(tmp_path: Path) -> None:
+    jobs = [_job("smooth", "rise", verdict="RESOLVED", sx_um=None, sy_um=13.0, sz_um=24.0)]
+    page = Page(write_batch_report(_write(tmp_path / "out", jobs)))
+    assert "not available, 13.0, 24.0" in page.spaced

@@ -10,6 +10,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
+from telerig.io.report.calibration.rig import common_plane
 from telerig.io.report.page.figures import (
     LEFT_OUT,
     MODEL,
@@ -213,11 +214,11 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
     """Return the pictures of which the folder has data; a single camera has none."""
     found = []
     if results.uncertainty:
-        maps = [_map(results.uncertainty, *what) for what in (_CALIBRATION, _MEASUREMENT)]
+        maps = [_map(results, *what) for what in (_CALIBRATION, _MEASUREMENT)]
         found += [picture for picture in maps if picture is not None]
     halves = results.file.diagnostics.halves
     if "points_mm" in halves:
-        found.append(_split_half(halves))
+        found.append(_split_half(halves, _across(results)))
     return found
 
 
@@ -225,8 +226,8 @@ _CALIBRATION = (
     "calibration_mm2",
     "Uncertainty: the calibration's share",
     "Standard deviation in µm of a point's position in the rig frame due to the calibration alone, "
-    "√(sx² + sy² + sz²), for points in the plane that contains both optical axes. Points of a run "
-    "that lie near each other share this error: it cancels in their differences.",
+    "√(sx² + sy² + sz²), for points in the plane of the rig frame nearest to both optical axes. "
+    "Points of a run that lie near each other share this error: it cancels in their differences.",
 )
 _MEASUREMENT = (
     "measurement_mm2",
@@ -237,30 +238,42 @@ _MEASUREMENT = (
 )
 
 
-def _plane(arrays: Mapping[str, Array], name: str) -> tuple[Array, Array, Array]:
-    """Return x and z (mm) of a grid in the plane of the optical axes, and the sd there (µm)."""
+def _across(results: CalibrationResults) -> int:
+    """Return which rig axis, x (0) or y (1), is nearer to the plane of the optical axes."""
+    return int(np.argmax(np.abs(common_plane(results)[0, :2])))
+
+
+def in_plane(points_mm: Array, across: int) -> Array:
+    """Return which points (N, 3) of a grid lie in the plane of ``across`` and z, (N,)."""
+    level = np.abs(points_mm[:, 1 - across])
+    return np.asarray(level <= level.min() + 1e-6)
+
+
+def _plane(results: CalibrationResults, name: str) -> tuple[Array, Array, Array]:
+    """Return coordinates (mm) of a grid near the optical axes, across and z, and its sd (µm)."""
+    arrays, across = results.uncertainty, _across(results)
     points = arrays["points_mm"]
     sd_um = 1e3 * np.sqrt(np.trace(arrays[name], axis1=-2, axis2=-1))
-    level = np.abs(points[:, 1])
-    flat = level <= level.min() + 1e-6
-    x, z = (np.unique(points[flat, i]) for i in (0, 2))
-    return x, z, sd_um[flat].reshape(len(x), len(z))
+    flat = in_plane(points, across)
+    side, z = (np.unique(points[flat, i]) for i in (across, 2))
+    return side, z, sd_um[flat].reshape(len(side), len(z))
 
 
 def _is_flat(grid: Array) -> bool:
     return bool(np.ptp(grid) <= 1e-3 * grid.max())
 
 
-def _map(arrays: Mapping[str, Array], name: str, title: str, caption: str) -> Picture | None:
+def _map(results: CalibrationResults, name: str, title: str, caption: str) -> Picture | None:
     """Draw a map; None for a uniform one, which `same_everywhere` states in words."""
-    x, z, grid = _plane(arrays, name)
+    side, z, grid = _plane(results, name)
     if _is_flat(grid):
         return None
-    limits: dict[str, Any] = {"xlim": (x[0], x[-1]), "ylim": (z[0], z[-1]), "aspect": "equal"}
-    with drawing(3.6, xlabel="x / mm", ylabel="z / mm", **limits) as sheet:
-        filled = sheet.axes.contourf(x, z, grid.T, levels=_LEVELS, cmap="viridis")
+    limits: dict[str, Any] = {"xlim": (side[0], side[-1]), "ylim": (z[0], z[-1])}
+    label = f"{'xy'[_across(results)]} / mm"
+    with drawing(3.6, xlabel=label, ylabel="z / mm", aspect="equal", **limits) as sheet:
+        filled = sheet.axes.contourf(side, z, grid.T, levels=_LEVELS, cmap="viridis")
         sheet.figure.colorbar(filled, ax=sheet.axes, label="µm")
-    caption = caption.format(sigma=number(float(arrays["sigma_px"]), 3))
+    caption = caption.format(sigma=number(float(results.uncertainty["sigma_px"]), 3))
     caption += f" {number(grid.min(), 3)} to {number(grid.max(), 3)} µm."
     return Picture(title, sheet.source, caption)
 
@@ -268,7 +281,7 @@ def _map(arrays: Mapping[str, Array], name: str, title: str, caption: str) -> Pi
 def same_everywhere(results: CalibrationResults) -> str:
     """Return a sentence on a pixels' share that is uniform; "" if it has a picture."""
     arrays = results.uncertainty
-    grid = _plane(arrays, _MEASUREMENT[0])[2] if arrays else np.zeros(0)
+    grid = _plane(results, _MEASUREMENT[0])[2] if arrays else np.zeros(0)
     if not grid.size or not _is_flat(grid):
         return ""
     sigma = number(float(arrays["sigma_px"]), 3)
@@ -279,24 +292,23 @@ def same_everywhere(results: CalibrationResults) -> str:
     )
 
 
-def _split_half(halves: Mapping[str, Any]) -> Picture:
+def _split_half(halves: Mapping[str, Any], across: int) -> Picture:
     """Draw how the halves of the views differ as arrows, and what is predicted as circles."""
     from matplotlib.patches import Circle
 
     points, shift, sd = (
         np.array(halves[name], float).reshape(-1, 3) for name in ("points_mm", "shift_um", "sd_um")
     )
-    level = np.abs(points[:, 1])
-    flat = level <= level.min() + 1e-6
-    x, z = points[flat][:, [0, 2]].T
+    flat, sides = in_plane(points, across), [across, 2]
+    x, z = points[flat][:, sides].T
     spacing = np.ptp(x) / max(len(np.unique(x)) - 1, 1)
-    longest = float(np.hypot(*shift[flat][:, [0, 2]].T).max())
+    longest = float(np.hypot(*shift[flat][:, sides].T).max())
     factor = 0.7 * spacing / max(longest, float(sd.max()), 1e-9)
-    with drawing(3.9, xlabel="x / mm", ylabel="z / mm") as sheet:
+    with drawing(3.9, xlabel=f"{'xy'[across]} / mm", ylabel="z / mm") as sheet:
         for a, b, s in zip(x, z, sd[flat]):
-            radius = factor * float(np.sqrt(np.mean(s[[0, 2]] ** 2)))
+            radius = factor * float(np.sqrt(np.mean(s[sides] ** 2)))
             sheet.axes.add_patch(Circle((a, b), radius, facecolor=MUTED, alpha=0.25, linewidth=0))
-        arrow = factor * shift[flat][:, [0, 2]]
+        arrow = factor * shift[flat][:, sides]
         sheet.axes.quiver(x, z, *arrow.T, angles="xy", scale_units="xy", scale=1, color=MODEL,
                           width=0.006)  # fmt: skip
         sheet.axes.update_datalim(np.stack([x, z], -1) + arrow)

@@ -73,10 +73,11 @@ def uncertainty(
     *,
     axes: Any = None,
 ) -> Any:
-    """Draw one standard deviation of a point's position over the plane of the optical axes, in µm.
+    """Draw one standard deviation of a point's position over the plane y = 0 of the rig, in µm.
 
-    source : uncertainty.npz of a calibration, or its arrays points_mm (N, 3) and <share>_mm2
-    (N, 3, 3). share : the calibration's, or that of the pixels. Returns axes.
+    It is √(sx² + sy² + sz²). Where the cameras stand side by side, both optical axes are near this
+    plane. source : uncertainty.npz of a calibration, or its arrays points_mm (N, 3) and
+    <share>_mm2 (N, 3, 3). share : the calibration's, or that of the pixels. Returns axes.
     Raises InputError for a file that is not one.
     """
     arrays = source if isinstance(source, Mapping) else _npz(source)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +13,13 @@ import pytest
 
 from telerig.errors import InputError
 from telerig.io.report.calibration.dot_fit import dot_pictures, edge_distance_px
-from telerig.io.report.calibration.figures import tilt_angles_rad
+from telerig.io.report.calibration.figures import tilt_angles_rad, trust_pictures
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
 from telerig.io.report.calibration.target import target_shape
 from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page import page
-from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Target
+from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Diagnostics, Target
 from telerig.io.results.tracking import TrackingFile
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -54,6 +55,31 @@ def test_tilt_is_the_angle_between_axis_and_normal() -> None:
     np.testing.assert_allclose(np.cos(direction), [-1.0, 1.0, -1.0], atol=1e-9)
     _, other, _ = tilt_angles_rad(_results(), 1)
     np.testing.assert_allclose(np.degrees(other), [65.0, 65.0, 50.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("turn", "name", "largest"), [([0, 1, 0], "x", 3), ([1, 0, 0], "y", 5)])
+def test_uncertainty_is_drawn_in_the_plane_of_both_axes(
+    turn: list[int], name: str, largest: int
+) -> None:
+    """Of cameras side by side, and of cameras one above the other."""
+    side = np.array([-2.0, 0.0, 2.0])
+    grid = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    sd_mm = 1e-3 * (1 + np.abs(grid) @ [1, 2, 0])
+    pose = Pose.from_rotvec(np.pi / 2 * np.array(turn))
+    second = Camera.create("right", (512, 512), 10.3, camera_from_rig=pose)
+    uncertainty = {
+        "points_mm": grid, "sigma_px": np.array(0.01),
+        "calibration_mm2": sd_mm[:, None, None] ** 2 * np.eye(3) / 3,
+        "measurement_mm2": np.broadcast_to(np.eye(3), (27, 3, 3)),
+    }  # fmt: skip
+    found = _results()
+    file = found.file.model_copy(update={"diagnostics": Diagnostics()})
+    cameras = (found.cameras[0], second)
+    found = replace(found, file=file, cameras=cameras, uncertainty=uncertainty)
+    (picture,) = trust_pictures(found)
+    assert f"1.00 to {largest}.00 µm" in picture.caption
+    drawn = base64.b64decode(picture.source.split(",")[1]).decode()
+    assert f">{name} / mm<" in drawn and ">z / mm<" in drawn
 
 
 def test_target_shape_finds_a_bump_and_its_deviation() -> None:

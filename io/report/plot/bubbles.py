@@ -78,7 +78,10 @@ def path(
 
 
 def velocity(summary: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
-    """Draw each bubble's mean velocity against its diameter, beside published laws; returns axes.
+    """Draw each bubble's mean speed against its diameter, beside published laws; returns axes.
+
+    The speed is ``slip_mm_s``, along the path and relative to the liquid. The laws are of the rise
+    velocity, which is smaller for a bubble that zigzags.
 
     summary : what `telerig.bubble_summary` returns. fluid : a mapping with the keys of [fluid] in
     rig.toml, for the laws (`telerig.rig.bubble_physics`); None for none.
@@ -87,7 +90,7 @@ def velocity(summary: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> A
     found = columns_of(summary, "d_eq_mm", "sd_eq_mm", "slip_mm_s", "s_slip_mm_s", made_by=_SUMMARY)
     d, _, speed, _ = finite(found[0], 0 * found[0], found[2], 0 * found[2])
     known = np.isfinite(found[0]) & np.isfinite(found[2])
-    axes = axes_of(axes, xlabel="equivalent diameter / mm", ylabel="velocity / (mm/s)")
+    axes = axes_of(axes, xlabel="equivalent diameter / mm", ylabel="speed along the path / (mm/s)")
     _points(axes, d, speed, found[1][known], found[3][known])
     known_liquid = liquid_of(fluid)
     if known_liquid is not None:

@@ -71,6 +71,7 @@ def test_velocities_lie_on_the_law_that_made_them() -> None:
     d, speed = law.get_data()
     expected = np.interp(summary()["d_eq_mm"], d, speed)
     assert np.allclose(expected, summary()["slip_mm_s"], rtol=1e-3)
+    assert axes.get_ylabel() == "speed along the path / (mm/s)"
     names = axes.get_legend_handles_labels()[1]
     assert {"bubbles, ± 1 sd", "Clift 1978, contaminated", "Moore 1965"} <= set(names)
     assert telerig.plot.velocity(summary()).get_legend_handles_labels()[1] == ["bubbles, ± 1 sd"]

@@ -40,7 +40,7 @@ def size_picture(results: SmoothingResults) -> Picture | None:
 
 
 def velocity_picture(results: SmoothingResults) -> Picture | None:
-    """Draw mean velocity against diameter, beside published laws."""
+    """Draw mean speed against diameter, beside published laws."""
     d = column(results.bubble_summary, "d_eq_mm")
     if not (np.isfinite(d) & np.isfinite(column(results.bubble_summary, "slip_mm_s"))).any():
         return None
@@ -49,10 +49,14 @@ def velocity_picture(results: SmoothingResults) -> Picture | None:
         plot.velocity(results.bubble_summary, fluid, axes=sheet.axes)
         _legend_below(sheet)
     caption = (
-        "Mean velocity relative to the liquid against the diameter of the sphere of equal volume. "
-        + ("Lines: published laws for single bubbles." if fluid else _NO_LIQUID)
-    )
-    return Picture("Velocity against size", sheet.source, caption)
+        "Mean speed along the path, relative to the liquid, against the diameter of the sphere of "
+        "equal volume. "
+        + (
+            "Lines: published laws for the rise velocity of single bubbles; one that zigzags moves "
+            "faster along its path than it rises." if fluid else _NO_LIQUID
+        )
+    )  # fmt: skip
+    return Picture("Speed against size", sheet.source, caption)
 
 
 def drag_picture(results: SmoothingResults) -> Picture | None:

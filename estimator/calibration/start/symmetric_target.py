@@ -26,8 +26,17 @@ def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[
     """Renumber the dots of a symmetric target such that all cameras and views agree.
 
     Returns the problem with the new numbers, and notes for the user on how they were decided.
-    Raises CalibrationError if two numberings explain the images of two cameras equally well.
+    Raises CalibrationError if two numberings explain the images of two cameras equally well, and
+    for an unbounded target: how its dots change places is not known, as its grid has no middle.
     """
+    if not problem.target.bounded:
+        raise CalibrationError(
+            f"the marks look the same after a turn ({problem.target.symmetry_order()}-fold "
+            "symmetry), and on an unbounded grid nothing else tells how the target is turned",
+            where="rig.toml [target]",
+            todo="use three or more marks that look different after every turn, such as "
+            "marks = [[0, 0], [0, 5], [3, 0]]",
+        )
     labels = problem.target.turns()
     if len(problem.cameras) > 1:
         problem = _numbered_alike_in_cameras(problem, labels, nominal_rotvec_deg)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from turned_images import settled, turned
 
+from telerig.errors import CalibrationError
 from telerig.rig.target import Target
 
 SQUARE = Target(
@@ -96,3 +97,11 @@ def test_a_known_distance_that_a_turn_moves_is_trusted_less(scene: Any) -> None:
     assert abs(error - 1) < 3 * scale_sd
     oblong = scene("symmetric", 2).calibrate("radial")
     assert not any("another pair" in n for n in oblong.notes)
+
+
+@pytest.mark.parametrize("marks", [((0, 0),), ((0, 0), (0, 5))])
+def test_symmetric_marks_on_an_unbounded_grid_are_refused(marks: Any, scene: Any) -> None:
+    made = scene("unbounded", 2)
+    made = replace(made, target=replace(made.target, marks=marks))
+    with pytest.raises(CalibrationError, match="look the same after a turn"):
+        made.calibrate("radial")

@@ -178,7 +178,7 @@ def _solved(
     free, joint = considered_covariance(noisier, there, shared, fit.models, considered)
     weak = checks.weak_parameters(final, own)
     found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
-    checked = _trust(fit.robust, joint, free, structure)
+    checked = _trust(final, replace(noisier, free=free), solution.state, joint, structure)
     scale_change = telecentricity(noisier, there, fit.models)
     return replace(
         found, diagnostics={**found.diagnostics, **checked},
@@ -245,16 +245,19 @@ def _nominal(
 
 
 def _trust(
-    fit: RobustFit,
+    problem: Problem,
+    noisier: Problem,
+    state: State,
     joint: JointCovariance,
-    free: tuple[tuple[str, ...], ...],
     structure: dict[str, Any],
 ) -> dict[str, Any]:
-    """Whether the covariance can be believed (split halves, residuals), and what would lower it."""
-    problem, state = fit.problem, fit.solution.state
-    advice = next_view(replace(problem, free=free), state, joint)
+    """Whether the covariance can be believed (split halves, residuals), and what would lower it.
+
+    noisier : the problem with the noise and the free parameters of ``joint``.
+    """
+    advice = next_view(noisier, state, joint)
     return {
-        "halves": split_half_check(problem, state),
+        "halves": split_half_check(problem, state, structure["widening"]),
         "structure": structure,
         "next_view": {} if advice is None else advice.as_dict(),
     }

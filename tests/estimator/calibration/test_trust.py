@@ -125,6 +125,21 @@ def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:
     assert not structure["sound"]
     assert any("the lens model lacks a term" in words for words in structure["words"])
     assert "! of two calibrations" in found.report()
+    said = found.diagnostics["halves"]["words"]
+    assert f"standard deviation is {structure['widening']:.2g} times larger than predicted" in said
+    assert "too small" not in said
+
+
+def test_the_next_view_has_the_noise_of_the_covariance(scene: Any) -> None:
+    """The same images with more stated noise, and with noise widened by a pattern: one gain."""
+    made = scene("dense", 3, sigma_px=0.02, views=8)
+    found = made.calibrate("none")
+    widening, advice = found.diagnostics["structure"]["widening"], found.diagnostics["next_view"]
+    floor = found.statistics["noise_floor_px"]
+    noisy = made.dots.assign(suu_px2=(widening * floor) ** 2, svv_px2=(widening * floor) ** 2)
+    stated = made.with_dots(noisy).calibrate("none").diagnostics["next_view"]
+    gain, expected = (1 - a["after_um"] / a["before_um"] for a in (advice, stated))
+    assert gain == pytest.approx(expected, rel=0.2)
 
 
 def test_halves_need_views(scene: Any) -> None:

@@ -55,7 +55,7 @@ def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[s
     standardised = standardised_residuals(whitened, leverage)
     share = 1 - float(np.trace(leverage, axis1=-2, axis2=-1).mean()) / 2
     tests: list[ResidualTest] = []
-    widening = [1.0]
+    widening = {"": 1.0}
     for c, camera in enumerate(problem.cameras):
         mine = obs.camera == c
         if mine.sum() < 2 * LEAST_IN_CELL:
@@ -65,14 +65,15 @@ def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[s
             camera.name, values, uv, camera.image_size_px, len(problem.free[c])
         )
         tests.append(region)
-        widening.append(power if region.p_value < UNLIKELY / len(problem.cameras) else 1.0)
+        if region.p_value < UNLIKELY / len(problem.cameras):
+            widening[camera.name] = power
         tests.append(_direction(camera.name, values, share))
         tests.append(_neighbours(camera.name, values, uv, obs.view[mine]))
         tests += _views(camera.name, values, obs.view[mine], problem.views)
     limit = UNLIKELY / max(len(tests), 1)
-    found = [t for t in tests if t.p_value < limit]
+    found = [t for t in tests if t.p_value < limit or (t.name == "region" and t.camera in widening)]
     words = [t.words for t in found] or ["no structure is left in the residuals"]
-    widest = float(np.sqrt(max(widening)))
+    widest = float(np.sqrt(max(widening.values())))
     if widest > 1:
         words.append(
             f"because of this pattern every standard deviation has been multiplied by {widest:.2g}"

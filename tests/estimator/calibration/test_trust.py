@@ -209,6 +209,20 @@ def test_each_structure_is_named() -> None:
     assert "neighbouring" in _only(_structure(dots, together), "neighbours", "left")
 
 
+def test_a_pattern_that_widens_is_named() -> None:
+    rng = np.random.default_rng(1)
+    dots = _Dots(rng)
+    noise = rng.standard_normal((960, 2))
+    at = (dots.uv_px[:, :1] < 120) & (dots.camera == 0)[:, None]
+    chances = []
+    for size in np.linspace(0.0, 1.0, 21):
+        found = _structure(dots, noise + size * at)
+        chances.append(found["tests"][0]["p_value"] * len(found["tests"]))
+        assert found["sound"] == (found["words"][0] == "no structure is left in the residuals")
+        assert found["sound"] == (found["widening"] == 1.0)
+    assert any(1e-3 < p < 1e-3 * len(found["tests"]) / 2 for p in chances)
+
+
 def _only(found: dict[str, Any], name: str, camera: str) -> str:
     """The words of that test, which objects; the other camera is sound."""
     assert not found["sound"]

@@ -24,6 +24,7 @@ _MAX_SAMPLES = 100_000
 _ENOUGH_PIXELS = 100
 _UNSEEN_SHARE = 0.2
 _CLIPPED_SHARE = 0.01
+_FLOAT_STEPS = 4096
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class NoiseModel:
     The variance is never less than that of rounding to whole steps, nor less than its smallest
     value between ``lowest`` and ``highest``.
 
-    step : distance between grey levels; 0 for floats.
+    step : distance between grey levels, see `grey_step`.
     relative_error : relative standard deviation of the estimated variance.
     lowest, highest : range of the grey levels at which the noise was measured.
     black, white : grey levels at which the image is clipped; infinite where it is not.
@@ -98,14 +99,14 @@ def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
     An image with many edges has few flat areas from which the noise can be estimated, but the
     residuals of the dots' fits show the noise as well. If both agree within 3 standard deviations,
     the factor is their weighted mean. If they disagree, it is 1. Without flat areas it is the
-    median of chi2_dof.
+    median of chi2_dof, or 1 if that is 0.
 
     chi2_dof, dof : (N,) chi-square per degree of freedom, and degrees of freedom, of N dots' fits.
     """
     if chi2_dof.size == 0:
         return 1.0
     if np.isinf(noise.relative_error):
-        return float(np.median(chi2_dof))
+        return float(np.median(chi2_dof)) or 1.0
     own = noise.relative_error**2
     error = 1.25**2 * 2.0 / (float(np.mean(dof)) * chi2_dof.size)
     excess = float(np.median(chi2_dof)) - 1.0
@@ -117,13 +118,17 @@ def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
 def grey_step(image: NDArray[np.generic]) -> float:
     """Return the distance between neighbouring grey levels of an image.
 
-    It is 0 for an array of floats, and 16 for 12-bit levels that are stored in the upper bits of
-    16-bit numbers.
+    It is 16 for 12-bit levels that are stored in the upper bits of 16-bit numbers. For floats it is
+    the smallest distance, but at least that of 12 bits: an image without noise, such as a rendered
+    one, is not exact.
     """
-    if not np.issubdtype(image.dtype, np.integer):
-        return 0.0
-    levels = np.unique(image[:: max(1, image.shape[0] // 256)]).astype(np.int64)
-    return float(np.gcd.reduce(np.diff(levels))) if levels.size > 1 else 1.0
+    whole = np.issubdtype(image.dtype, np.integer)
+    levels = np.unique(image[:: max(1, image.shape[0] // 256)])
+    if whole:
+        return float(np.gcd.reduce(np.diff(levels.astype(np.int64)))) if levels.size > 1 else 1.0
+    levels = np.unique(levels.astype(np.float32)).astype(np.float64)
+    least = float(np.ptp(levels)) / _FLOAT_STEPS
+    return max(float(np.diff(levels).min()), least) if levels.size > 1 else 0.0
 
 
 def clipped_sigma(values: Array, *, rounds: int = 12) -> float:

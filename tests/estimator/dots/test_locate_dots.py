@@ -168,6 +168,19 @@ def test_a_clipped_background_costs_no_dot(
     assert 0.5 < normalised(gap, table) < 1.25
 
 
+def test_floats_without_noise_are_measured_like_integers() -> None:
+    """A rendered or binary image has no noise at all, but its dots are not exact."""
+    truth = scene(7.0, size=120)
+    clean = renderer.render(truth)
+    for levels in (np.rint(clean), 255.0 * (clean > 115.0)):
+        whole = locate_dots(levels.astype(np.uint8))
+        assert len(whole) == len(truth.centres_px)
+        pd.testing.assert_frame_equal(locate_dots(levels), whole, rtol=1e-6)
+    smooth = locate_dots(clean)
+    assert len(smooth) == len(truth.centres_px)
+    assert 1e-5 < np.sqrt(smooth["suu_px2"].median()) < 0.01
+
+
 def test_columns_and_conventions() -> None:
     truth = scene(9.0, tilt_deg=50.0)
     table = locate_dots(renderer.picture(renderer.render(truth), 1.0, 8, np.random.default_rng(4)))

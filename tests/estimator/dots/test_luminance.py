@@ -250,12 +250,13 @@ def test_residuals_settle_an_uncertain_noise_but_not_a_misfit() -> None:
     assert agreed_factor(unsure, np.zeros(0), np.zeros(0)) == 1.0
 
 
-def test_grey_step_finds_twelve_bits_in_sixteen() -> None:
+def test_grey_step_finds_twelve_bits_in_sixteen_and_in_floats() -> None:
     rng = np.random.default_rng(8)
     image = rng.integers(0, 4096, (64, 64))
     assert grey_step((image * 16).astype(np.uint16)) == 16.0
     assert grey_step(image.astype(np.uint16)) == 1.0
-    assert grey_step(image.astype(np.float32)) == 0.0
+    assert grey_step(16 * image.astype(np.float32)) == 16.0
+    assert 0 < grey_step(rng.standard_normal((64, 64))) < 0.003
 
 
 def test_clipped_sigma_ignores_outliers() -> None:

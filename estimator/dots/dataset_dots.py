@@ -92,6 +92,15 @@ def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
     If several numberings fit equally well, one of them is returned and ``numbering.ambiguous`` is
     True. Raises DetectionError if no numbering fits.
     """
+    if not len(measured.dots) and len(measured.rejected):
+        reasons = measured.rejected["reason"].value_counts()
+        raise DetectionError(
+            f"no dots found: {len(measured.rejected)} spots were rejected, {reasons.iloc[0]} of "
+            f"them because: {reasons.index[0]}",
+            todo="check the exposure and the focus, [target] polarity and dot_diameter_mm, and "
+            "scale_px_per_mm of the camera in rig.toml; a dot needs a diameter of 5 px, and of a "
+            "third of the one that rig.toml states",
+        )
     numbering = number_dots(measured.dots, target)
     rows = measured.dots.iloc[numbering.table["index"].to_numpy()][MEASURED]
     unplaced = numbering.unplaced

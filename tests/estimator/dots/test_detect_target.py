@@ -141,3 +141,12 @@ def test_a_note_that_images_share_is_said_once() -> None:
     assert _notes_once(images) == [
         "the target is symmetric (in 3 of 3 images)", "view 1, camera left: something else",
     ]  # fmt: skip
+
+
+def test_an_image_of_rejected_spots_says_why() -> None:
+    image = np.full((120, 160), 40.0)
+    for row, column in np.ndindex(9, 12):
+        image[10 + 12 * row :, 10 + 12 * column :][:3, :3] = 200.0
+    image += np.random.default_rng(0).standard_normal(image.shape)
+    with pytest.raises(DetectionError, match=r"spots were rejected.*smaller than the smallest dot"):
+        detect_target(image, DESIGN)

@@ -19,10 +19,10 @@ from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.factors.linear_factors import add_linear_factors
 from telerig.factors.robust_loss import next_limit, travel_weights
-from telerig.io.dataset.dataset import Dataset, View
+from telerig.io.dataset.dataset import Dataset, View, files_by_view
 from telerig.io.dataset.tables import read_dots_csv
 from telerig.io.files.csv_table import Column, read_table
-from telerig.io.images.read import list_images, natural
+from telerig.io.images.read import natural
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, across, hat, nearest_rotation, rotation_from_rotvec
 from telerig.rig.triangulation import rig_jacobian, triangulate_any
@@ -102,16 +102,16 @@ def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | N
     if not folder.is_dir():
         return None
     positions = _positions(folder)
-    described = dataset.rig.stage
+    described, notes = dataset.rig.stage, list[str]()
     found = stage_axis_of(
         calibration,
-        _measured(dataset, folder),
+        _measured(dataset, folder, notes),
         positions,
         position_sigma_mm=0.001 if described is None else described.position_sigma_mm,
     )
-    if described is None:
-        return found
-    return replace(found, words=(*found.words, *_contradiction(found.axis_rig, described.axis)))
+    if described is not None:
+        notes += _contradiction(found.axis_rig, described.axis)
+    return replace(found, words=(*found.words, *notes))
 
 
 def _positions(folder: Path) -> pd.DataFrame:
@@ -123,10 +123,13 @@ def _positions(folder: Path) -> pd.DataFrame:
     return read_table(file, [Column("view", "name"), Column("position_mm")])
 
 
-def _measured(dataset: Dataset, folder: Path) -> pd.DataFrame:
-    """Return the table of measured dots, from dots.csv or from the images in the folder."""
+def _measured(dataset: Dataset, folder: Path, notes: list[str]) -> pd.DataFrame:
+    """Return the table of measured dots, from dots.csv or from the images in the folder.
+
+    Sentences about what is not used are appended to ``notes``.
+    """
     table = folder / "dots.csv"
-    views = _image_views(dataset, folder)
+    views = _image_views(dataset, folder, notes)
     if table.is_file() == bool(views):
         what = "both images and dots.csv" if views else "neither images nor dots.csv"
         raise InputError(
@@ -138,14 +141,17 @@ def _measured(dataset: Dataset, folder: Path) -> pd.DataFrame:
         return read_dots_csv(table, dataset.rig)
     from telerig.estimator.dots.dataset_dots import detect_dataset
 
-    return detect_dataset(replace(dataset, views=views, source="images", table=None)).dots
+    found = detect_dataset(replace(dataset, views=views, source="images", table=None))
+    notes += [f"{FOLDER}: {note}" for note in found.notes]
+    return found.dots
 
 
-def _image_views(dataset: Dataset, folder: Path) -> tuple[View, ...]:
+def _image_views(dataset: Dataset, folder: Path, notes: list[str]) -> tuple[View, ...]:
     paths: dict[str, dict[str, Path]] = {}
     for camera in dataset.rig.cameras:
-        for file in list_images(folder / camera) if (folder / camera).is_dir() else ():
-            paths.setdefault(file.stem, {})[camera] = file
+        if (folder / camera).is_dir():
+            for view, file in files_by_view(folder / camera, notes).items():
+                paths.setdefault(view, {})[camera] = file
     return tuple(View(name, paths[name]) for name in sorted(paths, key=natural))
 
 
@@ -211,6 +217,12 @@ def _dots(
         [f"{unknown} dots have numbers that are not in the calibration, and are not used"]
         if unknown else []
     )  # fmt: skip
+    if unknown and not known.any():
+        raise InputError(
+            f"none of the {unknown} dots has a number that is in the calibration",
+            where=FOLDER,
+            todo="number the dots as in the calibration, and show the same target",
+        )
     rows = table[known]
     views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
     unseen = [v for v in readings if v not in views]

@@ -276,7 +276,7 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
                 todo=suggestion(entry.name, list(rig.cameras)),
             )
         else:
-            for stem, file in _stems(entry, notes).items():
+            for stem, file in files_by_view(entry, notes).items():
                 by_view.setdefault(stem, {})[entry.name] = file
     _check_case(by_view, calibration)
     _note_single({view: set(paths) for view, paths in by_view.items()}, rig, notes)
@@ -286,13 +286,16 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
     )
 
 
-def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
-    """Return a camera's image files by view name (without extension); append to ``notes``."""
+def files_by_view(folder: Path, notes: list[str]) -> dict[str, Path]:
+    """Return a camera's image files by view name (without extension); append to ``notes``.
+
+    Raises InputError for two files of one view.
+    """
     images = list_images(folder)
     unused = [p.name for p in _entries(folder) if p not in images]
     if unused:
         notes.append(
-            f"calibration/{folder.name}: not used, as they are no images "
+            f"{folder.parent.name}/{folder.name}: not used, as they are no images "
             f"({' '.join(EXTENSIONS)}): {', '.join(unused)}"
         )
     stems: dict[str, Path] = {}

@@ -94,6 +94,15 @@ def test_images(folder: Path) -> None:
     assert found.scale_sd < 3e-4
     np.testing.assert_allclose(found.axis_rig, AXIS, atol=1e-3)
 
+    dark = folder / "stage_axis" / "left" / "top.tif"
+    tifffile.imwrite(dark, np.zeros_like(image))
+    found = stage_axis_from(dataset, known)
+    assert found is not None
+    assert any("view top, camera left is left out: no dots found" in w for w in found.words)
+    tifffile.imwrite(dark.with_suffix(".tiff"), image)
+    with pytest.raises(InputError, match=r"top\.tif and top\.tiff are the same view twice"):
+        stage_axis_from(dataset, known)
+
 
 def test_a_stage_that_runs_the_other_way(folder: Path) -> None:
     rig = read_rig_toml(folder / "rig.toml")
@@ -124,3 +133,12 @@ def test_what_is_missing(folder: Path) -> None:
     (folder / "stage_axis" / "positions.csv").unlink()
     with pytest.raises(InputError, match=r"no positions\.csv"):
         stage_axis_from(dataset, calibration(dataset))
+
+
+def test_dots_of_another_target(folder: Path) -> None:
+    dataset = telerig.load_dataset(folder)
+    known = calibration(dataset)
+    table = dots(dataset)
+    table.to_csv(folder / "stage_axis" / "dots.csv", index=False)
+    with pytest.raises(InputError, match="dots has a number that is in the calibration"):
+        stage_axis_from(dataset, replace(known, dot_ids=known.dot_ids + 1000))

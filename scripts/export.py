@@ -31,7 +31,8 @@ def export(
         ),
     ],
     run: Annotated[
-        str | None, typer.Option(help="Name of the run [the only one with results].")
+        str | None,
+        typer.Option(help="For trajectories: name of the run [the only one with results]."),
     ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="calibration.json [the dataset's own].")
@@ -43,7 +44,8 @@ def export(
     volume: Annotated[
         str | None,
         typer.Option(
-            help="Working volume in mm in the rig frame, 'x,x,y,y,z,z' [what all cameras see]."
+            help="For cameras: working volume in mm in the rig frame, 'x,x,y,y,z,z' [what all "
+            "cameras see]."
         ),
     ] = None,
     full_cubic: Annotated[

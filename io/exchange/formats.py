@@ -48,7 +48,7 @@ class Format:
 
     def __call__(self, *arguments: Any, **offered: Any) -> Any:
         """Call the function with the arguments and with those offered options that it takes."""
-        return self.load()(*arguments, **{key: offered[key] for key in self.options})
+        return self.load()(*arguments, **{k: offered[k] for k in self.options if k in offered})
 
 
 CAMERA_EXPORTS = {
@@ -142,7 +142,8 @@ def export_results(
         format, see `Format.options`.
 
     Returns lines of text that say what was written and where. Raises InputError for an unknown
-    format, and for results that are missing, stale or cannot be used.
+    format, for an option of other formats, and for results that are missing, stale or cannot be
+    used.
     """
     from telerig.io.exchange.export.run_results import (
         cameras_of,
@@ -154,6 +155,7 @@ def export_results(
     known = CAMERA_EXPORTS | RUN_EXPORTS
     if to not in known:
         raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
+    _refuse_options_of_others(to, run=run, calibration=calibration, **options)
     rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
     results = None
     if to in RUN_EXPORTS:
@@ -166,6 +168,29 @@ def export_results(
         lines = export_run(results, to, place, rig.cameras)
     accepted = rig.accepted if results is None else results.accepted
     return [*lines, *(f"accepted: {words}" for words in accepted), f"written: {place}"]
+
+
+def _refuse_options_of_others(to: str, **given: Any) -> None:
+    """Raise InputError for a given option that the format ``to`` does not know.
+
+    given : the options; those that are None, False or 0 were not given.
+    """
+    with_cameras = [name for name, known in RUN_EXPORTS.items() if "cameras" in known.options]
+    shared = {
+        "run": [*RUN_EXPORTS],
+        "calibration": [*CAMERA_EXPORTS, *with_cameras],
+        "volume": [*CAMERA_EXPORTS],
+    }
+    for option in (name for name, value in given.items() if value):
+        formats = shared.get(option) or [
+            name for name, known in CAMERA_EXPORTS.items() if option in known.options
+        ]
+        if to not in formats:
+            name = option.replace("_", "-")
+            raise InputError(
+                f"--to {to} has no option --{name}",
+                todo=f"leave it out; the formats that have it: {', '.join(formats) or 'none'}",
+            )
 
 
 def export_cameras(

@@ -170,10 +170,26 @@ def pixel_covariance(sigma_px: ArrayLike, shape: tuple[int, ...]) -> Array:
 
     sigma_px : one standard deviation, an array of them (...), or covariances (..., 2, 2). An array
     of the points' ``shape`` holds standard deviations, even if that is (2, 2). Raises InputError
-    for a standard deviation that is not positive.
+    for a standard deviation that is not positive, a covariance that is not positive definite, and
+    a wrong shape.
     """
     sigma = np.asarray(sigma_px, float)
-    if sigma.shape != shape and sigma.ndim >= 2 and sigma.shape[-2:] == (2, 2):
+    full = sigma.shape != shape and sigma.ndim >= 2 and sigma.shape[-2:] == (2, 2)
+    try:
+        np.broadcast_to(sigma, (*shape, 2, 2) if full else shape)
+    except ValueError:
+        raise InputError(
+            f"sigma_px of shape {sigma.shape} does not belong to points of shape {shape}",
+            todo="give one number, one for each point, or a covariance (2, 2) for each",
+        ) from None
+    if full:
+        determinant = sigma[..., 0, 0] * sigma[..., 1, 1] - sigma[..., 0, 1] * sigma[..., 1, 0]
+        if np.any(~((sigma[..., 0, 0] > 0) & (determinant > 0))):
+            raise InputError(
+                "a covariance of pixels is not positive definite",
+                where="sigma_px",
+                todo="give covariances in px^2, with positive variances and correlations below 1",
+            )
         return np.broadcast_to(sigma, (*shape, 2, 2))
     if np.any(~(sigma > 0)):
         raise InputError("sigma_px must be positive", todo="give the pixel noise in px")
@@ -214,6 +230,7 @@ def triangulate(
         raise InputError(f"unknown method {method!r}", todo='use "ml" or "midpoint"')
     shape = first.shape[:-1]
     pair = sigma_px if isinstance(sigma_px, tuple) else (sigma_px, sigma_px)
+    _check_count(pair, 2)
     covariances = [pixel_covariance(s, shape) for s in pair]
     if rays is None:
         rays = [camera.unproject(uv) for camera, uv in zip(cameras, (first, second))]
@@ -253,6 +270,7 @@ def triangulate_views(
         raise InputError(f"unknown method {method!r}", todo='use "ml" or "midpoint"')
     shape = pixels[0].shape[:-1]
     sigmas = sigma_px if isinstance(sigma_px, tuple) else (sigma_px,) * len(cameras)
+    _check_count(sigmas, len(cameras))
     uv = np.array([p.reshape(-1, 2) for p in pixels])
     seen = np.isfinite(uv).all(-1)
     noise = np.array(
@@ -283,10 +301,18 @@ def triangulate_views(
     return Triangulation(
         points.reshape(*shape, 3),
         covariance,
-        miss.reshape(*shape, -1),
+        miss.reshape(*shape, len(cameras)),
         covariance,
         seen.sum(0).reshape(shape),
     )
+
+
+def _check_count(sigmas: tuple[ArrayLike, ...], cameras: int) -> None:
+    if len(sigmas) != cameras:
+        raise InputError(
+            f"{len(sigmas)} entries of sigma_px for {cameras} cameras",
+            todo="give one number, or a tuple with one entry for each camera",
+        )
 
 
 def triangulate_any(
@@ -324,6 +350,8 @@ def seen_covariance(sigma_px: ArrayLike, seen: NDArray[np.bool_]) -> Array:
     sigma = np.asarray(sigma_px, float)
     if sigma.shape == seen.shape:
         sigma = np.where(seen, sigma, 1.0)
+    elif sigma.shape == (*seen.shape, 2, 2):
+        sigma = np.where(seen[..., None, None], sigma, np.eye(2))
     covariance = pixel_covariance(sigma, seen.shape)
     return np.where(seen[..., None, None], covariance, np.eye(2))
 

@@ -231,9 +231,11 @@ def test_bad_input() -> None:
         triangulate(cameras, (pixels[0][:, :1], pixels[1][:, :1]), 0.1)
     with pytest.raises(InputError, match="unknown method"):
         triangulate(cameras, tuple(pixels), 0.1, "best")
-    for sigma in (0.0, -1.0, np.nan):
+    for sigma in (0.0, -1.0, np.nan, np.zeros((2, 2)), [[1, 2], [2, 1]], -np.eye(2), np.ones(3)):
         with pytest.raises(InputError, match="sigma_px"):
             triangulate(cameras, tuple(pixels), sigma)
+    with pytest.raises(InputError, match="3 entries of sigma_px for 2 cameras"):
+        triangulate(cameras, tuple(pixels), (0.1, 0.1, 0.1))
 
 
 def test_parallel_cameras_are_an_error() -> None:
@@ -344,3 +346,16 @@ def test_views_that_cannot_be_used() -> None:
         triangulate_views(cameras, [uv, uv, uv], 0.1, "middle")
     with pytest.raises(GeometryError, match="parallel"):
         triangulate_views((cameras[0], cameras[0]), [uv, uv], 0.1)
+    with pytest.raises(InputError, match="2 entries of sigma_px for 3 cameras"):
+        triangulate_views(cameras, [uv, uv, uv], (0.1, 0.1))
+
+
+def test_views_of_no_point_and_covariances_of_unseen_pixels() -> None:
+    cameras = fan(3)
+    found = triangulate_views(cameras, [np.zeros((0, 2))] * 3, 0.1)
+    assert found.points_mm.shape == found.ray_miss_mm.shape == (0, 3)
+    uv = [camera.project([[1.0, 2.0, 3.0]]) for camera in cameras]
+    uv[1] = np.full((1, 2), np.nan)
+    unseen = (np.eye(2)[None], np.full((1, 2, 2), np.nan), np.eye(2)[None])
+    found = triangulate_views(cameras, uv, unseen)
+    np.testing.assert_allclose(found.points_mm, [[1.0, 2.0, 3.0]], atol=1e-9)

@@ -30,6 +30,8 @@ _RANK = 1e-3
 """Directions whose standard deviation is smaller than this share of the largest one are left out,
 because second-order effects of the others are larger there."""
 _ROUNDING = 1e-6
+_EXACT = 1e-9
+"""Largest difference (mm or rad) of two rigs without uncertainty that counts as rounding."""
 _FAR = 5.0
 _LEAST_CHANCE = 1e-12
 
@@ -62,8 +64,10 @@ class Change:
 
     @property
     def deviations(self) -> float:
-        """Return the change divided by its standard deviation; infinite if the latter is 0."""
-        return self.change / self.sd if self.sd > 0 else np.inf * np.sign(self.change)
+        """Return the change divided by its standard deviation; infinite if only the latter is 0."""
+        if self.sd > 0:
+            return self.change / self.sd
+        return float(np.copysign(np.inf, self.change)) if self.change else 0.0
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ class RigComparison:
     @property
     def identical(self) -> bool:
         """Whether both calibrations agree to rounding, so that they come from the same views."""
-        return self.field.rms_um < _ROUNDING * self.field.predicted_um
+        return self.field.rms_um < _ROUNDING * max(self.field.predicted_um, 1.0)
 
     @property
     def moved(self) -> bool:
@@ -319,7 +323,7 @@ def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:
         a, b = (r.cameras[c + 1].camera_from_rig.inverse() for r in (first, second))
         turn = a.rotation @ rotvec_from_rotation(a.rotation.T @ b.rotation)
         across = np.cross([0.0, 0.0, 1.0], a.rotation[:, 2])
-        across /= np.linalg.norm(across)
+        across /= max(np.linalg.norm(across), 1e-12)  # parallel axes have no such perpendicular
         changes.append(np.r_[turn, across @ (b.translation_mm - a.translation_mm)])
         rows[4 * c : 4 * c + 3, 6 * c : 6 * c + 3] = a.rotation
         rows[4 * c + 3, 6 * c + 3 : 6 * c + 6] = across @ a.rotation
@@ -381,8 +385,11 @@ def _root(covariance: Array) -> Array:
 def _chance(difference: Array, root: Array) -> float:
     """Return the probability of a difference (K,) as large, with the covariance root root^T.
 
-    Directions with (almost) no variance are left out of the chi-square.
+    Directions with (almost) no variance are left out of the chi-square. Without any variance, a
+    difference beyond rounding has the probability 0.
     """
+    if not np.any(root):
+        return float(np.all(np.abs(difference) < _EXACT))
     directions, sizes, _ = np.linalg.svd(root, full_matrices=False)
     seen = sizes > _RANK * sizes.max()
     along = directions[:, seen].T @ difference / sizes[seen]

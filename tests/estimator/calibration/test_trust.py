@@ -12,6 +12,9 @@ from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.quality.comparison import _chance, compare_calibrations
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
+from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
 
 STILL = range(10, 20)
 
@@ -62,6 +65,26 @@ def test_chance_does_not_judge_what_the_second_order_fills() -> None:
 
 def test_a_calibration_beside_itself_says_nothing_of_the_rig(at_rest: list[Any]) -> None:
     assert "same views" in compare_calibrations(at_rest[0], at_rest[0]).words()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.5])
+def test_rigs_without_uncertainty_are_compared_exactly(angle: float) -> None:
+    """Imported calibrations state no covariance, and axes of perspective lenses can be parallel."""
+    look = {"kappa_per_mm": 1e-3}
+
+    def rig(turned: float) -> Calibration:
+        pose = Pose.from_rotvec([0.0, angle, turned], [300.0 * (angle == 0), 0.0, 0.0])
+        left = Camera.create("left", (500, 400), 10.0, **look)
+        return calibration_from_cameras(
+            [left, Camera.create("right", (500, 400), 10.0, camera_from_rig=pose, **look)]
+        )
+
+    same = compare_calibrations(rig(0.0), rig(0.0))
+    assert "equal except for rounding" in same.words()
+    assert [c.deviations for c in same.changes] == [0.0] * 6
+    moved = compare_calibrations(rig(0.0), rig(0.01))
+    assert moved.as_dict()["verdict"] == "MOVED"
+    assert "the rig moved" in moved.words()
 
 
 def test_exchanged_cameras_and_other_lenses_are_named(scene: Any, at_rest: list[Any]) -> None:

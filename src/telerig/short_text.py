@@ -136,6 +136,11 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
 
+def no_formula(text: str) -> str:
+    """Return a text in which matplotlib takes no name of the user's for a formula."""
+    return text.replace("$", r"\$")
+
+
 UNITS = {
     "_mm_s2": "mm/s²", "_mm_s": "mm/s", "_mm": "mm", "_um": "µm", "_m_s2": "m/s²", "_hz": "Hz",
     "_s": "s", "_px": "px", "_rad": "rad", "_nats": "log-likelihood ratio (nats)",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.short_text import no_formula
 
 CAMERA_COLOURS = ("#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0")
 KEPT, LEFT_OUT, MODEL, MUTED = "#1b7f3b", "#c62828", "#c62828", "#8a8f98"
@@ -66,6 +68,9 @@ class Sheet:
     source: str = ""
 
 
+_UNNAMED = re.compile("_child[0-9]+$|_nolegend_$|[^_]|$")
+
+
 @contextmanager
 def drawing(
     height_in: float, *, legend: str = "", grid: bool = False, **settings: Any
@@ -77,6 +82,7 @@ def drawing(
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
     with rc_context(_STYLE):
         figure = Figure(figsize=(WIDTH_IN, height_in))
@@ -88,9 +94,14 @@ def drawing(
         axes.grid(grid)
         sheet = Sheet(figure, axes)
         yield sheet
+        for one in axes.get_children():
+            if not _UNNAMED.match(str(one.get_label())):  # a legend leaves out what begins with _
+                one.set_label(f" {one.get_label()}")
         if legend and axes.get_legend_handles_labels()[1]:
             above = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 4, "borderpad": 0.2}
             axes.legend(**(above if legend == "above" else {"loc": legend}))
+        for text in figure.findobj(Text):
+            text.set_text(no_formula(text.get_text()))
         sheet.source = png(figure, _DPI, _SHADES) if sheet.points > _MANY else svg(figure)
 
 

@@ -12,6 +12,7 @@ import pandas as pd
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.report.plot.axes import COLOURS, axes_of, columns_of, finite
+from telerig.short_text import no_formula
 
 _RESIDUALS = "results/calibration/residuals.csv"
 _LEAST_WEIGHT = 0.5
@@ -39,7 +40,9 @@ def residuals(
     if magnified is None:
         magnified = 0.05 * float(np.ptp(u) or 1.0) / typical if typical > 0 else 1.0
         magnified = 10.0 ** np.floor(np.log10(magnified)) if magnified > 0 else 1.0
-    axes = _image(axes_of(axes, title=f"{camera}, arrows {magnified:,.0f} times as long"))
+    axes = _image(
+        axes_of(axes, title=f"{no_formula(camera)}, arrows {magnified:,.0f} times as long")
+    )
     axes.quiver(u, v, magnified * du, magnified * dv, angles="xy", scale_units="xy", scale=1,
                 color=COLOURS[0], width=0.003)  # fmt: skip
     return axes
@@ -58,7 +61,7 @@ def coverage(
     what the points cover. Raises InputError for a camera without points.
     """
     u, v = finite(*columns_of(_of_camera(table, camera), "u_px", "v_px", made_by=_RESIDUALS))
-    axes = _image(axes_of(axes, title=f"{camera}, {len(u)} points"))
+    axes = _image(axes_of(axes, title=f"{no_formula(camera)}, {len(u)} points"))
     dots = {"markersize": 3, "alpha": 0.6, "markeredgewidth": 0, "color": COLOURS[0]}
     axes.plot(u, v, ".", **dots)
     if image_size_px is not None:
@@ -110,7 +113,7 @@ def shake(
     turned = y_up and axis == "y"
     name = "height" if turned else axis
     values = -values if turned else values
-    axes = axes_of(axes, xlabel="t / s", ylabel=f"shake of {camera}, {name} / µm")
+    axes = axes_of(axes, xlabel="t / s", ylabel=f"shake of {no_formula(camera)}, {name} / µm")
     if f"s{camera}_{axis}_mm" in table:
         far = 2 * table[f"s{camera}_{axis}_mm"].to_numpy(float)
         band = {"color": COLOURS[0], "alpha": 0.25, "linewidth": 0, "label": "± 2 sd"}

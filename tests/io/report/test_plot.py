@@ -142,6 +142,8 @@ def test_shake_has_one_sign() -> None:
     assert telerig.plot.shake(table, "left").get_lines()[0].get_ydata()[1] == pytest.approx(-20)
     down = telerig.plot.shake(table, "left", y_up=False)
     assert down.get_lines()[0].get_ydata()[1] == pytest.approx(20)
+    odd = telerig.plot.shake(table.rename(columns=lambda n: n.replace("left", "$_$")), "$_$")
+    odd.figure.canvas.draw()
     with pytest.raises(InputError, match="left_z_mm"):
         telerig.plot.shake(table, "left", "z")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +15,7 @@ from report_page import Page
 from smoothed_folder import AXES, changed, read, write_folder
 
 from telerig.errors import InputError
-from telerig.io.report.page.figures import Picture
+from telerig.io.report.page.figures import Picture, drawing
 from telerig.io.report.run import report
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.smoothing.figures import smoothing_drawings
@@ -315,6 +317,15 @@ def test_hostile_names_stay_text(folder: Path) -> None:
           residuals={evil: {"pixels": 3, "outliers": 0}})  # fmt: skip
     html = write_track_report(folder).read_text(encoding="utf-8")
     assert evil not in html and html.count("&lt;/script&gt;&lt;b&gt;x") >= 4
+
+
+def test_names_are_no_formulas_and_stand_in_the_legend() -> None:
+    with drawing(2.0, legend="above", yscale="log", title="cam$_$") as sheet:
+        for name in ("$_$", "_left", "s"):
+            sheet.axes.plot([1, 2], [1, 1000], label=name)
+    drawn = base64.b64decode(sheet.source.split(",")[1]).decode()
+    texts = [text.strip() for text in re.findall(r"<text[^>]*>([^<]+)</text>", drawn)]
+    assert texts[-4:] == ["cam$_$", "$_$", "_left", "s"]
 
 
 def test_importing_the_report_draws_in_no_heavy_library_nor_the_estimator() -> None:

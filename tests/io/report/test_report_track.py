@@ -6,6 +6,7 @@ import base64
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ from telerig.io.report.run.tracking.results import (
     read_track_results,
 )
 from telerig.io.report.run.tracking.scene import thinned, track_scene_json
-from telerig.io.report.run.tracking.tables import event_words, verdict
+from telerig.io.report.run.tracking.tables import event_words, pair_rows, verdict
 
 SECTIONS = [
     *("verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events", "notes"),
@@ -177,6 +178,19 @@ def test_no_rows_for_a_camera_and_no_tracks(folder: Path) -> None:
     text = Page(write_track_report(folder)).text
     assert "No bubble was followed in 60 frames" in text
     assert 'class="verdict rejected"' in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_an_offset_that_varies_is_not_a_list_of_offsets(folder: Path) -> None:
+    _edit(folder, pairs={"bias_px": [0.8, 0.21, -0.1, 0.0], "calibration_problem": True})
+    results = read_track_results(folder)
+    where = "in the middle of the paths, different elsewhere"
+    assert f"(offset 0.800 px {where})" in verdict(results).warnings[0]
+    assert pair_rows(results)[0][1] == f"0.800 {where}"
+
+
+def test_one_frame_lasts_no_time(results: TrackResults) -> None:
+    picture = time_series(replace(results, tracks=results.tracks.iloc[:1]), 0)
+    assert picture.caption.startswith("0 s, a colour per track")
 
 
 def test_hostile_names_stay_text(folder: Path) -> None:

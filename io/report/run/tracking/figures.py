@@ -44,7 +44,7 @@ def time_series(results: TrackResults, axis: int) -> Picture:
         draw_tracks(sheet, table["t_s"].to_numpy(float), place, table)
         if upwards < -0.5:
             sheet.axes.invert_yaxis()
-    span = 1e-9 + results.tracks["t_s"].max() - results.tracks["t_s"].min() if len(table) else 0
+    span = results.tracks["t_s"].max() - results.tracks["t_s"].min() if len(table) else 0
     caption = f"{number(float(span))} s, a colour per track; a line breaks where a bubble was lost."
     if upwards < -0.5:
         caption = f"The axis is turned round, so that up is up. {caption}"

@@ -116,10 +116,10 @@ def _with_learnt(results: TrackResults) -> Array | None:
 def _warnings(results: TrackResults) -> tuple[str, ...]:
     words = []
     if results.pairs.calibration_problem:
-        offsets = ", ".join(number(b) for b in _as_list(results.pairs.bias_px))
+        offset, varies = _offset(results.pairs.bias_px)
         words.append(
             "The two cameras disagree along the direction perpendicular to both optical axes"
-            + (f" (offset {offsets} px)" if offsets else "")
+            + ("" if offset is None else f" (offset {number(offset)} px{varies})")
             + ": this is a calibration problem. Calibrate again before you use these tracks."
         )
     ratio = ray_miss_ratio(results, _with_learnt(results), centred=bool(words))
@@ -200,15 +200,19 @@ def pair_rows(results: TrackResults) -> list[tuple[str, str]]:
     if pairs is None:
         return []
     stages = ("as it is", "after a constant", "after the whole bias", "for pairs left out of it")
-    bias = [number(b) for b in _as_list(pairs.bias_px)]
-    rows = [("offset perpendicular to both optical axes, px", ", ".join(bias) or ABSENT)]
+    offset, varies = _offset(pairs.bias_px)
+    rows = [("offset perpendicular to both optical axes, px", number(offset) + varies)]
     rows += [("scatter of a pair, px", number(pairs.scatter_px))]
     rows += [("shift common to a frame, px", number(pairs.frame_px))]
     return rows + [(f"RMS {stage}, px", number(rms)) for stage, rms in zip(stages, pairs.rms_px)]
 
 
-def _as_list(value: float | Sequence[float] | None) -> list[float]:
-    return [] if value is None else [value] if isinstance(value, float | int) else list(value)
+def _offset(bias_px: float | Sequence[float] | None) -> tuple[float | None, str]:
+    """Return the constant of the systematic ray miss, and in words that it varies in space."""
+    if bias_px is None or isinstance(bias_px, float | int):
+        return bias_px, ""
+    varies = " in the middle of the paths, different elsewhere" if len(bias_px) > 1 else ""
+    return (bias_px[0] if len(bias_px) else None), varies
 
 
 def flag_rows(results: TrackResults) -> list[Row]:

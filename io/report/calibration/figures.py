@@ -53,7 +53,7 @@ def residual_field(results: CalibrationResults, index: int) -> Picture:
         key_px = nice_below(0.15 * width / magnified)
         sheet.axes.quiverkey(
             quiver, 0.02, 1 + 0.5 * above / height, key_px * magnified,
-            f"{number(key_px, 1)} px, drawn {magnified:,.0f} times as long",
+            f"{number(key_px, 1)} px, drawn {magnified:,g} times as long",
             labelpos="E", coordinates="axes", labelsep=0.06,
         )  # fmt: skip
     caption = (

@@ -130,7 +130,8 @@ def drag(table: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
             axes.plot(liquid[0].reynolds(grid, speed), law, style, color=colour, linewidth=1.0,
                       label=name)  # fmt: skip
     low, high = np.quantile(coefficient, [0.02, 0.98])
-    axes.set_ylim(max(0.0, low - 0.5 * abs(high)), 1.5 * high)
+    margin = 0.5 * max(abs(low), abs(high))
+    axes.set_ylim(low - margin if low < 0 else max(0.0, low - margin), high + margin)
     margin = 0.15 * (re.max() - re.min()) + 0.05 * re.max()
     axes.set_xlim(max(0.0, re.min() - margin), re.max() + margin)
     return axes

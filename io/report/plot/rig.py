@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from typing import Any, Literal
+from zipfile import BadZipFile
 
 import numpy as np
 import pandas as pd
@@ -41,7 +42,7 @@ def residuals(
         magnified = 0.05 * float(np.ptp(u) or 1.0) / typical if typical > 0 else 1.0
         magnified = 10.0 ** np.floor(np.log10(magnified)) if magnified > 0 else 1.0
     axes = _image(
-        axes_of(axes, title=f"{no_formula(camera)}, arrows {magnified:,.0f} times as long")
+        axes_of(axes, title=f"{no_formula(camera)}, arrows {magnified:,g} times as long")
     )
     axes.quiver(u, v, magnified * du, magnified * dv, angles="xy", scale_units="xy", scale=1,
                 color=COLOURS[0], width=0.003)  # fmt: skip
@@ -149,6 +150,6 @@ def _npz(path: str | PathLike[str]) -> dict[str, Array]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, TypeError, BadZipFile) as error:
         what = f"cannot be read: {error}"
         raise InputError(what, where=str(path), todo="give uncertainty.npz") from error

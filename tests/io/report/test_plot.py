@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -79,6 +80,9 @@ def test_velocities_lie_on_the_law_that_made_them() -> None:
 
 def test_drag_of_bubbles_and_of_frames() -> None:
     axes = telerig.plot.drag(summary(), WATER)
+    low, high = telerig.plot.drag(summary(3).assign(drag=[-0.2, -0.1, 0.6]), WATER).get_ylim()
+    assert low < -0.2 and high > 0.6
+    assert telerig.plot.drag(summary(3).assign(drag=-0.2)).get_ylim()[1] > -0.2
     law = next(line for line in axes.get_lines() if line.get_label() == "Mendelson 1967")
     re, drag = law.get_data()
     at = np.nanargmin(np.abs(re - summary()["reynolds"][2]))
@@ -112,7 +116,7 @@ def test_spectra_peak_where_the_bubble_swings() -> None:
         telerig.plot.spectra(frames(20))
 
 
-def test_pictures_of_the_rig(tmp_path: object) -> None:
+def test_pictures_of_the_rig(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     dots = pd.DataFrame(rng.uniform(0, 500, (40, 2)), columns=["u_px", "v_px"])
     dots[["du_px", "dv_px"]] = 0.01 * rng.standard_normal((40, 2))
@@ -135,6 +139,15 @@ def test_pictures_of_the_rig(tmp_path: object) -> None:
         telerig.plot.uncertainty(arrays, "measurement")
     with pytest.raises(InputError, match="cannot be read"):
         telerig.plot.uncertainty("/nowhere/uncertainty.npz")
+    for content in (b"", b"PK\x03\x04 cut", b"\x93NUMPY\x01\x00"):
+        (tmp_path / "cut.npz").write_bytes(content)
+        with pytest.raises(InputError, match="cannot be read"):
+            telerig.plot.uncertainty(tmp_path / "cut.npz")
+    np.save(tmp_path / "one.npy", grid)
+    with pytest.raises(InputError, match="cannot be read"):
+        telerig.plot.uncertainty(tmp_path / "one.npy")
+    far = telerig.plot.residuals(dots.assign(du_px=300.0), "left")
+    assert far.get_title() == "left, arrows 0.01 times as long"
 
 
 def test_shake_has_one_sign() -> None:

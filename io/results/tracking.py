@@ -36,8 +36,9 @@ class Pairs(Part):
 
     bias_px : the systematic part of the ray miss: a constant, or the coefficients of a polynomial
         in the position whose first one is the constant.
-    rms_px : four RMS values of the ray misses: as they are; minus the constant; minus the whole
-        systematic part; and minus the systematic part that all other pairs give.
+    rms_px : four RMS values of the ray misses, each less the shift that the pairs of its frame
+        share: as they are; minus the constant; minus the whole systematic part; and minus the
+        systematic part that all other pairs give.
     scatter_px : standard deviation of the scatter of single pairs beyond the noise of their
         detections.
     frame_px : RMS of the shift that all pairs of a frame share, for example because of shake.

@@ -388,8 +388,8 @@ class PairModel:
     span_px : length of the shared coordinate that both images cover.
     pairs : number of pairs from which it was learnt (a sum of probabilities); 0 if not learnt.
     mean_gap_px : mean of the pairs' gaps and its standard error.
-    rms_px : RMS of the gaps: as they are; without the constant; without the whole bias; and
-        without a bias that is fitted without the pair itself.
+    rms_px : RMS of the gaps, less the shift of their frame: as they are; without the constant;
+        without the whole bias; and without a bias that is fitted without the pair itself.
     findings : what the user should know.
     """
 
@@ -469,8 +469,8 @@ class PairModel:
         }
         return [
             f"The run gives {self.pairs:.1f} pairs. The two rays of a pair miss each other by "
-            f"{raw:.2f} px RMS along the axis that the cameras share, on average by "
-            f"{offset:+.2f} ± {error:.2f} px.",
+            f"{raw:.2f} px RMS along the axis that the cameras share, less what all pairs of a frame "
+            f"have in common, and on average by {offset:+.2f} ± {error:.2f} px.",
             *(text for finding, text in texts.items() if finding in {*self.findings} - {*without}),
         ]
 

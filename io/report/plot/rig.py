@@ -41,9 +41,7 @@ def residuals(
     if magnified is None:
         magnified = 0.05 * float(np.ptp(u) or 1.0) / typical if typical > 0 else 1.0
         magnified = 10.0 ** np.floor(np.log10(magnified)) if magnified > 0 else 1.0
-    axes = _image(
-        axes_of(axes, title=f"{no_formula(camera)}, arrows {magnified:,g} times as long")
-    )
+    axes = _image(axes_of(axes, title=f"{no_formula(camera)}, arrows {magnified:,g} times as long"))
     axes.quiver(u, v, magnified * du, magnified * dv, angles="xy", scale_units="xy", scale=1,
                 color=COLOURS[0], width=0.003)  # fmt: skip
     return axes

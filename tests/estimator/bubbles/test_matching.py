@@ -176,6 +176,7 @@ def test_one_bubble_is_matched_and_its_bias_not_oversold() -> None:
     tables = [table(c.project(np.array([[1.0, 2.0, 3.0]]))) for c in cameras]
     model = estimate_pair_model([(tables[0], tables[1])], cameras)
     assert Finding.FEW_PAIRS in model.findings
+    assert "less what all pairs of a frame have in common" in model.sentences()[0]
     assert len(match_pairs(tables[0], tables[1], cameras, model)) == 1
 
 

@@ -188,6 +188,13 @@ def test_an_offset_that_varies_is_not_a_list_of_offsets(folder: Path) -> None:
     assert pair_rows(results)[0][1] == f"0.800 {where}"
 
 
+def test_scatter_without_the_shake_is_not_called_the_scatter(folder: Path) -> None:
+    _edit(folder, pairs={"bias_px": [0.0], "frame_px": 1.4, "rms_px": [0.04, 0.03, 0.03, 0.03]})
+    rows = dict(pair_rows(read_track_results(folder)))
+    assert rows["RMS without the shift common to a frame, px"] == "0.0400"
+    assert rows["shift common to a frame, px"] == "1.40"
+
+
 def test_one_frame_lasts_no_time(results: TrackResults) -> None:
     picture = time_series(replace(results, tracks=results.tracks.iloc[:1]), 0)
     assert picture.caption.startswith("0 s, a colour per track")

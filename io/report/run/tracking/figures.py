@@ -39,7 +39,7 @@ def time_series(results: TrackResults, axis: int) -> Picture:
     """Draw one rig coordinate of every track against time, reversed if it points down."""
     table = thinned(results.tracks, _MOST_POINTS)
     name, upwards = "xyz"[axis], float(results.up[axis])
-    with drawing(2.6, grid=True, xlabel="t / s", ylabel=f"{name} / mm") as sheet:
+    with drawing(2.6, grid=True, xlabel="t / s", ylabel=f"rig {name} / mm") as sheet:
         place = table[f"{name}_mm"].to_numpy(float)
         draw_tracks(sheet, table["t_s"].to_numpy(float), place, table)
         if upwards < -0.5:

@@ -199,7 +199,10 @@ def pair_rows(results: TrackResults) -> list[tuple[str, str]]:
     pairs = results.file.pairs
     if pairs is None:
         return []
-    stages = ("as it is", "after a constant", "after the whole bias", "for pairs left out of it")
+    stages = (
+        "without the shift common to a frame", "after a constant", "after the whole bias",
+        "for pairs left out of it",
+    )  # fmt: skip
     offset, varies = _offset(pairs.bias_px)
     rows = [("offset perpendicular to both optical axes, px", number(offset) + varies)]
     rows += [("scatter of a pair, px", number(pairs.scatter_px))]

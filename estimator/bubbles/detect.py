@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools
 from telerig.estimator.bubbles.field import lit_field
 from telerig.estimator.bubbles.flat_field import (
+    LEAST_BRIGHTNESS,
+    brightness,
+    checked_background,
     checked_image,
     normalised,
     nothing_to_see,
@@ -118,8 +121,9 @@ def detect_bubbles(
     """Find all bubbles in a backlit grey image.
 
     image : (rows, columns) grey levels.
-    background : (rows, columns) grey levels of the lit screen without bubbles; None estimates them
-        from the image itself, of which a dark surround of the screen is then left out.
+    background : (rows, columns) grey levels of the lit screen without bubbles; its brightness is
+        fitted to that of the image. None estimates them from the image itself, of which a dark
+        surround of the screen is then left out.
     min_diameter_px : least equivalent diameter of a bubble, in px; at least 4.
     min_contrast : least depth of a bubble's shadow, as a share of the background.
     everywhere : for crowds of bubbles, see :func:`find_bubbles`.
@@ -165,11 +169,18 @@ def find_bubbles(
     reason = nothing_to_see(image)
     if reason:
         return _bubbles({}, [], np.nan, reason)
-    if field is None and background is None:
+    if background is not None:
+        background = checked_background(background, image.shape)
+        gain = brightness(image, background, field)
+        if not gain > LEAST_BRIGHTNESS:
+            return _bubbles({}, [], np.nan, f"the screen has {gain:.0%} of its usual brightness")
+        background = background * np.float32(gain)
+    elif field is None:
         field = lit_field(image)
     if field is not None:
         background = screen_of_field(image, field) if background is None else background
-        image = np.where(field, image, background).astype(image.dtype, copy=False)
+        outside = np.minimum(background, image.max())
+        image = np.where(field, image, outside).astype(image.dtype, copy=False)
     looked_at = max(image.size if field is None else np.count_nonzero(field), 1)
     search = partial(_found, image, background, field, min_diameter_px, min_contrast)
     found = search(everywhere, everywhere)

@@ -18,6 +18,10 @@ _WHITE_SHARE = 0.98
 _SHRINK = 8
 _SCREEN_PASSES = 3
 _OUTSIDE, _LEAST_LEVEL = 0.3, 0.2
+_EVERY_PX = 4
+_LIT_SHARE, _BRIGHTEST = 0.6, 0.95
+LEAST_BRIGHTNESS = 0.25
+"""Brightness relative to the background below which an image counts as dark."""
 
 
 def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: float) -> NDArray[Any]:
@@ -32,6 +36,24 @@ def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: flo
             f"must lie in 0.05 .. 1, not {min_contrast}", where="min_contrast", todo="try 0.3"
         )
     return image
+
+
+def checked_background(background: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return the background as an array. Raises InputError if it cannot divide such an image."""
+    screen = np.asarray(background)
+    if screen.shape != shape:
+        raise InputError(
+            f"shape {screen.shape} differs from the image's {shape}",
+            where="background",
+            todo="estimate the background from images of this camera",
+        )
+    if not float(screen.min()) > 0.0:
+        raise InputError(
+            "has pixels that are not positive",
+            where="background",
+            todo="give the level of the lit screen at every pixel",
+        )
+    return screen
 
 
 def nothing_to_see(image: NDArray[Any]) -> str:
@@ -59,21 +81,8 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
         screen = screen_level(image.astype(np.float32, copy=False))
         lowest = float(screen.min())
     else:
-        screen = np.asarray(background)
-        if screen.shape != image.shape:
-            raise InputError(
-                f"shape {screen.shape} differs from the image's {image.shape}",
-                where="background",
-                todo="estimate the background from images of this camera",
-            )
-        screen = screen.astype(np.float32, copy=False)
+        screen = background.astype(np.float32, copy=False)
         lowest = float(screen.min())
-        if not lowest > 0.0:
-            raise InputError(
-                "has pixels that are not positive",
-                where="background",
-                todo="give the level of the lit screen at every pixel",
-            )
     floor = 1e-6 * float(image.max()) + 1e-12
     if lowest < floor:
         screen = np.maximum(screen, floor)
@@ -85,6 +94,24 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
         and sample.max() >= _WHITE_SHARE * _full_scale(image)
     )
     return ratio, clipped
+
+
+def brightness(image: NDArray[Any], background: NDArray[Any], field: Bools | None) -> float:
+    """Return how bright the lit screen of an image is, relative to its background.
+
+    It is the median over the pixels that are nearly as bright as the brightest ones, so that
+    bubbles may cover most of the screen. Pixels outside the field (rows, columns), and those where
+    the background is dark, do not count.
+    """
+    some = (slice(None, None, _EVERY_PX),) * 2
+    screen = np.asarray(background[some], np.float32)
+    lit = screen >= _LIT_SHARE * np.quantile(screen, _BRIGHTEST)
+    if field is not None and field[some].any():
+        lit &= field[some]
+    ratio = image[some][lit] / screen[lit]
+    if not ratio.size:
+        return 1.0
+    return float(np.median(ratio[ratio >= _LIT_SHARE * np.quantile(ratio, _BRIGHTEST)]))
 
 
 def _divisible(image: NDArray[Any]) -> NDArray[Any]:

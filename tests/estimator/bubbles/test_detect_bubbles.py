@@ -234,3 +234,35 @@ def test_clipped_screen_is_flagged() -> None:
 def test_bad_input_is_refused(image: NDArray[np.generic], options: dict[str, object]) -> None:
     with pytest.raises(InputError):
         detect_bubbles(image, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.8, 1.3])
+def test_light_that_differs_from_the_background_changes_no_outline(gain: float) -> None:
+    drawn = [Drawn((30.3, 40.2, 18.0, 13.0, 0.4)), Drawn((85.1, 33.0, 11.0, 11.0, 0.0))]
+    image = draw(drawn, (80, 120), blur_px=1.2)
+    usual, other = (
+        detect_bubbles(
+            digitised(light * image, noise=0.005), background=level(image.shape)
+        ).sort_values("u_px")
+        for light in (1.0, gain)
+    )
+    assert len(other) == len(drawn)
+    assert other["d_eq_px"].to_numpy() == pytest.approx(usual["d_eq_px"].to_numpy(), rel=0.003)
+
+
+def test_image_without_light_says_so() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 40, (80, 120)).astype(np.uint16)
+    found = find_bubbles(image, background=level(image.shape))
+    assert found.accepted.empty
+    assert "usual brightness" in found.reason
+    assert found.rejected.empty
+
+
+def test_background_brighter_than_white_makes_no_bubble_outside_the_field() -> None:
+    image = digitised(np.ones((80, 120)), noise=0.005, white=250.0).clip(0, 255).astype(np.uint8)
+    background = level(image.shape, 250.0)
+    background[30:50, 70:90] = 256.4
+    field = np.zeros(image.shape, bool)
+    field[:, :60] = True
+    assert find_bubbles(image, background=background, field=field).accepted.empty

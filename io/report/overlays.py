@@ -216,7 +216,7 @@ def draw_line(picture: Picture, points: Array, colour: Colour, *, closed: bool) 
 def write_label(
     picture: Picture, label: str, centre: Array, colour: Colour, taken: Bools | None = None
 ) -> bool:
-    """Write text round a point, with a dark rim; return whether there was room among ``taken``."""
+    """Write text round a point, with a rim; return whether there was room among ``taken``."""
     import cv2
 
     (width, height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, 1)
@@ -227,7 +227,7 @@ def write_label(
         if taken[place].any():
             return False
         taken[place] = True
-    for shade, thickness in ((INK, 2), (colour, 1)):
+    for shade, thickness in ((PAPER if colour == INK else INK, 2), (colour, 1)):
         cv2.putText(
             picture, label, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _SCALE, shade, thickness, cv2.LINE_AA
         )

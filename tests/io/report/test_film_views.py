@@ -27,6 +27,7 @@ from telerig.io.report.film.views import (
     view_frames,
     write_views_film,
 )
+from telerig.io.report.overlays import INK, write_label
 from telerig.io.report.run.tracking.results import read_track_results
 
 
@@ -129,3 +130,11 @@ def test_outline_is_the_documented_curve() -> None:
     np.testing.assert_allclose(bumpy[0], [10, 28.75], atol=1e-12)
     assert np.linalg.norm(turned[6] - plain[6]) == pytest.approx(1.0)
     np.testing.assert_allclose(np.linalg.norm(bare - [10, 20], axis=1), 6.0)
+
+
+def test_dark_words_on_paper_have_no_dark_rim() -> None:
+    written = np.full((30, 200, 3), 255, np.uint8)
+    assert write_label(written, "frame 30, 0.300 s", np.array([100.0, 15.0]), INK)
+    inside = written.min(axis=2) < 128
+    rows, columns = np.nonzero(inside)
+    assert 0.1 < inside[rows.min() : rows.max(), columns.min() : columns.max()].mean() < 0.35

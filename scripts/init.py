@@ -38,7 +38,10 @@ def init(
     ] = None,
     pitch: Annotated[
         float | None,
-        typer.Option(help="With --from-images: distance of neighbouring dots in mm [by --scale]."),
+        typer.Option(
+            help="With --from-images: distance of neighbouring dots in mm, along the lines with "
+            "more dots [by --scale]."
+        ),
     ] = None,
 ) -> None:
     """Make the folders of a dataset and a commented rig.toml.

@@ -49,8 +49,8 @@ def target_from_images(
     """Describe the target that images in a folder, or in one folder for each camera, show.
 
     pitch_mm : the known distance of neighbouring dots (along x). scale_px_per_mm : nominal scale of
-    the first camera, used where no pitch is given. Raises InputError if there are no images,
-    DetectionError if none shows a grid of dots.
+    the first camera, used where no pitch is given. Raises InputError if there are no images
+    or if those of a camera differ in size, DetectionError if none shows a grid of dots.
     """
     found, failures = [], []
     for name, images in _images_by_camera(folder).items():
@@ -65,15 +65,24 @@ def target_from_images(
             except DetectionError as error:
                 failures.append(f"{path}: {error.what}")
                 continue
-            found.append((name, image.shape[1::-1], measured.polarity, seen))
+            found.append((name, image.shape[1::-1], path, measured.polarity, seen))
     if not found:
         what = f"no image shows a grid of dots; the first: {failures[0]}"
         todo = "give images in which at least 6 whole, sharp dots of the grid are seen"
         raise DetectionError(what, where=str(folder), todo=todo)
+    _refuse_sizes([(name, size) for name, size, *_ in found], folder)
     polarity = Counter(p for *_, p, _ in found).most_common(1)[0][0]
-    found = [one for one in found if one[2] == polarity]
+    failures += [
+        f"{path}: its dots are {p.replace('_', ' ')}, unlike those of most images; it is not used"
+        for *_, path, p, _ in found if p != polarity
+    ]  # fmt: skip
+    found = [one for one in found if one[3] == polarity]
     hexagonal = 2 * sum(isinstance(seen, SeenHexagon) for *_, seen in found) > len(found)
-    found = [one for one in found if isinstance(one[3], SeenHexagon) == hexagonal]
+    failures += [
+        f"{path}: its grid is of another kind than in most images; it is not used"
+        for *_, path, _, seen in found if isinstance(seen, SeenHexagon) != hexagonal
+    ]  # fmt: skip
+    found = [one for one in found if isinstance(one[4], SeenHexagon) == hexagonal]
     hexagons = [seen for *_, seen in found if isinstance(seen, SeenHexagon)]
     grids = [seen for *_, seen in found if isinstance(seen, SeenTarget)]
     agreed = agreed_hexagon(hexagons) if hexagonal else agreed_target(grids)
@@ -88,10 +97,23 @@ def target_from_images(
     dot_mm = pitch_mm / agreed.pitch[0]
     sizes = {n: (int(w), int(h)) for n, (w, h), *_ in found}
     cameras = tuple((n, sizes[n], round(d / dot_mm, 4)) for n, d in diameter_px.items())
-    words = _words(agreed, polarity, len(found), pitch_px)
+    words = _words(agreed, polarity, len(found), diameter_px[first], pitch_px)
     return TargetProposal(
         cameras, pitch_px, _lines(agreed, polarity, pitch_mm), (*words, *failures)
     )
+
+
+def _refuse_sizes(sizes: Sequence[tuple[str, tuple[int, ...]]], folder: Path) -> None:
+    """Raise InputError if images of one camera (its name, and their size) differ in size."""
+    first = dict(reversed(sizes))
+    for name, size in sizes:
+        if size != first[name]:
+            known, other = (f"{w}x{h}" for w, h in (first[name], size))
+            raise InputError(
+                f"images of camera {name} have different sizes, {known} and {other} px",
+                where=str(folder),
+                todo="give images of one camera, or one folder for each camera",
+            )
 
 
 def _images_by_camera(folder: Path) -> dict[str, list[Path]]:
@@ -134,9 +156,13 @@ def _lines(seen: SeenTarget | SeenHexagon, polarity: Polarity, pitch_mm: float) 
 
 
 def _words(
-    seen: SeenTarget | SeenHexagon, polarity: Polarity, images: int, pitch_px: float
+    seen: SeenTarget | SeenHexagon,
+    polarity: Polarity,
+    images: int,
+    diameter_px: float,
+    pitch_px: float,
 ) -> Sequence[str]:
-    """Return what was found as sentences."""
+    """Return what was found as sentences. diameter_px, pitch_px : in the first camera."""
     kind, size = "a hexagonal grid", f"of {len(getattr(seen, 'points', ()))} dots"
     if isinstance(seen, SeenTarget):
         kind, size = "a grid", f"{seen.rows} rows, {seen.columns} columns"
@@ -144,7 +170,7 @@ def _words(
     marks = f"{len(seen.marks)} marks of the style {seen.mark_style}" if seen.marks else "no marks"
     words = [
         f"{images} images show {whole} {size}, "
-        f"{polarity.replace('_', ' ')}, {marks}, dots {seen.diameter_px:.1f} px across, "
+        f"{polarity.replace('_', ' ')}, {marks}, dots {diameter_px:.1f} px across, "
         f"{pitch_px:.1f} px apart"
     ]
     if isinstance(seen, SeenHexagon) and not seen.whole:

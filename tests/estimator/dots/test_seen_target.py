@@ -118,6 +118,25 @@ def test_folders_without_a_target(tmp_path: Path) -> None:
         target_from_images(tmp_path, pitch_mm=None, scale_px_per_mm=1.0)
 
 
+def test_images_that_disagree_are_named(tmp_path: Path) -> None:
+    image = views(PLATE)[0]
+    for camera, picture in (
+        ("left", image), ("right", np.repeat(np.repeat(image, 2, 0), 2, 1)), ("top", 255 - image),
+    ):  # fmt: skip
+        (tmp_path / camera).mkdir()
+        cv2.imwrite(str(tmp_path / camera / "a.png"), picture)
+    seen = target_from_images(tmp_path, pitch_mm=7.0, scale_px_per_mm=1.0)
+    assert [name for name, *_ in seen.cameras] == ["left", "right"]
+    assert any("top/a.png: its dots are" in words for words in seen.words)
+    alone = target_from_images(tmp_path / "left", pitch_mm=7.0, scale_px_per_mm=1.0)
+    across = alone.words[0].split(", dots ")[1]
+    assert across.split(" px")[0] in seen.words[0]
+
+    cv2.imwrite(str(tmp_path / "left" / "b.png"), np.repeat(np.repeat(image, 2, 0), 2, 1))
+    with pytest.raises(InputError, match="images of camera left have different sizes"):
+        target_from_images(tmp_path, pitch_mm=7.0, scale_px_per_mm=1.0)
+
+
 @pytest.mark.parametrize("style", ["ring", "large", "missing", None])
 def test_the_description_of_a_hexagonal_plate_numbers_its_images(
     tmp_path: Path, style: Any

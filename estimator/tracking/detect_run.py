@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background import methods
+from telerig.estimator.bubbles.background.from_run import LEAST_FRAMES
 from telerig.estimator.bubbles.detect import find_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.field import described_field
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
@@ -153,16 +154,16 @@ def lab_shift_px(
     """Return the travel of the rig since the first frame as (F, 2) in px of a camera.
 
     An object at rest in the laboratory that is seen at pixel p in the first frame is later seen at
-    p minus this shift. It is computed for the middle of the image at depth 0, and is 0 in frames
-    without a stage position.
+    p minus this shift. It is computed for the middle of the image at depth 0, and is NaN in frames
+    without a stage position; 0 if too few frames have one for a background.
 
     axis_rig : (3,) unit vector of the travel in the rig frame.
     position_mm : (F,) encoder positions, NaN where missing; None without an encoder.
     """
-    if position_mm is None:
+    known = [] if position_mm is None else position_mm[np.isfinite(position_mm)]
+    if position_mm is None or len(known) < LEAST_FRAMES:
         return np.zeros((frame_count, 2))
-    travelled = position_mm - position_mm[np.isfinite(position_mm)][:1].sum()
-    moved = np.where(np.isfinite(travelled), travelled, 0.0)[:, None] * axis_rig
+    moved = (position_mm - known[0])[:, None] * axis_rig
     width, height = camera.image_size_px
     origin, _ = camera.unproject(np.array([(width - 1) / 2, (height - 1) / 2]))
     return np.asarray(camera.project(origin + moved) - camera.project(origin))

@@ -343,3 +343,15 @@ def test_where_bubbles_are_looked_for_is_read_and_written(rise: Path, tmp_path: 
         with pytest.raises(InputError) as caught:
             read_rig_toml(file)
         assert words in str(caught.value) and str(caught.value).count("[bubbles") == 1
+
+
+def test_frames_outside_the_encoders_record_do_not_blur_the_background() -> None:
+    camera = truth_calibration().cameras[0]
+    axis = np.array([0.0, -1.0, 0.0])
+    position = np.append(np.linspace(5.0, 9.0, 6), [np.nan, np.nan])
+    shift = detect_run.lab_shift_px(camera, axis, position, len(position))
+    scale = camera["scale_px_per_mm"]
+    assert np.abs(shift[5]).max() == pytest.approx(4.0 * scale, rel=0.01)
+    assert np.isnan(shift[6:]).all()
+    position[2:] = np.nan
+    assert not detect_run.lab_shift_px(camera, axis, position, len(position)).any()

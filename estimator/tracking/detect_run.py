@@ -160,10 +160,10 @@ def lab_shift_px(
     axis_rig : (3,) unit vector of the travel in the rig frame.
     position_mm : (F,) encoder positions, NaN where missing; None without an encoder.
     """
-    known = [] if position_mm is None else position_mm[np.isfinite(position_mm)]
-    if position_mm is None or len(known) < LEAST_FRAMES:
+    if position_mm is None or np.isfinite(position_mm).sum() < LEAST_FRAMES:
         return np.zeros((frame_count, 2))
-    moved = (position_mm - known[0])[:, None] * axis_rig
+    start = position_mm[np.isfinite(position_mm)][0]
+    moved = (position_mm - start)[:, None] * axis_rig
     width, height = camera.image_size_px
     origin, _ = camera.unproject(np.array([(width - 1) / 2, (height - 1) / 2]))
     return np.asarray(camera.project(origin + moved) - camera.project(origin))

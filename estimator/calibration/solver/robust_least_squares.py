@@ -193,10 +193,21 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float
 
 
 def dof_per_row(problem: Problem) -> float:
-    """Return the approximate number of degrees of freedom per measured coordinate."""
-    rows = int(2 * np.sum(problem.kept))
-    used = sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1)
-    used += 6 * len(problem.views) + 3 * len(problem.dot_ids)
+    """Return the approximate number of degrees of freedom per measured coordinate.
+
+    A coordinate of a dot counts as the share of it that the images, and not its prior, determine.
+    """
+    kept = problem.kept
+    rows = int(2 * np.sum(kept))
+    used = float(sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1))
+    used += 6 * len(problem.views)
+    # an image of a target of any tilt shows two of three directions in space
+    scale = np.array([c["scale_px_per_mm"] for c in problem.cameras])[problem.camera]
+    variance = np.trace(problem.covariance_px2, axis1=1, axis2=2) / 2
+    shown = 2 / 3 * scale**2 / variance
+    information = np.bincount(problem.dot[kept], shown[kept], len(problem.dot_ids))
+    gain = information[:, None] * problem.dot_sigma_mm**2
+    used += float(np.sum(gain / (1 + gain)))
     return float(max(0.3, 1 - used / max(rows, 1)))
 
 

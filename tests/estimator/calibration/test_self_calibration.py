@@ -12,6 +12,7 @@ import pytest
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.calibrate import nominal_cameras
 from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.io.simulation.presets import preset
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
 
@@ -306,3 +307,21 @@ def test_outliers_leave_no_trace_in_the_dots_eccentricity(scene: Any) -> None:
             key = f"{camera}.{name}"
             pair = [next(c for c in k.cameras if c.name == camera)[name] for k in (found, expected)]
             assert abs(pair[0] - pair[1]) < 0.2 * expected.sd(key), key
+
+
+@pytest.mark.parametrize("more_px", [0.0, 0.015])
+def test_noise_floor_with_dots_that_are_well_known(scene: Any, more_px: float) -> None:
+    """A dot whose prior fixes it takes no degrees of freedom from the images."""
+    paper = preset("paper")
+    target = replace(
+        paper.target, rows=16, columns=16, pitch_mm=(2.0, 2.0), dot_diameter_mm=1.0,
+        mark_diameter_mm=1.4, print_sigma_mm=1e-4, flatness_sigma_mm=1e-4, scale_dots=None,
+        scale_distance_mm=None,
+    )  # fmt: skip
+    made = scene("paper", 0, target=target, views=8, cameras=paper.cameras[:1])
+    noise = more_px * np.random.default_rng(0).standard_normal((len(made.dots), 2))
+    made.dots[["u_px", "v_px"]] += noise
+    calibration = made.calibrate("radial")
+    assert calibration.statistics["noise_floor_px"] == pytest.approx(more_px, rel=0.05)
+    assert calibration.statistics["chi2_dof"] == pytest.approx(1, abs=0.06)
+    assert calibration.verdict["status"] == "GOOD" or more_px

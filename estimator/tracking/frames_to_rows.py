@@ -257,9 +257,10 @@ class RowMaker:
         table |= dict(zip((f"silhouettes_{x}_mm" for x in "xyz"), bodies.silhouette_points_mm.T))
         ambiguous = np.concatenate([f.pairs.ambiguous for f in frames])
         words = zip(flag_words(first), flag_words(second), ambiguous)
-        table["flags"] = [
+        texts = [
             "|".join(sorted({*a, *b, *(["ambiguous"] if unsure else [])})) for a, b, unsure in words
         ]
+        table["flags"] = pd.Series(texts, dtype=str)  # text also where there is no pair
         found = pd.DataFrame(table)
         return found[found["particle"] != NO_PARTICLE].reset_index(drop=True)
 

@@ -215,6 +215,24 @@ def test_a_crowded_run_is_warned_about(rise: Path, whole: Tracks) -> None:
         assert len(said) == count
 
 
+def test_bubbles_after_a_long_time_without_any(rise: Path, whole: Tracks, tmp_path: Path) -> None:
+    before = 700
+    late = whole.detections.assign(frame=whole.detections["frame"] + before, particle="")
+    count = before + FRAMES
+    summary = tracked(
+        rise, tmp_path / "late", detections=late, source="detections", frame_count=count,
+        t_s=np.arange(count) / 100.0, position_mm=None,
+    )  # fmt: skip
+    assert (summary["points"], summary["tracks"]) == (FRAMES, 1)
+
+
+def test_a_run_that_one_camera_sees_is_written(rise: Path, whole: Tracks, tmp_path: Path) -> None:
+    left = whole.detections[whole.detections["camera"] == "left"].assign(particle="")
+    summary = tracked(rise, tmp_path / "left", detections=left, source="detections")
+    assert (summary["points"], summary["detections_without_partner_or_track"]) == (0, FRAMES)
+    assert "No frame has detections in both cameras" in summary["pairs"]["words"][0]
+
+
 def test_a_run_without_any_bubble_says_so(rise: Path) -> None:
     run = telerig.load_run(rise / "runs" / "rise")
     table = pd.DataFrame({"frame": [0], "camera": ["left"], "u_px": [np.nan], "v_px": [np.nan]})

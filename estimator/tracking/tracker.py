@@ -479,8 +479,8 @@ class Tracker:
             self.stage.step(position_mm, t_s, 0.0)
             return None
         step, control, found = self._motion(self.stage, t_s, position_mm)
-        self.common = self.common.predicted(step)
         every = self._every()
+        self.common = self.common.predicted(step) if every else Common()
         if found.any():
             for track in every:
                 track.filter.x = track.filter.x + np.pad(found, (3, STATES - 6))

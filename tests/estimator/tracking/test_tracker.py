@@ -241,3 +241,11 @@ def test_bad_input_is_refused_in_words() -> None:
         TrackerSettings(confirm_hits=5)
     with pytest.raises(InputError, match="axis_rig"):
         Tracker(axis_rig=(0, 0, 0))
+
+
+def test_a_speck_after_a_long_time_without_bubbles_begins_no_track() -> None:
+    """What bubbles have in common is as well known as ever when the next ones come."""
+    speck, bubble = [[0.0, 0.0, 0.0]], [[3.0, 20.0, 0.0]]
+    frames = [[] for _ in range(300)] + [speck] + [bubble] * 6
+    ids, _ = run(Tracker(), frames, stage=np.full(len(frames), np.nan))
+    assert [i.tolist() for i in ids[300:]] == [[-1], *[[0]] * 6]

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 
 MODEL_FRAMES = 60
-"""Frames spread over the run from which the pair model is learnt."""
+"""Frames spread over those with bubbles, from which the pair model is learnt."""
 
 _RELIABLE = 0.99
 _FRAMES_AT_ONCE = 64
@@ -288,7 +288,7 @@ def tracking_stream(
     without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
     if stage is not None:
         stage("pair model", 0, 0)
-    sample = _sample(run, cameras, batches())
+    sample = _sample(cameras, batches)
     model = estimate_pair_model(sample, cameras)
     tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
     linker = RowMaker(cameras, model, tracker, _shape_sigma(sample, cameras, model))
@@ -413,15 +413,22 @@ def _split(table: pd.DataFrame, cameras: tuple[Camera, Camera]) -> dict[int, Tab
 
 
 def _sample(
-    run: RunData, cameras: tuple[Camera, Camera], batches: Iterator[pd.DataFrame]
+    cameras: tuple[Camera, Camera], batches: Callable[[], Iterator[pd.DataFrame]]
 ) -> list[Tables]:
-    """Return the detections of `MODEL_FRAMES` frames."""
-    frames = np.linspace(0, run.frame_count - 1, MODEL_FRAMES).astype(int)
+    """Return the detections of `MODEL_FRAMES` of the frames in which both cameras see bubbles."""
+    both = np.concatenate([np.zeros(0, np.int64), *map(_seen_by_both, batches())])
+    frames = both[np.linspace(0, len(both) - 1, min(len(both), MODEL_FRAMES)).astype(int)]
     return [
         tables
-        for batch in batches
+        for batch in batches()
         for tables in _split(batch[batch["frame"].isin(frames)], cameras).values()
     ]
+
+
+def _seen_by_both(batch: pd.DataFrame) -> Ints:
+    """Return the frames of a batch in which both cameras have detections."""
+    cameras = batch[np.isfinite(batch["u_px"].to_numpy(float))].groupby("frame")["camera"].nunique()
+    return np.asarray(cameras.index[cameras == 2], np.int64)
 
 
 def _shape_sigma(

@@ -224,6 +224,7 @@ def test_bubbles_after_a_long_time_without_any(rise: Path, whole: Tracks, tmp_pa
         t_s=np.arange(count) / 100.0, position_mm=None,
     )  # fmt: skip
     assert (summary["points"], summary["tracks"]) == (FRAMES, 1)
+    assert f"The run gives {FRAMES}.0 pairs" in summary["pairs"]["words"][0]
 
 
 def test_a_run_that_one_camera_sees_is_written(rise: Path, whole: Tracks, tmp_path: Path) -> None:

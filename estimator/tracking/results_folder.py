@@ -167,7 +167,7 @@ def _check_ids(detections: pd.DataFrame | FrameTable) -> None:
     names = numbers_of(ids_of(detections))[1]
     if names:
         raise InputError(
-            f"particle {names[0]!r} is no whole number, and the report needs numbers",
+            f"particle {names[0]!r} is no whole number below 1e15, which the report needs",
             where="detections.csv",
             todo="number the bubbles, or track with --no-report",
         )

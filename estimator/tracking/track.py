@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -57,6 +57,9 @@ if TYPE_CHECKING:
 MODEL_FRAMES = 60
 """Frames spread over those with bubbles, from which the pair model is learnt."""
 
+LARGEST_ID = 10**15
+"""Tracks are numbered below it; a larger number is the name of a bubble."""
+
 _RELIABLE = 0.99
 _FRAMES_AT_ONCE = 64
 
@@ -88,6 +91,7 @@ class TrackingStream:
     covered : for each camera, number of detections and the area that they cover (px^2), so far.
     beyond : number of points beyond the dots of the calibration, so far.
     common_mm2 : (3,) sums over the points of the variances by the calibration's errors, so far.
+    names : names of the tracks by number, if the given ids are no whole numbers.
     """
 
     run: RunData
@@ -104,6 +108,7 @@ class TrackingStream:
     common_mm2: Array = field(default_factory=lambda: np.zeros(3))
     particles: set[Any] = field(default_factory=set)
     covered: dict[str, tuple[int, float]] = field(default_factory=dict)
+    names: Mapping[int, str] | None = None
 
     def __post_init__(self) -> None:
         self._pairs = PairCollector(self.calibration)
@@ -111,7 +116,12 @@ class TrackingStream:
     @property
     def events(self) -> list[TrackEvent]:
         """Events of the tracks so far."""
-        return [*self.linker.events, *self.corrections.events]
+        events, names = self.linker.events, self.names
+        if names is not None:
+            events = [
+                replace(e, particles=tuple(_name(p, names) for p in e.particles)) for e in events
+            ]
+        return [*events, *self.corrections.events]
 
     @property
     def rows(self) -> Iterator[Linked]:
@@ -261,7 +271,8 @@ def tracking_stream(
     batches: Callable[[], Iterator[pd.DataFrame]]
     if run.detections is not None:
         numbers, labels = numbers_of(ids_of(run.detections))
-        first_id = max(numbers.values(), default=NO_PARTICLE) + 1
+        taken = [*numbers.values(), *_whole(numbers).values()]  # no new track gets a given name
+        first_id = max(taken, default=NO_PARTICLE) + 1
         batches = partial(_given, run.detections, numbers)
     else:
         inputs = {
@@ -297,7 +308,9 @@ def tracking_stream(
         rows = (_labelled(part, labels) for part in rows)
     corrections = read_corrections(run.path, numbered=labels is None)
     rows = corrections.applied(rows)
-    return TrackingStream(run, calibration, linker, without, scene, marks, rows, corrections)
+    return TrackingStream(
+        run, calibration, linker, without, scene, marks, rows, corrections, names=labels
+    )
 
 
 def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:
@@ -367,14 +380,20 @@ def ids_of(detections: pd.DataFrame | FrameTable) -> set[str]:
     return set(detections["particle"].unique().astype(str)) - {""}
 
 
+def _whole(ids: Iterable[str]) -> dict[str, int]:
+    """Return the numbers of those ids that are whole numbers below `LARGEST_ID`, as 7 for "07"."""
+    found = {text: int(text) for text in ids if text.isascii() and text.isdecimal()}
+    return {text: number for text, number in found.items() if number < LARGEST_ID}
+
+
 def numbers_of(ids: set[str]) -> tuple[dict[str, int], dict[int, str] | None]:
     """Return the number of each given id, and the ids' names by number.
 
-    The names are None if all given ids are whole numbers.
+    The names are None if all given ids are whole numbers below `LARGEST_ID`.
     """
-    given = sorted(ids)
-    if all(text.isascii() and text.isdecimal() and str(int(text)) == text for text in given):
-        return {text: int(text) for text in given}, None
+    given, numbers = sorted(ids), _whole(ids)
+    if all(str(numbers.get(text)) == text for text in given):
+        return numbers, None
     return {text: i for i, text in enumerate(given)}, dict(enumerate(given))
 
 
@@ -389,11 +408,16 @@ def _given(
         yield _complete(part).assign(particle=particle)
 
 
-def _labelled(part: Linked, labels: dict[int, str]) -> Linked:
+def _name(particle: Any, names: Mapping[int, str]) -> str:
+    """Return the given name of a track, or its number as text."""
+    return names.get(int(particle), str(particle))
+
+
+def _labelled(part: Linked, labels: Mapping[int, str]) -> Linked:
     """Replace numbers by the given names."""
 
     def named(particle: pd.Series[Any]) -> list[str]:
-        return ["" if pd.isna(p) else labels.get(int(p), str(p)) for p in particle]
+        return ["" if pd.isna(p) else _name(p, labels) for p in particle]
 
     return Linked(
         part.tracks.assign(particle=named(part.tracks["particle"])),

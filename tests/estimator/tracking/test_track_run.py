@@ -98,6 +98,21 @@ def test_given_ids_pass_through(rise: Path, whole: Tracks) -> None:
         assert set(again.detections["particle"]) == {expected}
 
 
+@pytest.mark.parametrize("name", ["0", "1", "02", "a", str(10**15 + 1), str(10**20)])
+def test_a_new_track_has_no_given_name(rise: Path, whole: Tracks, name: str) -> None:
+    """A named bubble beside one without a name: each is one track, also in the events."""
+    table = whole.detections.drop(columns="particle")
+    beside = table.assign(particle="", v_px=table["v_px"] + 60.0)
+    both = pd.concat([table.assign(particle=name), beside], ignore_index=True)
+    run = replace(telerig.load_run(rise / "runs" / "rise"), detections=both, source="detections")
+    again = telerig.track(run, truth_calibration())
+    tracks = again.table.assign(particle=again.table["particle"].astype(str))
+    assert tracks["particle"].nunique() == 2 and not tracks.duplicated(["frame", "particle"]).any()
+    assert name in set(tracks["particle"])
+    births = again.events[again.events["kind"] == "birth"]
+    assert set(births["particles"]) == set(tracks["particle"])
+
+
 def test_named_bubbles_are_tracked_but_not_reported_nor_smoothed(
     rise: Path, whole: Tracks, tmp_path: Path
 ) -> None:

@@ -171,7 +171,7 @@ class RowMaker:
         predicted = self.tracker.predict(t_s, position_mm)
         sight = self.sights([tables])[0] if sight is None else sight
         pairs, offset_px = pair_frame(sight, self.model, predicted)
-        first, second = (_others(rows, len(table)) for rows, table in zip(pairs.rows.T, tables))
+        first, second = (_others(rows, given) for rows, given in zip(pairs.rows.T, sight.given))
         unpaired = (first, second)
         measured = _measured(pairs, unpaired, sight.pixels, offset_px)
         result = self.tracker.update(number, t_s, measured, position_mm)
@@ -308,9 +308,9 @@ def pair_frame(sight: Sight, model: PairModel, predicted: Prediction | None) -> 
     return pairs, np.median(sight.left_px[chosen], axis=0).reshape(2, 2)
 
 
-def _others(rows: Ints, many: int) -> Ints:
-    """Return the numbers below ``many`` that are not among the rows."""
-    out = np.ones(many, bool)
+def _others(rows: Ints, given: Ints) -> Ints:
+    """Return the rows of detections without a given id that are not among ``rows``."""
+    out = given == NO_PARTICLE
     out[rows] = False
     return np.flatnonzero(out)
 

@@ -98,6 +98,17 @@ def test_given_ids_pass_through(rise: Path, whole: Tracks) -> None:
         assert set(again.detections["particle"]) == {expected}
 
 
+def test_an_id_given_in_one_camera_stays(rise: Path, whole: Tracks) -> None:
+    """A track without a given id passes through a detection that has one and no partner."""
+    table = whole.detections.drop(columns="particle").assign(particle="")
+    one = table["frame"].isin([7, 8]) & (table["camera"] == "left")
+    table.loc[one, "particle"] = "55"
+    table = table[one | ~table["frame"].isin([7, 8])].reset_index(drop=True)
+    run = replace(telerig.load_run(rise / "runs" / "rise"), detections=table, source="detections")
+    again = telerig.track(run, truth_calibration()).detections
+    assert set(again.loc[again["frame"].isin([7, 8]), "particle"]) == {55}
+
+
 @pytest.mark.parametrize("name", ["0", "1", "02", "a", str(10**15 + 1), str(10**20)])
 def test_a_new_track_has_no_given_name(rise: Path, whole: Tracks, name: str) -> None:
     """A named bubble beside one without a name: each is one track, also in the events."""

@@ -291,7 +291,8 @@ def fingerprint(run: RunData, options: dict[str, Any]) -> str:
 
     found = hashlib.sha256(json.dumps([VERSION, options], default=str).encode())
     for folder, folders, names in os.walk(run.path):
-        folders.sort()
+        inputs = folders if Path(folder) != run.path else set(folders) & set(run.cameras)
+        folders[:] = sorted(inputs)  # results may lie in the run's folder, too
         inside = Path(folder).relative_to(run.path)
         for name in sorted(names):
             state = (Path(folder) / name).stat()

@@ -276,14 +276,15 @@ def tracking_stream(
         batches = partial(_given, run.detections, numbers)
     else:
         inputs = {
-            "options": repr(chosen), "cameras": repr(cameras), "frames": str(run.frame_count)
+            "options": repr(chosen), "cameras": repr(cameras), "frames": str(run.frame_count),
+            "axis": repr(axis),
         }  # fmt: skip
         if run.rig is not None and run.rig.bubbles:
             hashes = {name: hash_if_there(file) for name, file in mask_files(run).items()}
             inputs["bubbles"] = repr((run.rig.bubbles, hashes))
         strip = described_strip(run)
         if strip is not None:
-            inputs |= {"references": repr(strip), "axis": repr(axis)}
+            inputs["references"] = repr(strip)
         store = DetectionStore(work, fingerprint(run, inputs), run.frame_count, cores())
         if strip is not None:
             from telerig.estimator.tracking.follow_marks import follow_references

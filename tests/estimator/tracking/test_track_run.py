@@ -171,6 +171,20 @@ def test_an_interrupted_run_goes_on_and_ends_alike(
     assert not list(tmp_path.glob(".*work"))
 
 
+def test_results_inside_the_run_are_no_input(rise: Path, tmp_path: Path) -> None:
+    """A run that belongs to no dataset has its results, and its work folder, inside."""
+    data = tmp_path / "data"
+    shutil.copytree(rise, data)
+    run = telerig.load_run(data / "runs" / "rise")
+    before = detect_run.fingerprint(run, {})
+    work = run.path / ".results.work"
+    work.mkdir()
+    (work / "detections-0000000.csv").write_text("frame\n", encoding="utf-8")
+    assert detect_run.fingerprint(run, {}) == before
+    next((run.path / "left").iterdir()).unlink()
+    assert detect_run.fingerprint(run, {}) != before
+
+
 def test_other_options_do_not_take_up_old_detections(rise: Path, tmp_path: Path) -> None:
     store = detect_run.DetectionStore(tmp_path / "work", "one", 20, 1)
     store.path(store.batches[0]).write_text("frame\n", encoding="utf-8")

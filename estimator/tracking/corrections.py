@@ -20,6 +20,7 @@ from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.io.files.csv_table import Column, read_table
 
 FILE = "corrections.csv"
+_ONCE = ["frame", "particle", "camera"]
 ACTIONS = ("drop", "join", "split", "rename")
 _COLUMNS = [
     Column("action", "text"),
@@ -54,11 +55,13 @@ class Corrections:
     """Apply corrections to the rows of a run, and keep what was done.
 
     used : by correction, the first frame and time in which it changed something.
+    kept : the joins whose staying track was found.
     """
 
     file: Path
     corrections: tuple[Correction, ...] = ()
     used: dict[Correction, tuple[int, float]] = field(default_factory=dict)
+    kept: set[Correction] = field(default_factory=set)
 
     @property
     def events(self) -> list[TrackEvent]:
@@ -71,8 +74,14 @@ class Corrections:
 
     @property
     def warnings(self) -> list[str]:
-        """Return a sentence for each correction that changed nothing."""
-        return [
+        """Return a sentence for each correction that changed nothing, or joined nothing."""
+        alone = [
+            f"{FILE} row {c.row}: join only renamed track {c.other}: there is no track {c.particle} "
+            "to join it with. Check the row"
+            for c in self.used
+            if c.action == "join" and c not in self.kept
+        ]
+        return alone + [
             f"{FILE} row {c.row}: {c.action} changed nothing: there is no track "
             f"{c.other if c.action == 'join' else c.particle}"
             + (f" from frame {c.frame} on" if c.frame else "")
@@ -92,9 +101,12 @@ class Corrections:
         known = tracks["particle"].notna()
         kind = part.tracks["particle"].dtype
         tracks = tracks[known].astype({"particle": kind}).reset_index(drop=True)
-        twice = tracks.duplicated(["frame", "particle"])
-        if twice.any():
-            particle, frame = (tracks.loc[twice, name].iloc[0] for name in ("particle", "frame"))
+        seen = detections[detections["particle"].notna()]
+        for table, names in ((tracks, _ONCE[:2]), (seen, _ONCE)):
+            twice = table.duplicated(names)
+            if not twice.any():
+                continue
+            particle, frame = (table.loc[twice, name].iloc[0] for name in ("particle", "frame"))
             raise InputError(
                 f"two tracks have the id {particle} in frame {frame}",
                 where=str(self.file),
@@ -116,6 +128,8 @@ class Corrections:
                     where=f"{self.file} row {one.row}",
                     todo="give another id, or join the tracks",
                 )
+            if one.action == "join" and counts and (ids == one.particle).any():
+                self.kept.add(one)
             if counts and hit.any():
                 first = table.iloc[int(np.flatnonzero(hit)[0])]
                 self.used.setdefault(one, (int(first["frame"]), float(first["t_s"])))
@@ -171,6 +185,8 @@ def read_corrections(run: Path, numbered: bool) -> Corrections:
                 "give numbers, as tracks.csv",
             )
             raise InputError(what, where=where, todo=todo)
+        if numbered:
+            particle, other = (str(int(text)) if text else "" for text in (particle, other))
         start = 0 if np.isnan(frame) else int(frame)
         out.append(Correction(int(row), action, particle, other, start, reason))
     return Corrections(file, tuple(out))

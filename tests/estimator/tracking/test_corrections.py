@@ -27,7 +27,7 @@ def parts(ids: list[list[float]]) -> Iterator[Linked]:
     """One part per frame, with the ids of its tracks; detections have one more, without a track."""
     for frame, here in enumerate(ids):
         tracks = pd.DataFrame({"frame": frame, "particle": np.array(here, np.int64), "t_s": 0.1})
-        found = pd.DataFrame({"frame": frame, "particle": [*here, np.nan], "t_s": 0.1})
+        found = pd.DataFrame({"frame": frame, "particle": [*here, np.nan], "camera": "left"})
         yield Linked(tracks, found)
 
 
@@ -74,6 +74,30 @@ def test_what_was_done_and_what_changed_nothing_is_said(tmp_path: Path) -> None:
     assert "no track 2 from frame 40 on" in corrections.warnings[1]
 
 
+def test_a_join_with_a_track_that_is_not_there_is_said(tmp_path: Path) -> None:
+    ids = [[1, 2], [1, 2], [3]]
+    for rows, count in (("join,99,3,,typing error\n", 1), ("join,2,3,,the same\n", 0)):
+        corrections = read(tmp_path, rows)
+        list(corrections.applied(parts(ids)))
+        found = [w for w in corrections.warnings if "there is no track 99 to join it with" in w]
+        assert len(corrections.warnings) == len(found) == count
+
+
+def test_numbers_with_zeros_before_them_are_numbers(tmp_path: Path) -> None:
+    assert corrected(tmp_path, "rename,01,007,,x\n", [[1], [1]]) == [[7], [7]]
+    with pytest.raises(InputError, match="there is a track 2 already"):
+        corrected(tmp_path, "rename,1,02,,x\n", [[1, 2]])
+
+
+def test_tracks_that_one_camera_sees_in_the_same_frame_are_not_joined(tmp_path: Path) -> None:
+    """Both tracks are in one image, although only one of them has a point in that frame."""
+    tracks = pd.DataFrame({"frame": [0], "particle": [1], "t_s": [0.0]})
+    found = pd.DataFrame({"frame": 0, "particle": [1, 2, 1], "camera": ["a", "a", "b"]})
+    found = found.astype({"particle": "Int64"})
+    with pytest.raises(InputError, match="two tracks have the id 1 in frame 0"):
+        list(read(tmp_path, "join,1,2,,x\n").applied(iter([Linked(tracks, found)])))
+
+
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
@@ -98,6 +122,7 @@ def test_refusals(tmp_path: Path, rows: str, words: str) -> None:
 def test_named_bubbles(tmp_path: Path) -> None:
     (tmp_path / "corrections.csv").write_text(HEAD + "rename,a,left one,,label\n")
     table = pd.DataFrame({"frame": 0, "particle": np.array(["a", "b"], object), "t_s": 0.0})
+    table["camera"] = "left"
     done = next(read_corrections(tmp_path, numbered=False).applied(iter([Linked(table, table)])))
     assert done.tracks["particle"].tolist() == ["left one", "b"]
 

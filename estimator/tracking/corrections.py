@@ -76,8 +76,8 @@ class Corrections:
     def warnings(self) -> list[str]:
         """Return a sentence for each correction that changed nothing, or joined nothing."""
         alone = [
-            f"{FILE} row {c.row}: join only renamed track {c.other}: there is no track {c.particle} "
-            "to join it with. Check the row"
+            f"{FILE} row {c.row}: join only renamed track {c.other}: there is no track "
+            f"{c.particle} to join it with. Check the row"
             for c in self.used
             if c.action == "join" and c not in self.kept
         ]

@@ -88,6 +88,7 @@ class TrackingStream:
     marks : marks that were followed in the images; None without a strip of dots.
     linked : the rows, which are computed while they are read.
     detections, points, particles : numbers of detections and points, and ids of tracks, so far.
+    paired : number of points that are measured in both images, so far.
     covered : for each camera, number of detections and the area that they cover (px^2), so far.
     beyond : number of points beyond the dots of the calibration, so far.
     common_mm2 : (3,) sums over the points of the variances by the calibration's errors, so far.
@@ -104,6 +105,7 @@ class TrackingStream:
     corrections: Corrections
     detections: int = 0
     points: int = 0
+    paired: int = 0
     beyond: int = 0
     common_mm2: Array = field(default_factory=lambda: np.zeros(3))
     particles: set[Any] = field(default_factory=set)
@@ -129,6 +131,7 @@ class TrackingStream:
         for part in map(self._with_share, self.linked):
             self.detections += int(np.isfinite(part.detections["u_px"].to_numpy(float)).sum())
             self.points += len(part.tracks)
+            self.paired += int(part.tracks["ray_miss_mm"].notna().sum())
             self.particles |= set(part.tracks["particle"])
             self._pairs.add(part.tracks)
             for camera, areas in part.detections.groupby("camera")["area_px2"]:
@@ -167,7 +170,7 @@ class TrackingStream:
             "detections": self.detections,
             "points": self.points,
             "tracks": len(self.particles),
-            "detections_without_partner_or_track": self.detections - 2 * self.points,
+            "detections_without_partner_or_track": self.detections - 2 * self.paired,
             "frames_without_bubbles": self.frames_without,
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
             "pairs": with_change(model, change, self.calibration),

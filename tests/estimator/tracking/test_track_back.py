@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
+import telerig
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import default_model
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.tracking.frames_to_rows import RowMaker
 from telerig.estimator.tracking.tracker import Tracker
+from telerig.io.dataset.run import RunData
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 
@@ -172,3 +176,22 @@ def test_no_detection_is_given_twice() -> None:
     first = found[["frame", f"{CAMERAS[0].name}_u_px", f"{CAMERAS[0].name}_v_px"]]
     assert not first.duplicated().any()
     assert not found.duplicated(["frame", "particle"]).any()
+
+
+def test_a_point_that_one_image_hides_counts_one_detection(tmp_path: Path) -> None:
+    """The number of detections without a partner is that of the detections in no pair."""
+    rng, hidden = np.random.default_rng(3), set(range(14, 22))
+    truth = paths(rng)
+    found = pd.concat(
+        table(camera, frame, truth[frame], np.zeros(2), rng,
+              [i for i in range(6) if not (i == BACK and camera == 1 and frame in hidden)])
+        for frame in range(FRAMES) for camera in (0, 1)
+    ).assign(particle="")  # fmt: skip
+    names = tuple(c.name for c in CAMERAS)
+    sizes = {c.name: c.image_size_px for c in CAMERAS}
+    run = RunData("r", tmp_path, names, FRAMES, DT_S * np.arange(FRAMES), None, sizes,
+                  "detections", detections=found.reset_index(drop=True))  # fmt: skip
+    tracks = telerig.track(run, calibration_from_cameras(list(CAMERAS)))
+    shared = int(tracks.table["flags"].str.contains("shared").sum())
+    left = tracks.summary["detections_without_partner_or_track"]
+    assert shared > 0 and left == len(found) - 2 * (len(tracks.table) - shared) >= shared

@@ -10,7 +10,8 @@ from telerig.arrays import Array
 
 LEAST_PERIODS = 1.5
 _LEAST_SAMPLES = 16
-_PADDING = 8
+_PADDING, _FINER = 8, 8
+_DENSEST = 16
 SIGNIFICANT = 6.0
 _ROUNDING = 1e-9
 _NEAR_PERIODS, _OWN_PERIODS, _FALL = 5.0, 1.0, 2.5
@@ -51,7 +52,8 @@ def dominant_oscillation(
 ) -> Oscillation | None:
     """Return the strongest sinusoid of a series between two frequencies.
 
-    t_s : (N,) times, nearly uniform. Frequencies above 0.45 of the sampling rate are not sought.
+    t_s : (N,) increasing times. Frequencies above 0.45 over the short steps between them (the 10 %
+        quantile) are not sought.
     values : (N, K), K = 1 or 2 components of one common frequency.
     significant : least amplitude over its standard deviation.
 
@@ -61,31 +63,28 @@ def dominant_oscillation(
     variances S / T of A and 3 S / (pi^2 A^2 T^3) of f, which are the Cramer-Rao bounds for white
     noise of this density.
 
-    Returns None if the record is shorter than 1.5 periods or 16 samples, or if the amplitude is
-    not significant.
+    Returns None if the record is shorter than 1.5 periods or 16 samples, if the amplitude is not
+    significant, or if the noise hides the difference from a sinusoid of another frequency (an
+    alias) at these times.
     """
     good = np.isfinite(values).all(-1)
     t, y = np.asarray(t_s, float)[good], np.asarray(values, float)[good]
     if len(t) < _LEAST_SAMPLES:
         return None
     duration = (t[-1] - t[0]) * len(t) / (len(t) - 1)
-    step = float(np.median(np.diff(t)))
-    low, high = max(low_hz, LEAST_PERIODS / duration), min(high_hz, 0.45 / step)
+    step = max(float(np.quantile(np.diff(t), 0.1)), duration / (_DENSEST * len(t)))
+    lowest, highest = LEAST_PERIODS / duration, 0.45 / step
+    low, high = max(low_hz, lowest), min(high_hz, highest)
     if low >= high:
         return None
-    even = np.linspace(t[0], t[-1], round((t[-1] - t[0]) / step) + 1)
     line = np.stack([np.ones(len(t)), t - t[0]], -1)
     level = y - line @ np.linalg.lstsq(line, y, rcond=None)[0]
-    grid = np.stack([np.interp(even, t, column) for column in level.T], -1)
-    count = _PADDING * len(even)
-    power = (np.abs(np.fft.rfft(grid * np.hanning(len(even))[:, None], count, axis=0)) ** 2).sum(-1)
-    frequency = np.fft.rfftfreq(count, step)
-    inside = np.flatnonzero((frequency >= low) & (frequency <= high))
-    if not len(inside):
+    start = _strongest(t, level, step, (low, high))
+    if start is None:
         return None
-    f = _refined(t, y, float(frequency[inside[np.argmax(power[inside])]]), 0.5 / duration)
+    f = _refined(t, y, start, 0.5 / duration)
     coefficients, left = _fitted(t, y, f)
-    density = _density(even, np.stack([np.interp(even, t, c) for c in left.T], -1), f, duration)
+    density = _density(t, left, f, duration)
     if not density > (_ROUNDING * np.abs(y).max()) ** 2 * duration:
         return None
     cosine, sine = coefficients[2], coefficients[3]
@@ -94,11 +93,37 @@ def dominant_oscillation(
     s_amplitude = float(np.sqrt(density / duration))
     if axes[0] < significant * s_amplitude or not low <= f <= high:
         return None
+    wave = y - left - line @ np.linalg.lstsq(line, y - left, rcond=None)[0]
+    other = _strongest(t, wave, step, (lowest, highest), but=(f, 1 / duration))
+    if other is not None:
+        alias = _refined(t, wave, other, 0.5 / duration)
+        difference = float((_fitted(t, wave, alias)[1] ** 2).sum())
+        if difference < 0.5 * significant**2 * density * len(t) / (2 * duration):
+            return None
     total = float((axes**2).sum())
-    s_f = float(np.sqrt(3 * density / (np.pi**2 * total * duration**3)))
+    s_f = float(np.sqrt(density / (4 * np.pi**2 * total * duration * t.var())))
     return Oscillation(
         f, s_f, float(axes[0]), minor, s_amplitude, s_amplitude * (len(axes) > 1), cosine, sine
     )
+
+
+def _strongest(
+    t: Array, y: Array, step: float, band: tuple[float, float], but: tuple[float, float] = (0, -1)
+) -> float | None:
+    """Return the frequency of the highest windowed periodogram in a band, except near one of them.
+
+    The values stay at their times, to a fraction of the step: values interpolated over long steps
+    would be those of a lower frequency.
+    """
+    place = np.rint((t - t[0]) * (_FINER / step)).astype(int)
+    length = _FINER * round((t[-1] - t[0]) / step + 1)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * (t - t[0]) / (t[-1] - t[0]))
+    grid = np.stack([np.bincount(place, column * window, length) for column in y.T], -1)
+    power = (np.abs(np.fft.rfft(grid, _PADDING * length, axis=0)) ** 2).sum(-1)
+    frequency = np.fft.rfftfreq(_PADDING * length, step / _FINER)
+    outside = (frequency < band[0]) | (frequency > band[1])
+    power[outside | (np.abs(frequency - but[0]) <= but[1])] = 0
+    return float(frequency[np.argmax(power)]) if power.any() else None
 
 
 def _fitted(t: Array, y: Array, f: float) -> tuple[Array, Array]:
@@ -130,14 +155,11 @@ def _density(t: Array, left: Array, f: float, duration: float) -> float:
     periods of a slow oscillation look like such noise. The density is known from k squares alone:
     the square of an error over it has the mean k / (k - 2).
     """
-    step = float(t[1] - t[0])
-    frequency = np.fft.rfftfreq(len(t), step)
-    periodogram = 2 * step / len(t) * (np.abs(np.fft.rfft(left, axis=0)) ** 2).mean(-1)
-    away = np.abs(frequency - f) * duration
-    near = (away < _NEAR_PERIODS) & (away > _OWN_PERIODS)
-    near[0] = False
-    if not near.any():
-        return 0.0
-    squares = 2 * left.shape[1] * np.count_nonzero(near)
-    each = (periodogram * (frequency / f) ** _FALL)[near]
+    periods = np.arange(1, np.ceil(f * duration + _NEAR_PERIODS))
+    away = np.abs(periods - f * duration)
+    frequency = periods[(away < _NEAR_PERIODS) & (away > _OWN_PERIODS)] / duration
+    waves = np.exp(-2j * np.pi * np.outer(frequency, t))
+    periodogram = 2 * duration / len(t) ** 2 * (np.abs(waves @ left) ** 2).mean(-1)
+    squares = 2 * left.shape[1] * len(frequency)
+    each = periodogram * (frequency / f) ** _FALL
     return float(each.mean() * squares / max(squares - 2, 1))

@@ -208,6 +208,31 @@ def test_noise_and_short_records_have_no_oscillation() -> None:
     assert dominant_oscillation(t, holes).frequency_hz == pytest.approx(6.0, abs=0.05)
 
 
+def test_an_oscillation_at_unequal_times() -> None:
+    even = np.arange(400) / 200
+    pairs = np.repeat(np.arange(100) / 50, 2)
+    slower = np.concatenate([np.arange(0, 0.8, 0.005), np.arange(0.8, 8, 0.02)])
+    for t, f in (
+        (pairs + np.tile([0, 1e-3], 100), 30.0),
+        (slower, 30.0),
+        (even[np.abs(even - 1) > 0.5], 30.0),
+        (even[np.abs(even - 1) > 0.5], 5.0),
+    ):
+        off = []
+        for seed in range(20):
+            noise = 0.1 * np.random.default_rng(seed).standard_normal(len(t))
+            found = dominant_oscillation(t, (np.sin(2 * np.pi * f * t + seed) + noise)[:, None])
+            assert found is not None
+            off.append(((found.frequency_hz - f) / found.s_frequency_hz,
+                        (found.major - 1) / found.s_major))  # fmt: skip
+        nees = np.mean(np.square(off), 0)
+        assert nees.min() > 0.3 and nees.max() < 2.5
+    # images of a pair 10 us apart do not tell 30 from 20 Hz
+    t = pairs + np.tile([0, 1e-5], 100)
+    noise = 0.1 * np.random.default_rng(1).standard_normal(len(t))
+    assert dominant_oscillation(t, (np.sin(60 * np.pi * t) + noise)[:, None]) is None
+
+
 def test_a_bubble_is_summarised() -> None:
     frames = frames_table(motion(400), body(400), UP, G, WATER)
     liquid = liquid_of(WATER, G)

@@ -137,8 +137,8 @@ def smooth(
     calibration : calibration of the cameras.
     stage : the encoder: a table or a mapping with t_s (E,) and position_mm (E,), which increases
         where the stage moves along its axis; or the `RunData` of the run (`telerig.load_run`),
-        whose other records are then used as well where nothing else is given; None without an
-        encoder.
+        whose other records are then used as well where nothing else is given, and of whose frames
+        only those that were tracked (``telerig track --frames``); None without an encoder.
     accelerometers : a mapping of the sensor's name to a mapping (`AccelerometerRecord`) with
         "t_s" (N,), which increases; the readings (N, 3) along the sensor's x, y, z, either "a_m_s2"
         or "a" with "unit" ("m/s^2", "g", "mg", "mm/s^2", "cm/s^2" or "ft/s^2"); "mounted_on", the
@@ -540,6 +540,8 @@ def problem_of(
                 todo="give the run without t_s, or give its tables (stage=run.stage, ...) "
                 "together with t_s",
             )
+        of_tracks = getattr(tracks, "summary", None) or {}
+        run = run.first(of_tracks.get("frames") or run.frame_count)  # track --frames
         stage, rig, t_s = run.stage, run.rig if rig is None else rig, run.t_s
         accelerometers = run.accelerometers if accelerometers is None else accelerometers
         references = run.references if references is None else references

@@ -65,6 +65,19 @@ def test_another_results_folder_and_tracks_from_a_file(data: Path, tmp_path: Pat
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+def test_only_tracked_frames_count(tmp_path: Path) -> None:
+    config = run_preset("swarm", frames=40)
+    telerig.simulate(config, rng=np.random.default_rng(2), out=tmp_path, images=False)
+    rig = calibration_from_cameras(list(true_cameras(config.calibration).values()))
+    run = telerig.load_run(tmp_path / "runs" / "swarm")
+    tracks = telerig.track(run.first(20), rig)
+    cut, whole = (
+        telerig.smooth(tracks, rig, stage=part, model="default") for part in (run.first(20), run)
+    )
+    assert set(whole.shake["frame"]) == set(range(20))
+    assert whole.summary["swarm"] == cut.summary["swarm"] != {}
+
+
 def test_without_tracks_it_says_what_to_do(data: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(
         app, ["smooth", str(data / "runs" / "rise"), "--tracks", str(tmp_path)]

@@ -32,8 +32,9 @@ def summary_table(
     frames : what `telerig.bubble_table` returns.
     up : (3,) unit vector against gravity in the rig frame.
     liquid : properties of the liquid; if it is None, the dimensionless numbers are NaN.
-    ways : by particle and number of its rows, standard deviations (3,) in mm of the displacement
-        from the first row to the last one; other bubbles get an upper bound.
+    ways : by particle and number of its rows, standard deviations (4,) in mm of the displacement
+        from the first row to the last one, and of the path's length; other bubbles get an upper
+        bound.
     """
     groups = frames.groupby("particle", sort=True)
     known = ways or {}
@@ -62,7 +63,10 @@ def _row(
     row["slip_mm_s"] = _mean(mine["slip_mm_s"])
     # noise across the motion makes a mean speed too large
     noise = (mine[[f"sv{a}_mm_s" for a in AXES]] ** 2).sum(axis=1) / (2 * mine["slip_mm_s"])
-    row["s_slip_mm_s"] = float(np.hypot(row["s_rise_mm_s"], _mean(noise)))
+    steady = row["s_rise_mm_s"]
+    if way_sd_mm is not None and t[-1] > t[0]:
+        steady = way_sd_mm[3] / (t[-1] - t[0])
+    row["s_slip_mm_s"] = float(np.hypot(steady, _mean(noise)))
     row |= _zigzag(t, mine, up)
     low = _ABOVE_ZIGZAG * row.get("zigzag_hz", 0.0)
     shape = dominant_oscillation(t, np.log(mine[["aspect"]].to_numpy(float)), low)
@@ -132,7 +136,7 @@ def _mean_rise(
     duration = t[-1] - t[0]
     rise = float((height[-1] - height[0]) / duration)
     if way_sd_mm is not None:
-        return rise, float(np.linalg.norm(way_sd_mm * up) / duration)
+        return rise, float(np.linalg.norm(way_sd_mm[:3] * up) / duration)
     ends = _along_variance(mine, "s{}_mm", up)[[0, -1]].sum() / duration**2
     steady = np.sqrt(_along_variance(mine, "sv{}_mm_s", up)).mean() ** 2
     bound = np.fmin(ends, steady)

@@ -224,9 +224,11 @@ def bubble_summary(
     frames = bubble_table(smoothing, fluid) if bubbles is None else bubbles
     liquid, inflation = liquid_of(known, gravity), smoothing.verdict.get("inflation", (1.0,) * 3)
     ways = {
-        (int(particle), int(mean["frames"])): np.multiply(mean["way_sd_mm"], inflation)
+        (int(particle), int(mean["frames"])): np.array(
+            [*np.multiply(mean["way_sd_mm"], inflation), mean["length_sd_mm"] * max(inflation)]
+        )
         for particle, mean in smoothing.summary.get("bubble_means", {}).items()
-        if "way_sd_mm" in mean
+        if "length_sd_mm" in mean
     }
     return summary_table(frames, up, None if liquid is None else liquid[0], ways)
 
@@ -404,6 +406,7 @@ def _means(evidence: Evidence) -> dict[str, Any]:
             found |= {f"s{n}": s for n, s in zip(names, mean.sigma_mm_s.tolist())}
         if mean.way_sigma_mm is not None:
             found |= {"frames": mean.frames, "way_sd_mm": mean.way_sigma_mm.tolist()}
+            found["length_sd_mm"] = mean.length_sigma_mm
         out[str(particle)] = found
     return out
 

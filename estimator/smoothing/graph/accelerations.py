@@ -41,7 +41,7 @@ from telerig.factors.state_space import Component
 from telerig.rig.triangulation import stacked_jacobian
 
 _ROWS_AT_ONCE = 20_000
-_LEAST_RISE = 1e-6
+_LEAST_RISE, _STILL_MM_S = 1e-6, 1e-9
 _POOLED_S = 0.1
 """Over so much time on either side the few draws are averaged; the errors' statistics change more
 slowly."""
@@ -66,10 +66,10 @@ def accelerations_of(
     probable, shortest, _ = low_passes
     velocity, value = np.empty((2, graph.rows, 3))
     velocity_covariance, covariance = np.empty((2, graph.rows, 3, 3))
-    displacement = list[Array]()
+    ways = list[tuple[Array, Array]]()
     for rows, chains in _chains(solution, rig, shortest):
         velocity[rows], velocity_covariance[rows] = chains.moments(chains.graph.bubble.velocity)
-        displacement.append(chains.displacement_variances())
+        ways.append(chains.way_variances(velocity[rows]))
     for rows, chains in _chains(solution, rig, probable):
         value[rows], covariance[rows] = chains.moments(chains.graph.bubble.acceleration)
     variance = np.diagonal(covariance, axis1=1, axis2=2).mean(0)
@@ -80,9 +80,10 @@ def accelerations_of(
         )
         for axis, one, time_s in zip(np.eye(3), variance, probable.time_s, strict=True)
     ]  # fmt: skip
+    displacement, length = (np.concatenate(parts) for parts in zip(*ways, strict=True))
     return Accelerations(
-        velocity, velocity_covariance, np.concatenate(displacement), value, covariance,
-        np.array(band), low_passes,
+        velocity, velocity_covariance, displacement, length, value, covariance, np.array(band),
+        low_passes,
     )  # fmt: skip
 
 
@@ -193,25 +194,32 @@ class _Chains:
         by_rig = errors @ np.swapaxes(errors, -1, -2) / max(errors.shape[-1], 1)
         return value, covariance + self._pooled(by_rig)
 
-    def displacement_variances(self) -> Array:
-        """Return variances (bubbles, 3) in mm^2 of the displacement over each bubble's track.
+    def way_variances(self, velocity: Array) -> tuple[Array, Array]:
+        """Return variances in mm^2 of the displacement (bubbles, 3) from each track's first frame
+        to its last one, and of the length (bubbles,) of the way.
 
-        It is the displacement from the track's first frame to its last one. The errors of the
-        bubble's own motion at both ends are taken as independent; the correlation of the rig's
-        errors between both ends is included.
+        velocity : (rows, 3), whose directions the steps of the way have.
         """
         graph = self.graph
-        ends = np.stack([graph.first_row[:-1], graph.first_row[1:] - 1])
-        own, errors = np.zeros((ends.shape[1], 3)), list[Array]()
-        found = self.found[: graph.rows * graph.bubble.size]
-        for at in ends:
-            rows = graph.in_bubble_basis(graph.bubble.position[None], at)
-            errors.append(rows @ found.reshape(graph.rows, graph.bubble.size, -1)[at, :, 1:])
-            covariance = self.chains.covariances(self.chains.places.place_of_row[at])
-            own += ((rows @ covariance) * rows).sum(-1)
-        first, last = errors
-        draws = max(first.shape[-1], 1)
-        return np.asarray(own + ((last - first) ** 2).sum(-1) / draws)
+        first, last = graph.first_row[:-1], graph.first_row[1:] - 1
+        along = velocity / np.maximum(np.linalg.norm(velocity, axis=-1, keepdims=True), _STILL_MM_S)
+        step = (along[1:] + along[:-1]) / 2
+        step[last[:-1]] = 0.0
+        by_place = np.zeros((graph.rows, 3, 4))
+        by_place[last, :, :3] += np.eye(3)
+        by_place[first, :, :3] -= np.eye(3)
+        by_place[1:, :, 3] += step
+        by_place[:-1, :, 3] -= step
+        rows = graph.in_bubble_basis(graph.bubble.position[None], np.arange(graph.rows))
+        by_state = rows.mT @ by_place
+        cut = graph.rows * graph.bubble.size
+        errors = self.found[:cut, 1:].reshape(graph.rows, graph.bubble.size, -1)
+        moved = np.add.reduceat(np.einsum("nsk,nsd->nkd", by_state, errors), first)
+        side = np.zeros((len(self.found), 4))
+        side[:cut] = by_state.reshape(cut, 4)
+        own = (by_state * self._solved(side)[:cut].reshape(by_state.shape)).sum(1)
+        variance = np.add.reduceat(own, first) + (moved**2).sum(-1) / max(errors.shape[-1], 1)
+        return variance[:, :3], variance[:, 3]
 
     def _pooled(self, values: Array) -> Array:
         """Average values (rows, 3, 3) over neighbours in time, each bubble by itself."""

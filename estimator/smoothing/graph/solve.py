@@ -115,6 +115,7 @@ class Accelerations:
     velocity_mm_s : (rows, 3).
     velocity_covariance : (rows, 3, 3), rows as in the graph.
     displacement_variance_mm2 : (bubbles, 3) of the way from the first frame to the last one.
+    length_variance_mm2 : (bubbles,) of the length of that way.
     value_mm_s2 : (rows, 3).
     covariance : (rows, 3, 3) in mm^2/s^4.
     bandwidth_hz : (3,) along each axis the frequency up to which accelerations are followed by at
@@ -125,6 +126,7 @@ class Accelerations:
     velocity_mm_s: Array
     velocity_covariance: Array
     displacement_variance_mm2: Array
+    length_variance_mm2: Array
     value_mm_s2: Array
     covariance: Array
     bandwidth_hz: Array

@@ -21,6 +21,7 @@ from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 
 AXES = ("x", "y", "z")
 BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
+_STILL = 1e-12
 _WINDOW_S, _LEAST_FRAMES = 0.1, 10
 _EDGE = 0.1
 _SEEN = 0.25
@@ -178,12 +179,14 @@ class Mean:
     velocity_mm_s : (3,).
     sigma_mm_s : (3,) its standard deviation; None without covariances.
     way_sigma_mm : (3,) standard deviation of the displacement from the first to the last frame.
+    length_sigma_mm : standard deviation of the length of the path between these frames.
     """
 
     frames: int
     velocity_mm_s: Array
     sigma_mm_s: Array | None
     way_sigma_mm: Array | None = None
+    length_sigma_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -326,12 +329,16 @@ def _means(solution: Solution, span: Span) -> dict[int, Mean]:
         if bubble.last < span.own.start or bubble.first >= span.own.stop:
             continue
         sigma = None if found is None else np.sqrt(np.diagonal(found.means[i]))
-        way = None
+        way = length = None
         if moved is not None:
             begin, end = graph.problem.t_s[[bubble.first, bubble.last]]
-            stage = speed[graph.first_row[i] : graph.first_row[i + 1]].mean(0)
-            way = np.sqrt(moved.displacement_variance_mm2[i] + stage * (end - begin) ** 2)
-        out[bubble.particle] = Mean(len(bubble), solution.state.means[i], sigma, way)
+            rows = slice(graph.first_row[i], graph.first_row[i + 1])
+            stage = speed[rows].mean(0) * (end - begin) ** 2
+            way = np.sqrt(moved.displacement_variance_mm2[i] + stage)
+            share = (moved.velocity_mm_s[rows] ** 2).mean(0)
+            along = float(stage @ share / max(share.sum(), _STILL))
+            length = float(np.sqrt(moved.length_variance_mm2[i] + along))
+        out[bubble.particle] = Mean(len(bubble), solution.state.means[i], sigma, way, length)
     return out
 
 

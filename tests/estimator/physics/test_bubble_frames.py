@@ -243,9 +243,12 @@ def test_a_bubble_is_summarised() -> None:
     assert row["rise_mm_s"] == pytest.approx(0.25) and row["lifetime_s"] == pytest.approx(399 / 500)
     particle = int(row["particle"])
     for rows, sd_mm in ((400, 0.004), (399, row["s_rise_mm_s"] * 399 / 500)):
-        ways = {(particle, rows): np.array([1.0, 0.004, 1.0])}
+        ways = {(particle, rows): np.array([1.0, 0.004, 1.0, 0.006])}
         way = summary_table(frames, UP, liquid[0], ways).iloc[0]
         assert way["s_rise_mm_s"] == pytest.approx(sd_mm * 500 / 399)
+        noise = (3.0**2 * 3) / (2 * way["slip_mm_s"])
+        length = 0.006 * 500 / 399 if rows == 400 else row["s_rise_mm_s"]
+        assert way["s_slip_mm_s"] == pytest.approx(np.hypot(length, noise))
     # 0.02 mm at both ends
     assert row["s_rise_mm_s"] == pytest.approx(0.02 * 2**0.5 / row["lifetime_s"])
     assert row["d_eq_mm"] == pytest.approx(3.0) and row["sd_eq_mm"] == pytest.approx(0.03)

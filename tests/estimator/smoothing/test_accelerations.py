@@ -184,7 +184,7 @@ def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learne
     stated: float,
 ) -> None:
     """Noise that is stated too large, as by what an unknown shape adds, does not widen them."""
-    squares, ways = [], []
+    squares, ways, lengths = [], [], []
     for seed, inertia_s in enumerate((0.004, 0.01, 0.02)):
         rng = np.random.default_rng(seed)
         problem, truth = drawn_bubbles(rng, inertia_s, 200, 3, 0.005, stated)
@@ -201,9 +201,15 @@ def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learne
         place = (solution.state.bubbles @ solution.graph.bubble.position.T).reshape(3, -1, 3)
         known = np.array([b.guess_mm[-1] - b.guess_mm[0] for b in problem.bubbles])
         ways.append((place[:, -1] - place[:, 0] - known) ** 2 / found.displacement_variance_mm2)
+        moved = solution.velocities_mm_s.reshape(place.shape)
+        along = moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+        faster = ((moved - truth[0].reshape(place.shape)) * along).sum(-1)
+        length = np.trapezoid(faster, problem.t_s)
+        lengths.append(length**2 / found.length_variance_mm2)
     mean = np.mean(squares, axis=(0, 2, 3))
     assert ((mean > 0.8) & (mean < 1.25)).all()
     assert 0.4 < np.mean(ways) < 1.8  # 27 of them
+    assert 0.3 < np.mean(lengths) < 2.2  # 9 of them
 
 
 @pytest.mark.parametrize("steady", [False, True])

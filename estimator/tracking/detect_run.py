@@ -277,7 +277,8 @@ def _shared(path: str) -> tuple[DetectionStore, str, Callable[[Batch], pd.DataFr
 def read_batch(path: Path) -> pd.DataFrame:
     """Read a CSV table that `write_table` wrote; blank texts become ""."""
     kinds = {"camera": str, "flags": str, "reason": str}
-    table = pd.read_csv(path, dtype=kinds)
+    # a camera may be named NA
+    table = pd.read_csv(path, dtype=kinds, keep_default_na=False, na_values=[""])
     texts = [name for name in kinds if name in table]
     table[texts] = table[texts].fillna("")
     return table

@@ -213,7 +213,7 @@ def _write_pictures(scene: Scene, summary: Mapping[str, Any], staged: Path) -> N
 def _labels(staged: Path, camera: str, frame: int) -> pd.DataFrame:
     chunks = pd.read_csv(
         staged / "detections.csv", usecols=["frame", "camera", "particle", "u_px", "v_px"],
-        dtype={"camera": str}, chunksize=20_000,
+        dtype={"camera": str}, chunksize=20_000, keep_default_na=False, na_values=[""],
     )  # fmt: skip
     found = [c[(c["frame"] == frame) & (c["camera"] == camera)] for c in chunks]
     return pd.concat(found, ignore_index=True)

@@ -442,7 +442,8 @@ def refuse_copies(problem: Problem) -> None:
             raise CalibrationError(
                 f"{names[0]} and {names[1]} are copies of one image: even their noise is the same. "
                 "Counted twice, they would make the calibration seem better than it is",
-                todo="remove the copy; if the two should differ, look for the mistake in copying",
+                todo="remove the copy; if the two should differ, look for the mistake in copying; "
+                "if both are of a target at rest, the dots' standard deviations are far too large",
             )
 
 

@@ -30,6 +30,7 @@ from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     Progress,
     Scene,
+    described_fields,
     described_strip,
     detect_missing,
     fingerprint,
@@ -197,9 +198,9 @@ class TrackingStream:
     def _crowded(self) -> list[str]:
         """Return a warning for each camera with more bubbles than the detection can separate."""
         found, frames = [], self.run.frame_count
+        fields = described_fields(self.run) if self.run.detections is None else {}
         for camera, (many, area) in self.covered.items():
             width, height = self.run.image_sizes_px[camera]
-            fields = self.scene.fields if self.scene is not None else {}
             looked_at = fields[camera].sum() if camera in fields else width * height
             share = area / (float(looked_at) * frames)
             if is_crowded(share, many / frames, COVERED_LIMIT):

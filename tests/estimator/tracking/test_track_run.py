@@ -18,8 +18,9 @@ import telerig
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.tracking import detect_run
+from telerig.estimator.tracking import track as track_module
 from telerig.estimator.tracking.results_folder import write_tracking
-from telerig.estimator.tracking.track import TrackOptions
+from telerig.estimator.tracking.track import TrackOptions, tracking_stream
 from telerig.estimator.tracking.tracks import Tracks
 from telerig.io.results.stale import stale
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
@@ -379,6 +380,27 @@ def test_another_mask_is_another_input(rise: Path, tmp_path: Path) -> None:
     assert stale(folder) == ()
     cv2.imwrite(str(data / "mask.png"), np.full((height, width), 128, np.uint8))
     assert any("mask.png" in words for words in stale(folder))
+
+
+def test_a_resumed_run_is_as_crowded_as_one_in_one_go(
+    rise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, shares = tmp_path / "data", list[float]()
+    shutil.copytree(rise, data)
+    with (data / "rig.toml").open("a", encoding="utf-8") as rig:
+        rig.write('\n[bubbles.left]\nmask = "mask.png"\n')
+    run = telerig.load_run(data / "runs" / "rise")
+    width, height = run.image_sizes_px["left"]
+    mask = np.full((height, width), 255, np.uint8)
+    mask[: height // 3] = 0
+    cv2.imwrite(str(data / "mask.png"), mask)
+    monkeypatch.setattr(track_module, "is_crowded", lambda share, *_: bool(shares.append(share)))
+    for _ in range(2):  # the second time, all detections are there
+        stream = tracking_stream(run, truth_calibration(), tmp_path / "work")
+        list(stream.rows)
+        stream.summary()
+    assert stream.scene is None
+    assert shares[2:] == pytest.approx(shares[:2])
 
 
 def test_where_bubbles_are_looked_for_is_read_and_written(rise: Path, tmp_path: Path) -> None:

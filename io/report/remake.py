@@ -53,17 +53,18 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
 def remake_report(results: ResultsFolder, out: Path | None = None) -> Path:
     """Write the page of a results folder into it, or into ``out``; return its path."""
     if out is not None:
-        return _write_page(results, out)
+        return _write_page(results, out, out)
     again = f"telerig report {shlex.quote(str(results.folder))}"
     with replaced_results(results.folder, "report", again=again, inputs={}) as staged:
-        return results.folder / _write_page(results, staged).name
+        return results.folder / _write_page(results, staged, results.folder).name
 
 
-def _write_page(results: ResultsFolder, out: Path) -> Path:
+def _write_page(results: ResultsFolder, out: Path, page_folder: Path) -> Path:
+    """Write into ``out`` the page that will lie in ``page_folder``."""
     if results.kind == "calibration":
         from telerig.io.report.calibration.report import write_calibration_report
 
-        return write_calibration_report(results.folder, out)
+        return write_calibration_report(results.folder, out, page_folder=page_folder)
     if (results.folder / "validation.json").is_file():
         from telerig.io.report.validation import write_validation_report
 
@@ -73,7 +74,7 @@ def _write_page(results: ResultsFolder, out: Path) -> Path:
     if results.kind == "run":
         from telerig.io.report.run.report import write_track_report
 
-        return write_track_report(results.folder, out)
+        return write_track_report(results.folder, out, page_folder=page_folder)
     from telerig.io.report.batch.report import write_batch_report
 
     return write_batch_report(results.folder, out)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -22,7 +20,7 @@ from telerig.io.report.page.figures import (
     draw_curves,
     drawing,
 )
-from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
+from telerig.io.report.page.page import Figure, Row, drawn_over_cores, link_to, render_page
 from telerig.io.results.batch import BatchFile, verdict_and_flags, verdict_counts, verdict_of
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import Verdict
@@ -179,14 +177,9 @@ def _text(value: Any) -> str:
 
 
 def _link(job: Job, folder: Path, results: str) -> str:
-    """Return the link from the batch's page to a report, relative if the disk allows it."""
+    """Return the link from the batch's page to a report."""
     target = Path(job["dataset"]) / "results" / results / "report.html"
-    if not target.is_file():
-        return ""
-    try:
-        return quote(Path(os.path.relpath(target, Path(folder).resolve())).as_posix())
-    except ValueError:
-        return target.as_uri()
+    return link_to(target, folder) if target.is_file() else ""
 
 
 def _drawings(jobs: Sequence[Job]) -> list[Callable[[], Picture | None]]:

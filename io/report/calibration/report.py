@@ -44,27 +44,36 @@ _SHOWN = {
 
 
 def write_calibration_report(
-    results_folder: Path, out: Path | None = None, *, dot: list[Picture] | None = None
+    results_folder: Path,
+    out: Path | None = None,
+    *,
+    dot: list[Picture] | None = None,
+    page_folder: Path | None = None,
 ) -> Path:
     """Write report.html into a calibration's results folder, or into ``out``; return its path.
 
     The page is made from nothing but that folder. dot : what `dot_pictures` made of dot_example.npz
-    before; None draws it now. Raises InputError for a folder that holds no calibration, or files
+    before; None draws it now. page_folder : where the page will lie in the end, if ``out`` is
+    temporary. Raises InputError for a folder that holds no calibration, or files
     that cannot be read or do not fit together.
     """
     folder = Path(results_folder)
     with reading(folder, ()):
-        page = render(read_results(folder), dot, stale(folder))
+        page = render(read_results(folder), dot, stale(folder), page_folder or out)
     file = (folder if out is None else Path(out)) / "report.html"
     write_text_atomic(file, page)
     return file
 
 
 def render(
-    results: CalibrationResults, dot: list[Picture] | None = None, outdated: Sequence[str] = ()
+    results: CalibrationResults,
+    dot: list[Picture] | None = None,
+    outdated: Sequence[str] = (),
+    page_folder: Path | None = None,
 ) -> str:
-    """Return the page as text; ``outdated`` is what `stale` found."""
-    context = {"stale": outdated} | _words(results) | _tables(results) | _pictures(results, dot)
+    """Return the page as text; ``outdated`` is what `stale` found, ``page_folder`` its place."""
+    context = {"stale": outdated} | _words(results) | _tables(results)
+    context |= _pictures(results, dot, page_folder)
     return render_page("template_calibration.html", context, scene_json(results))
 
 
@@ -119,7 +128,9 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
     }
 
 
-def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[str, Any]:
+def _pictures(
+    results: CalibrationResults, dot: list[Picture] | None, page_folder: Path | None
+) -> dict[str, Any]:
     every = range(len(results.cameras))
     drawings: list[tuple[str, Callable[[], Any]]] = [  # what takes long comes first
         ("trust", partial(trust_pictures, results)),
@@ -130,7 +141,7 @@ def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[st
         ("plan", partial(rig_plan, results)),
         *(("covered", partial(coverage, results, i)) for i in every),
         ("covered", partial(tilts, results)),
-        ("sheet", partial(contact_sheet, results)),
+        ("sheet", partial(contact_sheet, results, page_folder)),
     ]
     if dot is None:
         drawings.insert(0, ("dot", partial(dot_pictures, results.dot_example)))
@@ -144,7 +155,9 @@ def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[st
     return pictures
 
 
-def contact_sheet(results: CalibrationResults) -> ContactSheet:
+def contact_sheet(results: CalibrationResults, page_folder: Path | None = None) -> ContactSheet:
     """Return the overlays of a calibration. Raises InputError for a picture that cannot be read."""
     views = list(results.views) if results.overlays else []
-    return picture_sheet(views, results.camera_names, results.overlays)
+    return picture_sheet(
+        views, results.camera_names, results.overlays, page_folder=page_folder
+    )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from telerig.errors import InputError
 from telerig.io.report.page.figures import data_uri
+from telerig.io.report.page.page import link_to
 
 BUDGET_BYTES = 1_500_000
 """Of JPEG: with the page's other parts a report stays below 8 MB."""
@@ -47,11 +48,12 @@ def picture_sheet(
     *,
     small_width_px: int = SMALL_WIDTH_PX,
     budget_bytes: int | None = None,
+    page_folder: Path | None = None,
 ) -> ContactSheet:
     """Return pictures as they are if they fit; else smaller; else the last rows linked only.
 
-    files : JPEG or PNG by (column, row), <results>/<kind>/<folder>/<name>. Raises InputError for a
-    picture that cannot be read.
+    files : JPEG or PNG by (column, row), <results>/<kind>/<folder>/<name>. page_folder : where the
+    page will lie; None for <results>. Raises InputError for a picture that cannot be read.
     """
     pictures = {key: read_picture(file) for key, file in files.items()}
     left = BUDGET_BYTES if budget_bytes is None else budget_bytes
@@ -66,7 +68,10 @@ def picture_sheet(
             left -= len(picture)
             kind = "image/png" if picture.startswith(_PNG) else "image/jpeg"
             source = data_uri(kind, picture) if picture and left >= 0 else ""
-            link = "/".join(files[column, row].parts[-3:]) if picture else ""
+            link = ""
+            if picture:
+                file = files[column, row]
+                link = link_to(file, page_folder or file.parents[2])
             cells.append(Cell(column, source, link))
         views.append((row, tuple(cells)))
     return ContactSheet(tuple(views), shrunk)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -39,6 +42,15 @@ class Row:
     cells: tuple[str, ...]
     strong: bool = False
     faint: bool = False
+
+
+def link_to(target: Path, page_folder: Path) -> str:
+    """Return the link to a file from a page in a folder, relative if the disk allows it."""
+    try:
+        link = os.path.relpath(target.resolve(), Path(page_folder).resolve())
+    except ValueError:
+        return target.resolve().as_uri()
+    return quote(Path(link).as_posix())
 
 
 def render_page(template: str, context: Mapping[str, Any], scene: str) -> str:

@@ -50,14 +50,17 @@ _SHOWN = {"schema", "kind", "run", "notes", "worst_frames", "pairs", "covariance
           "rig_change", "warnings"}  # fmt: skip
 
 
-def write_track_report(results_folder: Path, out: Path | None = None) -> Path:
+def write_track_report(
+    results_folder: Path, out: Path | None = None, *, page_folder: Path | None = None
+) -> Path:
     """Write report.html into a tracked run's results folder, or into ``out``; returns its path.
 
     It reads nothing but that folder, and the calibration beside it (`results_cameras`) for the
     drawing of two rays: tracking.json and tracks.csv, and if they are there
     detections.csv, events.csv, references.csv, run.json, overlays/<camera>/<frame>.jpg and
     binary/<camera>/<frame>.png. Where smoothing.json is there, with trajectories.csv and shake.csv,
-    the page begins with the smoothing. It is written whole or not at all. Raises InputError for a
+    the page begins with the smoothing. It is written whole or not at all. page_folder : where the
+    page will lie in the end, if ``out`` is temporary. Raises InputError for a
     folder that holds no tracks, or files that cannot be read or do not fit together.
     """
     folder = Path(results_folder)
@@ -65,7 +68,7 @@ def write_track_report(results_folder: Path, out: Path | None = None) -> Path:
         tracks = read_track_results(folder)
         rig = run_cameras(folder, tracks)
         smoothing = read_smoothing_results(folder, tracks.up)
-        page = render(tracks, smoothing, rig, stale(folder))
+        page = render(tracks, smoothing, rig, stale(folder), page_folder or out)
     file = (folder if out is None else Path(out)) / "report.html"
     write_text_atomic(file, page)
     return file
@@ -76,6 +79,7 @@ def render(
     smoothing: SmoothingResults | None = None,
     rig: tuple[tuple[Camera, Camera] | None, str] = (None, ""),
     outdated: Sequence[str] = (),
+    page_folder: Path | None = None,
 ) -> str:
     """Return the report of a run as the text of an HTML page.
 
@@ -83,6 +87,7 @@ def render(
     smoothing : None for a page without it.
     rig : the two cameras and "", or None and the reason why they are not known.
     outdated : the results that are older than their inputs, in words, from `stale`.
+    page_folder : where the page will lie; None for the results folder.
     """
     in_space = _in_space(results, smoothing)
     scene = track_scene_json(in_space)
@@ -98,7 +103,7 @@ def render(
     rows = list(tables.worst_words(results)) if results.pictures else []
     context["sheet"] = picture_sheet(
         rows, columns, results.pictures, small_width_px=_SMALL_WIDTH_PX,
-        budget_bytes=min(BUDGET_BYTES, max(0, int(left / _BASE64))),
+        budget_bytes=min(BUDGET_BYTES, max(0, int(left / _BASE64))), page_folder=page_folder,
     )  # fmt: skip
     return render_page("template_track.html", context, scene)
 

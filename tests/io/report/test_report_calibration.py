@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -20,6 +22,7 @@ from telerig.io.report.calibration.report import contact_sheet, write_calibratio
 from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.tables import parameter_rows, pose_rows, worst_rows
 from telerig.io.report.page import contact_sheet as sheets
+from telerig.io.report.remake import ResultsFolder, remake_report
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.short_text import with_sd
 
@@ -207,6 +210,12 @@ def test_pictures_beyond_the_budget_shrink_then_become_links(
     monkeypatch.setattr(sheets, "BUDGET_BYTES", 10)
     assert contact_sheet(results).linked == 2
     assert 'href="overlays/left/view01.jpg"' in write_calibration_report(folder).read_text()
+    elsewhere = folder.parent / "else where"
+    for out in (None, elsewhere):
+        page = remake_report(ResultsFolder(folder, "calibration"), out)
+        links = re.findall(r'href="([^"]*view01.jpg)"', page.read_text())
+        assert [(page.parent / unquote(link)).is_file() for link in links] == [True, True]
+        assert links[0].startswith("overlays/") == (out is None)
     results.overlays["left", "view01"].write_bytes(b"rubbish" * 9)
     with pytest.raises(InputError, match=r"view01.jpg: is no JPEG"):
         contact_sheet(results)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,6 +21,8 @@ from tracked_folder import SCALE, SIGMA_PX, WORST, write_folder
 
 from telerig.errors import InputError
 from telerig.io.report.page import contact_sheet as sheets
+from telerig.io.report.remake import ResultsFolder, remake_report
+from telerig.io.report.run import report
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.tracking.figures import (
     marks_followed,
@@ -306,7 +309,7 @@ def test_many_events_are_counted(folder: Path) -> None:
 
 
 def test_pictures_beyond_the_budget_shrink_and_the_page_stays_small(
-    whole: Path, results: TrackResults, monkeypatch: pytest.MonkeyPatch
+    whole: Path, results: TrackResults, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     columns = ["left", "left, binary"]
     size = sum(file.stat().st_size for file in results.pictures.values())
@@ -318,6 +321,10 @@ def test_pictures_beyond_the_budget_shrink_and_the_page_stays_small(
     assert cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED).shape[1] == 200
     none = sheets.picture_sheet(frames, columns, results.pictures, budget_bytes=0)
     assert none.linked == 4 and none.views[0][1][1].link == "binary/left/000007.png"
+    monkeypatch.setattr(report, "BUDGET_BYTES", 0)
+    page = remake_report(ResultsFolder(whole, "run"), tmp_path / "elsewhere")
+    links = re.findall(r'href="([^"]*/00000[^"]*)"', page.read_text())
+    assert len(links) == 4 and all((page.parent / link).is_file() for link in links)
 
 
 def _repeated(file: Path, times: int, frames: int) -> int:

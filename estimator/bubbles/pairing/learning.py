@@ -127,7 +127,8 @@ def _findings(model: PairModel, votes: float) -> tuple[Finding, ...]:
     varies = len(model.bias_px) > 1 and after_constant > max(_LEAST_PROBLEM_PX, 1.5 * after_all)
     few = model.pairs < _FEW_PAIRS
     found = {
-        Finding.CALIBRATION_OFFSET: abs(offset) > max(_LEAST_PROBLEM_PX, _SIGNIFICANT * error),
+        Finding.CALIBRATION_OFFSET: not few
+        and abs(offset) > max(_LEAST_PROBLEM_PX, _SIGNIFICANT * error),
         Finding.OFFSET_VARIES: varies,
         Finding.FEW_PAIRS: few,
         Finding.UNCLEAR_OFFSET: not few and votes < _CLEAR_VOTE,

@@ -83,6 +83,14 @@ def test_a_biased_calibration_is_survived_and_reported(bias: float) -> None:
     assert recall >= 0.98 and precision >= 0.98
 
 
+def test_few_pairs_accuse_no_calibration() -> None:
+    rng = np.random.default_rng(12)
+    tables, _, _ = frame(rng, 3, shift=2.0, seen=1.0, clutter=0.0)
+    model = estimate_pair_model([tables], rig())
+    assert abs(model.mean_gap_px[0]) > 1 and model.findings[:1] == (Finding.FEW_PAIRS,)
+    assert not model.calibration_problem
+
+
 def test_a_bias_that_changes_over_the_volume_is_followed() -> None:
     rng = np.random.default_rng(13)
     points = rng.uniform([-30, -19, -30], [30, 19, 30], (60, 3))

@@ -298,7 +298,7 @@ def test_words_say_it_once() -> None:
     still = PairCollector(known)
     pairs.add(Run().tracks(cameras, moved(cameras, along_perpendicular(cameras, 0.08, 0, 0)), rng))
     still.add(Run().tracks(cameras, cameras, rng))
-    findings = (Finding.CALIBRATION_OFFSET, Finding.FEW_PAIRS)
+    findings = (Finding.CALIBRATION_OFFSET, Finding.UNCLEAR_OFFSET)
     model = replace(default_model(cameras), findings=findings)
     said = with_change(model, pairs.found(), known)
     assert said["calibration_problem"]

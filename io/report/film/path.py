@@ -340,12 +340,12 @@ class _Page:
         pen = ImageDraw.Draw(image)
         for words, (u, v), anchor, colour, size in self._texts:
             place = u * DPI / 100, v * DPI / 100
-            pen.text(place, words, colour, _font(size * DPI / 100), anchor)
+            pen.text(place, words, colour, font(size * DPI / 100), anchor)
         return np.array(image)
 
 
 @cache
-def _font(size_px: float) -> Any:
+def font(size_px: float) -> Any:
     """Return Matplotlib's own typeface, for Pillow."""
     from matplotlib import get_data_path
     from PIL import ImageFont

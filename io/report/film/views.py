@@ -17,6 +17,7 @@ from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Progress, write_film
+from telerig.io.report.film.path import font
 from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
 from telerig.io.results.manifest import reading
 
@@ -29,7 +30,7 @@ TAIL_FRAMES = 24
 WIDTH_PX = 640
 _GIF_WIDTH_PX = 800
 _RATE_HZ = 25.0
-_STRIP_PX, _GAP_PX = 30, 4
+_STRIP_PX, _GAP_PX, _NAME_PX = 30, 4, 13
 _ALONE: Colour = (250, 190, 20)
 _COLOURS: tuple[Colour, ...] = (
     (20, 110, 255), (235, 70, 0), (15, 165, 60), (205, 40, 200), (225, 25, 60), (0, 165, 175),
@@ -188,6 +189,7 @@ def _view(
 ) -> Picture:
     """Return one camera's image with its bubbles, (h, w, 3), below a strip with its name."""
     import cv2
+    from PIL import Image, ImageDraw  # OpenCV 4 writes ASCII alone
 
     factor = min(1.0, WIDTH_PX / size_px[0])
     width, height = round(size_px[0] * factor), round(size_px[1] * factor)
@@ -208,9 +210,9 @@ def _view(
         if bubble.particle is not None:
             beside = np.array([ring[:, 0].max() + 10, ring[:, 1].mean()])
             write_label(picture, str(bubble.particle), beside, colour)
-    strip = np.full((_STRIP_PX, width, 3), 255, np.uint8)
-    write_label(strip, camera, np.array([30.0, _STRIP_PX / 2]), INK)
-    return np.concatenate([strip, picture])
+    strip = Image.new("RGB", (width, _STRIP_PX), PAPER)
+    ImageDraw.Draw(strip).text((8, _STRIP_PX / 2), camera, INK, font(_NAME_PX), "lm")
+    return np.concatenate([np.array(strip), picture])
 
 
 def _palette() -> list[Colour]:

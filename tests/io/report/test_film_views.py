@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -117,6 +118,29 @@ def test_outlines_and_tails_are_drawn_where_they_were_found(run: Path) -> None:
     assert coloured[v + top, u].mean() > 0.95
     assert not coloured[top + 2 : top + 40].any()
     assert np.ptp(draw_views(_image, SIZES, shades, frames[2])[-20:, -60:]) == 0
+
+
+def test_names_of_cameras_in_any_alphabet(monkeypatch: pytest.MonkeyPatch) -> None:
+    ascii_only = []
+    write = cv2.putText
+
+    def of_opencv_4(picture: np.ndarray, text: str, *how: object) -> np.ndarray:
+        ascii_only.append(text)
+        return write(picture, text.encode("ascii", "replace").decode(), *how)
+
+    monkeypatch.setattr(cv2, "putText", of_opencv_4)
+    frame = views.ViewFrame(0, None, ((), ()))
+    strips = [
+        draw_views(
+            lambda *_: np.zeros((80, 300), np.uint8),
+            {name: (300, 80), "right": (300, 80)},
+            {name: (0.0, 255.0), "right": (0.0, 255.0)},
+            frame,
+        )[:30, :150]
+        for name in ("верх", "????")
+    ]
+    assert strips[0].min() < 100 and not np.array_equal(*strips)
+    assert all(text.isascii() for text in ascii_only)
 
 
 def test_outline_is_the_documented_curve() -> None:

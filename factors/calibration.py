@@ -278,9 +278,9 @@ def depth_gauge_residual(rig_from_camera: Array, sigma_mm: float) -> tuple[Array
 
     Returns the residuals (..., 2), which are the translation along the axis of the first camera and
     along the camera's own axis, both over ``sigma_mm``, and their derivatives (..., 2, 6) with
-    respect to GTSAM's Pose3 tangent. Images do not determine either translation for the second
-    camera. For a further camera they leave only the translation along its own axis undetermined;
-    see `docs/theory.md`.
+    respect to GTSAM's Pose3 tangent. Images do not determine either translation for one camera,
+    `Problem.origin_camera`. For a further camera they leave only the translation along its own axis
+    undetermined; see `docs/theory.md`.
     """
     rotation, translation = rig_from_camera[..., :3, :3], rig_from_camera[..., :3, 3]
     axis = rotation[..., 2]

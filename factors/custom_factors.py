@@ -134,13 +134,13 @@ def distance_factor(first: int, second: int, distance_mm: float, sigma_mm: float
     return custom_factor([first, second], [3, 3], 1, residual)
 
 
-def depth_gauge_factor(key: int, sigma_mm: float, *, second: bool) -> Any:
+def depth_gauge_factor(key: int, sigma_mm: float, *, both: bool) -> Any:
     """Return the factor that fixes the origin of the rig frame; see `depth_gauge_residual`.
 
-    second : True for the second camera, which takes both rows. A further camera takes only the row
-        along its own axis.
+    both : whether the camera takes both rows, as the one that fixes the origin along the first axis
+        does. A further camera takes only the row along its own axis.
     """
-    first = 0 if second else 1
+    first = 0 if both else 1
 
     def residual(values: Any) -> tuple[Array, list[Array]]:
         value, jacobian = depth_gauge_residual(values.atPose3(key).matrix(), sigma_mm)

@@ -34,7 +34,7 @@ from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_covariance, triangulate_any
 
 GAUGE = (
-    "rig frame = first camera's frame, its origin where the {two} optical axes come closest; image "
+    "rig frame = first camera's frame, its origin where {axes} come closest; image "
     "centres held at the middle of the image unless the model frees them; target frame tied to "
     "the nominal dot positions by the dots' priors"
 )
@@ -155,7 +155,11 @@ def _hulls(residuals: pd.DataFrame) -> dict[str, tuple[tuple[float, float], ...]
 def _gauge(problem: Problem) -> str:
     if problem.scales_held:
         return GAUGE_OF_SCALES
-    return GAUGE.format(two="two" if len(problem.cameras) <= 2 else "first two")
+    axes = "the two optical axes" if len(problem.cameras) <= 2 else "the first two optical axes"
+    if problem.origin_camera > 1:
+        first, other = (problem.cameras[c].name for c in (0, problem.origin_camera))
+        axes = f"the optical axes of cameras {first!r} and {other!r}"
+    return GAUGE.format(axes=axes)
 
 
 def dot_table(problem: Problem) -> pd.DataFrame:

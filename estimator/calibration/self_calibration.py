@@ -201,8 +201,15 @@ def _with_wider_noise(
 
 
 def _with_origin(problem: Problem, start: State) -> Problem:
-    """Return the problem, with the start's scales held if perspective axes are nearly parallel."""
-    if len(problem.cameras) < 2 or not mirror_ambiguity.perspective_sign(start, problem):
+    """Return the problem with its `origin_camera` by the start's rotations.
+
+    If perspective axes are nearly parallel, the start's scales are held, too.
+    """
+    if len(problem.cameras) < 2:
+        return problem
+    turns = np.swapaxes(start.rig_from_camera[:, :3, :3], -1, -2)
+    problem = replace(problem, origin_camera=known_target.origin_camera(turns))
+    if not mirror_ambiguity.perspective_sign(start, problem):
         return problem
     if checks.axes_angle_deg(start) > checks.NEAR_PARALLEL_DEG:
         return problem

@@ -21,6 +21,8 @@ from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start.known_target import (
     ImageMap,
     image_maps,
+    offset_freedom,
+    origin_camera,
     overlap_tree,
     stereo_states,
 )
@@ -194,10 +196,7 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
     if count < 3 or np.all(np.abs(kappa_rho) > PERSPECTIVE):
         return ()
     turns = np.swapaxes(state.rig_from_camera[:, :3, :3], -1, -2)
-    free = np.zeros((count, 2, 2 * count - 3))
-    free[1, :, 0] = np.array([-1, 1]) * turns[1][1::-1, 2]
-    for c in range(2, count):
-        free[c, :, 2 * c - 3 : 2 * c - 1] = np.eye(2)
+    free = offset_freedom(turns)
     normal = np.zeros((free.shape[-1],) * 2)
     for v in range(len(problem.views)):
         mine = (problem.view == v) & problem.kept
@@ -318,13 +317,14 @@ def _coverage_note(problem: Problem, c: int) -> list[Note]:
 
 
 def axes_angle_deg(state: State) -> float:
-    """Return the angle between the optical axes of the first two cameras, 0 to 90 degrees."""
-    first, second = state.rig_from_camera[:2, :3, 2]
-    return float(np.degrees(np.arccos(min(abs(first @ second), 1.0))))
+    """Return the angle of the axes that fix the origin (`origin_camera`), 0 to 90 degrees."""
+    axes = state.rig_from_camera[:, :3, 2]
+    other = axes[origin_camera(np.swapaxes(state.rig_from_camera[:, :3, :3], -1, -2))]
+    return float(np.degrees(np.arccos(min(abs(axes[0] @ other), 1.0))))
 
 
 def parallel_notes(state: State) -> list[Note]:
-    """Return a note if the optical axes of the first two cameras are nearly parallel."""
+    """Return a note if the optical axes are nearly parallel: `axes_angle_deg`."""
     if len(state.rig_from_camera) < 2 or axes_angle_deg(state) > NEAR_PARALLEL_DEG:
         return []
     words = (

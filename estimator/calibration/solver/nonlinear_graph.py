@@ -62,7 +62,8 @@ def nonlinear_graph(problem: Problem, start: State) -> tuple[Any, Any, Keys]:
             graph.add(gtsam.PriorFactorVector(keys.intrinsics[c], mean, noise))
             values.insert(keys.intrinsics[c], np.zeros(len(free)))
         if c:
-            graph.add(depth_gauge_factor(keys.camera[c], problem.gauge_sigma_mm, second=c == 1))
+            both = c == problem.origin_camera
+            graph.add(depth_gauge_factor(keys.camera[c], problem.gauge_sigma_mm, both=both))
             values.insert(keys.camera[c], gtsam.Pose3(start.rig_from_camera[c]))
     for key, view in zip(keys.view, start.rig_from_target):
         graph.add(place_factor(key, system.place_sigma_mm))

@@ -93,6 +93,8 @@ class Problem:
     hold_scales : if all lenses have perspective, whether their scales are held at nominal. Each
         camera's origin is then at the depth at which its scale is the nominal one, and not where
         the optical axes come closest.
+    origin_camera : index of the camera whose optical axis fixes, with the first one's, the rig's
+        origin (`known_target.origin_camera`).
     """
 
     cameras: tuple[Camera, ...]
@@ -113,6 +115,7 @@ class Problem:
     solver: str = "auto"
     outlier_sd: float = OUTLIER_SD
     hold_scales: bool = False
+    origin_camera: int = 1
 
     @property
     def scales_held(self) -> bool:
@@ -496,11 +499,11 @@ class System:
             value = (state.intrinsics[c] - nominal.intrinsics)[free] / sigma
             jacobian = np.diag(unit / sigma)
             if c:
-                # only the second camera fixes the origin along the axis of the first camera
+                # only one camera fixes the origin along the axis of the first camera
                 gauge, by_pose = depth_gauge_residual(
                     state.rig_from_camera[c], problem.gauge_sigma_mm
                 )
-                first = 0 if c == 1 else 1
+                first = 0 if c == problem.origin_camera else 1
                 value = np.concatenate([value, gauge[first:]])
                 whole = np.zeros((len(value), len(free) + 6))
                 whole[: len(free), : len(free)] = jacobian

@@ -352,18 +352,40 @@ def perspective_from_maps(
     return float(kappas[order[int(np.searchsorted(share, 0.5))]])
 
 
+def origin_camera(camera_from_rig: Array) -> int:
+    """Return the index of the camera whose axis fixes, with the first one's, the rig's origin.
+
+    It is the second camera, unless its optical axis is nearly parallel to the first one's and that
+    of a further camera is less so. camera_from_rig : (C, 3, 3).
+    """
+    sines = np.linalg.norm(camera_from_rig[:, :2, 2], axis=-1)
+    return 1 if len(sines) < 3 or sines[1] > NEAR_PARALLEL else 1 + int(sines[1:].argmax())
+
+
+def offset_freedom(camera_from_rig: Array) -> Array:
+    """Return the offsets (C, 2, 2 C - 3) in mm of C > 2 telecentric cameras by each free number.
+
+    The offset of the `origin_camera` along the image of the first axis is held at zero.
+    camera_from_rig : (C, 3, 3).
+    """
+    count, origin = len(camera_from_rig), origin_camera(camera_from_rig)
+    along = camera_from_rig[origin][:2, 2] / np.linalg.norm(camera_from_rig[origin][:2, 2])
+    freedom = np.zeros((count, 2, 2 * count - 3))
+    freedom[origin, :, 0] = -along[1], along[0]
+    others = [c for c in range(1, count) if c != origin]
+    for at, c in enumerate(others):
+        freedom[c, :, 2 * at + 1 : 2 * at + 3] = np.eye(2)
+    return freedom
+
+
 def _place_views(views: Array, shifts: dict[tuple[int, int], Array], cameras: Array) -> Array:
     """Write each view's translation; return the cameras' (C, 2) offsets, gauge-fixed.
 
-    Along the image of the first axis in the second camera the offset is held at zero.
+    Along the image of the first axis in the `origin_camera` the offset is held at zero.
     """
     if len(cameras) == 2:
         return np.array([np.zeros(2), _place_views_of_two(views, shifts, cameras[1])])
-    along = cameras[1][:2, 2] / np.linalg.norm(cameras[1][:2, 2])
-    freedom = np.zeros((len(cameras), 2, 2 * len(cameras) - 3))
-    freedom[1, :, 0] = -along[1], along[0]
-    for c in range(2, len(cameras)):
-        freedom[c, :, 2 * c - 3 : 2 * c - 1] = np.eye(2)
+    freedom = offset_freedom(cameras)
     at = 3 * len(views)
     design = np.zeros((len(shifts), 2, at + freedom.shape[-1]))
     for row, (v, c) in zip(design, shifts):

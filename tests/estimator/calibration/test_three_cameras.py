@@ -129,6 +129,24 @@ def test_views_of_two_cameras_only_leave_an_offset_open(scene: Any) -> None:
     assert own @ block @ own > 1.0
 
 
+@pytest.mark.parametrize("solver", ["gtsam", "schur"])
+def test_opposite_first_cameras_leave_the_origin_to_the_third(scene: Any, solver: str) -> None:
+    """Cameras at 0, 90, 180 degrees have the same origin and depths in the order 0, 180, 90."""
+    target = replace(scene("three", 0).target, two_sided=True)
+    made = scene("three", 1, target=target, angle_deg=90.0, seen_by=(("left", "middle", "right"),))
+    left, middle, right = made.cameras
+    points, sd = np.array([[1.0, 2.0, 3.0], [5.0, -4.0, 2.0]]), []
+    for cameras in ([left, middle, right], [left, right, middle]):
+        found = replace(made, cameras=cameras).calibrate("radial", solver=solver)
+        assert found.verdict["status"] == "GOOD" and not found.notes, (found.verdict, found.notes)
+        assert abs(found.camera("middle").rig_from_camera.translation_mm[2]) < 1e-5
+        uv = {c.name: c.project(points) for c in found.cameras}
+        covariance = found.triangulate(uv, sigma_px=0.05).covariance_mm2
+        sd.append(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
+    assert "the optical axes of cameras 'left' and 'middle' come" in found.diagnostics["gauge"]
+    np.testing.assert_allclose(sd[0], sd[1], rtol=1e-3)
+
+
 def test_two_groups_without_a_common_view_are_named(scene: Any) -> None:
     cameras = tuple(CameraConfig(name, (512, 512)) for name in NAMES)
     made = scene("three", 3, cameras=cameras, angle_deg=35.0, seen_by=(("a", "b"), ("c", "d")))

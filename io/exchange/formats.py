@@ -146,6 +146,7 @@ def export_results(
     used.
     """
     from telerig.io.exchange.export.run_results import (
+        CalibratedCameras,
         cameras_of,
         read_results,
         results_root,
@@ -156,8 +157,9 @@ def export_results(
     if to not in known:
         raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
     _refuse_options_of_others(to, run=run, calibration=calibration, **options)
-    rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
-    results = None
+    rig, results = CalibratedCameras(), None
+    if to in CAMERA_EXPORTS or "cameras" in known[to].options:
+        rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
     if to in RUN_EXPORTS:
         results = read_results(run_folder(source, run), accept=accept)
     name = to if results is None else results.name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import h5py
@@ -23,6 +24,7 @@ from telerig.io.exchange.export.run_results import (
     unit_of,
 )
 from telerig.io.exchange.export.tables import write_hdf5, write_mat, write_trackpy
+from telerig.io.exchange.formats import export_results
 from telerig.io.files.csv_table import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -231,3 +233,15 @@ def test_only_the_results_of_runs_are_taken_for_runs(folder: Path, tmp_path: Pat
     elsewhere.mkdir()
     with pytest.raises(InputError, match="neither a dataset nor a folder of results"):
         run_folder(elsewhere, None)
+
+
+def test_only_formats_with_cameras_read_the_calibration(folder: Path, tmp_path: Path) -> None:
+    dataset = tmp_path / "dataset"
+    shutil.copytree(folder, dataset / "results" / "run1")
+    (dataset / "results" / "calibration").mkdir()
+    (dataset / "results" / "calibration" / "calibration.json").write_text("{", encoding="utf-8")
+    for to in ("netcdf", "trackpy"):
+        export_results(dataset, to, out=tmp_path / to)
+        assert (tmp_path / to).stat().st_size > 0
+    with pytest.raises(InputError, match="cannot be read as JSON"):
+        export_results(dataset, "hdf5", out=tmp_path / "hdf5")

@@ -465,7 +465,8 @@ def read_joint_covariance(file: Path) -> tuple[tuple[str, ...], Array]:
     """Read covariance.npz, the covariance of all estimated parameters of a calibration.
 
     Returns the names of the parameters and their covariance (parameters, parameters). Both are
-    empty when the file does not exist.
+    empty when the file does not exist. A parameter that no measurement touches has an infinite
+    variance.
     Raises InputError for a file that cannot be read or whose arrays do not fit together.
     """
     if not file.is_file():
@@ -474,7 +475,8 @@ def read_joint_covariance(file: Path) -> tuple[tuple[str, ...], Array]:
     names, matrix = tuple(str(name) for name in archive["names"].tolist()), archive["covariance"]
     if matrix.shape != (len(names), len(names)):
         raise _broken(file, f"{len(names)} names, but a covariance of shape {matrix.shape}")
-    if matrix.dtype.kind != "f" or not np.isfinite(matrix).all():
+    known = np.isfinite(matrix) if matrix.dtype.kind == "f" else np.zeros(matrix.shape, bool)
+    if not (known | ((matrix == np.inf) & np.eye(len(matrix), dtype=bool))).all():
         raise _broken(file, "the covariance holds what is not a finite number")
     return names, matrix
 

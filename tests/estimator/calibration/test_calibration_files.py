@@ -51,6 +51,17 @@ def assert_same(a: Calibration, b: Calibration) -> None:
         assert json.dumps(getattr(a, part), default=float) == json.dumps(getattr(b, part))
 
 
+def test_a_view_without_a_kept_dot_is_written_and_read(scene: Any, tmp_path: Path) -> None:
+    made = scene("paper", 1)
+    dots = made.dots
+    few = (dots["view"] != "view08") | ((dots["dot"] < 3) & (dots["camera"] == "left"))
+    found = made.with_dots(dots[few]).calibrate("radial")
+    assert np.isinf(found.joint_covariance.diagonal()).sum() == 3  # the pose's rotation
+    found.save(tmp_path / "calibration")
+    loaded = load_calibration(tmp_path / "calibration")
+    np.testing.assert_array_equal(loaded.joint_covariance, found.joint_covariance)
+
+
 def test_round_trip(calibration: Calibration, saved: Path) -> None:
     for path in (saved, saved / "calibration.json", str(saved)):
         loaded = load_calibration(path)

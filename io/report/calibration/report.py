@@ -158,6 +158,4 @@ def _pictures(
 def contact_sheet(results: CalibrationResults, page_folder: Path | None = None) -> ContactSheet:
     """Return the overlays of a calibration. Raises InputError for a picture that cannot be read."""
     views = list(results.views) if results.overlays else []
-    return picture_sheet(
-        views, results.camera_names, results.overlays, page_folder=page_folder
-    )
+    return picture_sheet(views, results.camera_names, results.overlays, page_folder=page_folder)

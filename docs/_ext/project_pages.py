@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -61,16 +60,17 @@ def with_links(text: str, docname: str) -> str:
 
 
 def modules() -> dict[str, list[str]]:
-    """Package to its public modules, from pyproject.toml's folders."""
-    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
-    folders: dict[str, str] = tools["setuptools"]["package-dir"]
+    """Package to its public modules, from the folders below `src/telerig`."""
+    source = ROOT / "src"
+    folders = sorted(Path(folder) for folder, _, _ in os.walk(source, followlinks=True))
     return {
-        package: sorted(
-            f"{package}.{path.stem}"
-            for path in (ROOT / folder).glob("*.py")
+        ".".join(folder.relative_to(source).parts): sorted(
+            ".".join(path.relative_to(source).with_suffix("").parts)
+            for path in folder.glob("*.py")
             if not path.stem.startswith("_")
         )
-        for package, folder in folders.items()
+        for folder in folders
+        if (folder / "__init__.py").is_file()
     }
 
 

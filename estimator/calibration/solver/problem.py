@@ -189,6 +189,18 @@ class Problem:
         }
         return replace(self, **parts)
 
+    def renumbered(self, ids: Ints) -> Problem:
+        """Return the problem with other ids (M,) of its measured dots, and no known distance."""
+        dot_ids = np.unique(ids)
+        return replace(
+            self,
+            dot_ids=dot_ids,
+            nominal_mm=self.target.nominal_mm(dot_ids),
+            dot_sigma_mm=np.tile(self.dot_sigma_mm[0], (len(dot_ids), 1)),
+            dot=np.searchsorted(dot_ids, ids),
+            scale=None,
+        )
+
     def free_indices(self, camera: int) -> Ints:
         """Return the indices into `PARAMETERS` of one camera's free intrinsics."""
         return np.array([INDEX[p] for p in self.free[camera]], int)
@@ -307,7 +319,7 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
         covariance_px2=covariance,
         weight=np.ones(len(table)),
         free=tuple(("scale_px_per_mm",) for _ in cameras),
-        scale=_scale(target, ids),
+        scale=known_scale(target, ids),
         plate_shift=np.zeros((len(views), len(cameras))),
     )
 
@@ -353,7 +365,14 @@ def _check(table: pd.DataFrame, names: Sequence[str], target: Target) -> None:
             )
 
 
-def _scale(target: Target, ids: NDArray[np.int64]) -> tuple[tuple[int, int], float, float] | None:
+def known_scale(
+    target: Target, ids: NDArray[np.int64]
+) -> tuple[tuple[int, int], float, float] | None:
+    """Return `Problem.scale` for the dots with some ids (N,), ascending.
+
+    Raises CalibrationError if one of the two dots is not among them, or if the stated distance
+    contradicts the nominal positions.
+    """
     if target.scale_dots is None or target.scale_distance_mm is None:
         return None
     missing = [d for d in target.scale_dots if d not in ids]

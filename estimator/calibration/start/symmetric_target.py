@@ -12,7 +12,7 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import Problem, known_scale
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve
 from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
@@ -41,6 +41,7 @@ def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[
     if len(problem.cameras) > 1:
         problem = _numbered_alike_in_cameras(problem, labels, nominal_rotvec_deg)
     problem, contrast = _numbered_alike_in_views(problem, labels)
+    problem = replace(problem, scale=known_scale(problem.target, problem.dot_ids))
     problem, about_scale = _scale_of_any_turn(problem, labels)
     cameras = "both cameras" if len(problem.cameras) <= 2 else "all cameras"
     many = f"{len(labels)}-fold symmetric target without marks"
@@ -79,18 +80,12 @@ def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, l
 
 
 def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:
-    ids = problem.dot_ids[problem.dot].copy()
+    """Return the problem with turned numbers in some images, and without a known distance."""
+    ids = problem.dot_ids[problem.dot]
     for (v, c), label in choice.items():
         rows = (problem.view == v) & (problem.camera == c)
         ids[rows] = label[ids[rows]]
-    known = np.searchsorted(problem.dot_ids, ids)
-    if not np.array_equal(problem.dot_ids[known], ids):
-        raise CalibrationError(
-            "the target is symmetric, and if it is turned into another orientation some of its "
-            "dots get numbers that were found in no image",
-            todo="put marks on the target, or leave out views that show only a part of it",
-        )
-    return replace(problem, dot=known)
+    return problem.renumbered(ids)
 
 
 def _numbered_alike_in_cameras(
@@ -209,7 +204,7 @@ def _numbered_alike_in_views(problem: Problem, labels: list[Ints]) -> tuple[Prob
     else:
         start = known_target.mono_state(held, held.nominal_mm)
     rough = robust_solve(held.with_model("tangential"), start)
-    marks = _print_errors(rough.problem, rough.solution.state)
+    marks = _print_errors(rough.problem, rough.solution.state, len(labels[0]))
     turned = np.array([_turned(marks, label, k, len(labels)) for k, label in enumerate(labels)])
     choice = _most_alike_turns(turned)
     contrast = _contrast(turned, choice)
@@ -226,7 +221,7 @@ def _most_alike_turns(turned: Array) -> Ints:
     choice = min(starts, key=lambda c: _scatter(turned[c, views]))
     for _ in range(10):
         chosen = turned[choice, views]
-        others = np.array([np.nanmean(np.delete(chosen, v, 0), 0) for v in views])
+        others = np.array([_mean(np.delete(chosen, v, 0)) for v in views])
         before, choice = choice, _misfits(turned, others).argmin(0)
         if np.array_equal(before, choice):
             break
@@ -234,23 +229,40 @@ def _most_alike_turns(turned: Array) -> Ints:
 
 
 def _misfits(turned: Array, others: Array) -> Array:
-    """Return mean square differences (T, V) of views' turns from print errors (V or 1, N, 2)."""
-    return np.asarray(np.nanmean((turned - others) ** 2, (2, 3)))
+    """Return mean square differences (T, V) of views' turns from print errors (V or 1, N, 2).
+
+    They are infinite where the two have no dot in common.
+    """
+    squares = (turned - others) ** 2
+    many = np.isfinite(squares).sum((2, 3))
+    return np.where(many > 0, np.nansum(squares, (2, 3)) / np.maximum(many, 1), np.inf)
+
+
+def _mean(marks: Array) -> Array:
+    """Return the mean (N, 2) over the views that see a dot; NaN for a dot that none sees."""
+    many = np.isfinite(marks).sum(0)
+    return np.where(many > 0, np.nansum(marks, 0) / np.maximum(many, 1), np.nan)
 
 
 def _scatter(marks: Array) -> float:
-    return float(np.nansum((marks - np.nanmean(marks, 0)) ** 2))
+    """Return the variance of print errors (V, N, 2) between the views."""
+    seen = np.isfinite(marks).sum(0)
+    freedom = np.maximum(seen - 1, 0).sum()
+    return float(np.nansum((marks - _mean(marks)) ** 2) / max(freedom, 1))
 
 
-def _print_errors(problem: Problem, state: State) -> Array:
-    """Return (V, N, 2) where views see dots, minus nominal, in the target's plane (mm)."""
+def _print_errors(problem: Problem, state: State, count: int) -> Array:
+    """Return (V, N, 2) where views see the target's N dots, minus nominal, in its plane (mm).
+
+    NaN for a dot that a view does not show.
+    """
     obs = problem.observations()
     jac = whitened_residuals(state, obs, problem.rho_mm)
-    normal = np.zeros((len(problem.views), len(problem.dot_ids), 2, 2))
+    normal = np.zeros((len(problem.views), count, 2, 2))
     right = np.zeros((*normal.shape[:2], 2))
-    plane = jac.by_dot[..., :2]
-    np.add.at(normal, (obs.view, obs.dot), np.swapaxes(plane, -1, -2) @ plane)
-    np.add.at(right, (obs.view, obs.dot), -np.einsum("mij,mi->mj", plane, jac.value))
+    plane, dot = jac.by_dot[..., :2], problem.dot_ids[obs.dot]
+    np.add.at(normal, (obs.view, dot), np.swapaxes(plane, -1, -2) @ plane)
+    np.add.at(right, (obs.view, dot), -np.einsum("mij,mi->mj", plane, jac.value))
     unseen = np.linalg.det(normal) <= 0
     normal[unseen] = np.eye(2)
     errors = np.linalg.solve(normal, right[..., None])[..., 0]
@@ -270,8 +282,7 @@ def _contrast(turned: Array, choice: Ints) -> float:
     worst = np.inf
     for v in range(len(choice)):
         others = np.delete(chosen, v, 0)
-        mean = np.nanmean(others, 0)
-        scatter = np.nanvar(others, axis=0).mean() + 1e-18
-        costs = np.sort(np.nansum((turned[:, v] - mean) ** 2, (1, 2)) / scatter)
+        squares = (turned[:, v] - _mean(others)) ** 2 / (_scatter(others) + 1e-18)
+        costs = np.sort(np.nansum(squares, (1, 2)))
         worst = min(worst, np.sqrt(max(0.0, costs[1] - costs[0])))
     return float(worst)

@@ -56,6 +56,18 @@ def test_images_turned_at_random(seed: int, target: Target | None, scene: Any) -
     assert any("numbered so that both cameras and all views agree" in n for n in calibration.notes)
 
 
+@pytest.mark.parametrize("turn", [False, True], ids=["numbered alike", "turned at random"])
+def test_dots_that_no_image_shows(turn: bool, scene: Any) -> None:
+    """Every real plate has a hidden dot: an image's numbering turns it into another number."""
+    right = scene("symmetric", 1)
+    right = right.with_dots(right.dots[~right.dots["dot"].isin([3, 31])].reset_index(drop=True))
+    made = turned(right, 1)[0] if turn else right
+    calibration = made.calibrate("radial")
+    assert settled(calibration, made, right.dots["dot"]) != []
+    assert len(calibration.target_points_mm) == len(made.target.ids()) - 2
+    assert calibration.statistics["share_kept"] > 0.995
+
+
 def test_outliers_do_not_confuse_the_turns(scene: Any) -> None:
     right = scene("symmetric", 1, outlier_share=0.05)
     made, _ = turned(right, 1)

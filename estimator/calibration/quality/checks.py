@@ -461,7 +461,9 @@ def wrong_pairs(problem: Problem, dots_mm: Array) -> str:
         offsets = [0, *(s * n for n in range(1, FARTHEST + 1) for s in (1, -1))]
         costs = np.array([[_cost(problem, dots_mm, c, v, s) for s in offsets] for v in starts])
         best = costs.argmin(1)
-        clear = (best > 0) & (costs.min(1) < FAR_BETTER * costs[:, 0])
+        # a window that has no solution, for example without a shared view, proves nothing
+        clear = (best > 0) & np.isfinite(costs[:, 0])
+        clear &= costs.min(1) < FAR_BETTER * np.where(clear, costs[:, 0], 0.0)
         if not clear.any():
             continue
         chosen = int(np.bincount(best[clear]).argmax())

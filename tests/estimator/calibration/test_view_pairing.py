@@ -39,6 +39,19 @@ def test_images_under_the_names_of_other_views_are_refused(first: int, by: int, 
     assert "same file name" in text
 
 
+def test_views_that_no_two_cameras_share_hide_no_other_error(paper: Any) -> None:
+    """Windows of three such views have no solution, whatever the offset of the images."""
+    first = sorted(paper.dots["view"].unique())[:3]
+    made = paper.changed(
+        lambda dots: dots[(dots["camera"] != "right") | ~dots["view"].isin(first)].reset_index(
+            drop=True
+        )
+    )
+    made = replace(made, nominal_rotvec_deg=None)
+    with pytest.raises(CalibrationError, match="mirror"):
+        made.calibrate("radial")
+
+
 def copied(dots: pd.DataFrame, camera: str | None, noise_px: float) -> pd.DataFrame:
     """The first view of a camera, or of all, once more as the last view."""
     views = sorted(dots["view"].unique())

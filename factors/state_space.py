@@ -444,18 +444,19 @@ def _steps(components: Sequence[Component], which: Sequence[int], lengths_s: Arr
     )  # fmt: skip
 
 
-def exact_step(drift: Array, noise: Array, dt_s: float) -> tuple[Array, Array]:
-    """Return the transition and the covariance, both (n, n), of x' = F x + L w over one step.
+def exact_step(drift: Array, noise: Array, dt_s: float | Array) -> tuple[Array, Array]:
+    """Return the transition and the covariance, both (n, n), of x' = F x + L w over one step, or
+    both (U, n, n) over steps of the lengths dt_s (U,).
 
     drift : (n, n) F.
     noise : (n, m) L.
 
     The covariance may be singular.
     """
-    transition, covariance = _exact_steps(
-        drift[None], noise[None], np.array([dt_s]), _integrations(drift, noise)
-    )
-    return transition[0], covariance[0]
+    lengths = np.atleast_1d(np.asarray(dt_s, float))
+    f, gain = (np.repeat(a[None], len(lengths), 0) for a in (drift, noise))
+    transition, covariance = _exact_steps(f, gain, lengths, _integrations(drift, noise))
+    return (transition, covariance) if np.ndim(dt_s) else (transition[0], covariance[0])
 
 
 def _exact_steps(drift: Array, noise: Array, dt_s: Array, orders: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,10 +28,11 @@ from telerig.factors.bubble_motion import (
     Inertia,
     LowPasses,
     Prior,
+    Triple,
     bubble_processes,
     inertial_bubble_path,
 )
-from telerig.factors.state_space import Component, discretise, distinct_steps
+from telerig.factors.state_space import Component, distinct_steps, exact_step
 
 RigErrors = tuple[Array, Array]
 """Draws of the errors of shake (N, D, K) and constants (n, K)."""
@@ -257,36 +259,61 @@ class _Paths:
     def log_likelihood(self, values: Array) -> float:
         """Return it for the values (3,) of `learned`."""
         time_s, forces, noise = values.tolist()
-        inertia, total = Inertia((time_s,) * 3, (forces,) * 3), 0.0
+        total = 0.0
         for direction, series in zip(self.directions, self.series, strict=True):
-            process = inertial_bubble_path(self.bubble, direction, inertia)
-            sigma = self.bubble.mean_sigma_mm_s
-            total += log_likelihood(process, sigma, self.dt_s, series, noise)
+            moves = _moves_of(
+                self.bubble, tuple(direction.tolist()), time_s, forces, self.dt_s.tobytes()
+            )
+            total += log_likelihood(moves, series, noise)
         return total
 
 
-def log_likelihood(
-    process: Component, mean_sigma_mm_s: float, dt_s: Array, paths: Sequence[Series], noise: float
-) -> float:
-    """Return its expectation over the draws of the rig, up to a constant."""
-    from telerig.estimator.smoothing.graph.kernels import filtered
+class Moves(NamedTuple):
+    """A process and its constant mean as one state (s,), over steps of U lengths.
 
-    steps, size = discretise([process], dt_s)[0], process.size
-    transition, extra = np.zeros((2, len(dt_s), size + 1, size + 1))
-    transition[:, :size, :size], transition[:, :size, size:] = steps.transition[0], steps.input[0]
-    transition[:, size, size] = 1.0
-    extra[:, :size, :size] = steps.covariance[0]
-    begin = np.zeros((size + 1, size + 1))
+    begin : (s, s) covariance of the first state.
+    transition, extra : (U, s, s) of each step, and the covariance that it adds.
+    """
+
+    begin: Array
+    transition: Array
+    extra: Array
+
+
+@lru_cache(maxsize=16)
+def _moves_of(
+    bubble: BubbleModel, direction: Triple, time_s: float, forces: float, dt_s: bytes
+) -> Moves:
+    """Return the moves along a direction. The optimiser changes the noise alone in every third or
+    fourth call, which changes none of them."""
+    inertia = Inertia((time_s,) * 3, (forces,) * 3)
+    process = inertial_bubble_path(bubble, np.array(direction), inertia)
+    return moves_of(process, bubble.mean_sigma_mm_s, np.frombuffer(dt_s))
+
+
+def moves_of(process: Component, mean_sigma_mm_s: float, dt_s: Array) -> Moves:
+    """Return the moves of a process with one input, its mean, over steps of lengths dt_s (U,)."""
+    size = process.size
+    drift, begin = np.zeros((2, size + 1, size + 1))
+    drift[:size, :size], drift[:size, size:] = process.drift, process.input
     begin[:size, :size] = process.start_covariance
     pushed = mean_sigma_mm_s * np.append(process.start_from_input, 1.0)
     begin += np.outer(pushed, pushed)
+    noise = np.vstack([process.noise, np.zeros_like(process.noise[:1])])
+    return Moves(begin, *exact_step(drift, noise, dt_s))
+
+
+def log_likelihood(moves: Moves, paths: Sequence[Series], noise: float) -> float:
+    """Return its expectation over the draws of the rig, up to a constant."""
+    from telerig.estimator.smoothing.graph.kernels import filtered
+
     total = 0.0
     for step, values, variance in paths:
         columns = values.shape[1]
         squares = np.zeros(columns)
         total += filtered(
-            np.zeros((size + 1, columns)), begin.copy(), transition, extra, step, values,
-            noise**2 * variance, squares,
+            np.zeros((len(moves.begin), columns)), moves.begin.copy(), moves.transition,
+            moves.extra, step, values, noise**2 * variance, squares,
         )  # fmt: skip
         total -= (squares[0] + (squares[1:].mean() if columns > 1 else 0.0)) / 2
     return float(total)

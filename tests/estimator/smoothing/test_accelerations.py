@@ -254,8 +254,9 @@ def test_the_filters_likelihood_is_that_of_dense_algebra() -> None:
     variance[4] = np.inf
     dt_s, index = distinct_steps(np.diff(t))
     found = low_pass.log_likelihood(
-        process, 300.0, dt_s, [low_pass.Series(index, values, variance / 4)], 2.0
-    )
+        low_pass.moves_of(process, 300.0, dt_s),
+        [low_pass.Series(index, values, variance / 4)], 2.0,
+    )  # fmt: skip
     size = process.size + 1
     drift, gain = np.zeros((size, size)), np.zeros((size, process.noise.shape[1]))
     drift[:-1, :-1], drift[:-1, -1:], gain[:-1] = process.drift, process.input, process.noise

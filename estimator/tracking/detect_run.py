@@ -29,6 +29,7 @@ from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.background.from_run import LEAST_FRAMES
 from telerig.estimator.bubbles.detect import find_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.field import described_field
+from telerig.estimator.bubbles.outline.blobs import Rejected
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import atomic_path, write_json_atomic
@@ -47,7 +48,9 @@ Batch = tuple[int, int]
 FRAMES_FOR_WORKERS = 40
 """Below this, starting fresh worker processes costs more than it saves."""
 
-_LARGEST_BATCH = 64
+_BATCHES, _LEAST_BATCH, _LARGEST_BATCH = 64, 4, 64
+"""A run has about so many batches, and a batch so many frames. They do not depend on the number of
+cores, so that a run can go on with another one."""
 
 
 @dataclass(frozen=True)
@@ -174,14 +177,15 @@ class DetectionStore:
     continue.
 
     The folder belongs to one fingerprint of input and options; it is emptied if the fingerprint is
-    a different one. It holds tables of two kinds: "detections" of bubbles and "dots" of a strip.
+    a different one. It holds tables of three kinds: "detections" of bubbles, "rejected" shadows
+    beside them, and "dots" of a strip.
     """
 
-    def __init__(self, folder: Path, fingerprint: str, frame_count: int, workers: int) -> None:
+    def __init__(self, folder: Path, fingerprint: str, frame_count: int) -> None:
         self.folder, self.frame_count = folder, frame_count
-        size = int(np.clip(frame_count // (4 * workers), 4, _LARGEST_BATCH))
+        size = int(np.clip(frame_count // _BATCHES, _LEAST_BATCH, _LARGEST_BATCH))
         self.batches = list(pairwise([*range(0, frame_count, size), frame_count]))
-        state = {"fingerprint": fingerprint, "batch": size}
+        state = {"fingerprint": fingerprint}
         mark = folder / "work.json"
         if not (mark.is_file() and json.loads(mark.read_bytes()) == state):
             shutil.rmtree(folder, ignore_errors=True)
@@ -193,8 +197,8 @@ class DetectionStore:
     def missing(self, kind: str = "detections") -> list[Batch]:
         return [b for b in self.batches if not self.path(b, kind).is_file()]
 
-    def tables(self) -> Iterator[pd.DataFrame]:
-        return (read_batch(self.path(batch)) for batch in self.batches)
+    def tables(self, kind: str = "detections") -> Iterator[pd.DataFrame]:
+        return (read_batch(self.path(batch, kind)) for batch in self.batches)
 
     def fill(
         self,
@@ -314,40 +318,53 @@ def detect_missing(
     """
     if executor is None:
         load_compiled_loops()
-    table_of = partial(_detect_batch, scene)
+    table_of = partial(_detect_batch, scene, store)
     store.fill("detections", table_of, progress, "detection", executor)
 
 
-def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:
+def _detect_batch(scene: Scene, store: DetectionStore, batch: Batch) -> pd.DataFrame:
+    """Return the bubbles of a batch, after the shadows that are none were written."""
     keep_freed_memory()
-    tables = [
+    found = [
         _detect(scene, camera, frame) for frame in range(*batch) for camera in scene.run.cameras
     ]
+    bubbles, rejected = map(joined, zip(*found))
+    write_table(rejected, store.path(batch, "rejected"))
+    return bubbles
+
+
+def joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of one or more tables in one; columns of empty tables have no type."""
     return pd.concat([t for t in tables if len(t)] or tables[:1], ignore_index=True)
 
 
-def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
-    """Detect the bubbles of an image; without any the reason is the only row."""
+def _detect(scene: Scene, camera: str, frame: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Detect the bubbles of an image; without any the reason is the only row.
+
+    Returns them, and the shadows that are no bubbles (`Bubbles.rejected`).
+    """
     image, strip = scene.image(camera, frame), scene.strips.get(camera)
-    if image is None:
-        found, reason = pd.DataFrame(columns=DETECTION_COLUMNS), "no image"
-    else:
+    found, reason = pd.DataFrame(columns=DETECTION_COLUMNS), "no image"
+    rejected = pd.DataFrame(columns=Rejected._fields)
+    if image is not None:
         level = scene.backgrounds[camera].of_frame(frame)
         try:
-            found = find_bubbles(
+            bubbles = find_bubbles(
                 image, background=level, field=scene.fields.get(camera),
                 min_diameter_px=scene.min_diameter_px, crowds=True,
-            ).accepted  # fmt: skip
+            )  # fmt: skip
         except InputError as error:
             raise InputError(
                 error.what, where=f"camera {camera}, frame {frame}", todo=error.todo
             ) from error
+        found, rejected = bubbles.accepted, bubbles.rejected
         if strip is not None and len(found):
             found = found[~strip.are_dots(frame, found)].reset_index(drop=True)
         reason = str(found.attrs.get("reason", "")) or "no bubble" if found.empty else ""
     if found.empty:
         found = pd.DataFrame({name: [np.nan] for name in DETECTION_COLUMNS}).assign(flags="")
-    return found.assign(frame=frame, camera=camera, reason=reason)
+    found = found.assign(frame=frame, camera=camera, reason=reason)
+    return found, rejected.assign(frame=frame, camera=camera)
 
 
 def described_strip(run: RunData) -> ReferencesDescription | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,17 +17,15 @@ import numpy as np
 import pandas as pd
 
 from telerig.errors import InputError
-from telerig.estimator.bubbles.detect import find_bubbles, outline_points
-from telerig.estimator.calibration.result.calibration import pair_of_run
-from telerig.estimator.tracking.detect_run import Progress, Scene, make_scene, mask_files
+from telerig.estimator.bubbles.detect import outline_points
+from telerig.estimator.bubbles.outline.blobs import Rejected
+from telerig.estimator.tracking.detect_run import DetectionStore, Progress, joined, mask_files
 from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.track import (
     TrackingStream,
     TrackOptions,
-    check_calibration,
     ids_of,
     numbers_of,
-    stage_axis,
     tracking_stream,
 )
 from telerig.estimator.tracking.tracks import events_table
@@ -130,15 +128,8 @@ def write_tracking(
         if table is not None:
             write_table(table, staged / "references.csv")
         write_json_atomic(staged / "run.json", _record(run, options, record))
-        if run.detections is None:
-            cameras = check_calibration(run, pair_of_run(calibration, run.cameras))
-            axis = stage_axis(run, calibration)
-            strips = stream.marks.strips if stream.marks is not None else None
-            scene = stream.scene or make_scene(
-                run, cameras, axis, options.min_diameter_px, strips=strips,
-                method=options.background,
-            )  # fmt: skip
-            _write_pictures(scene, summary, staged)
+        if stream.store is not None:
+            _write_pictures(run, stream.store, summary, staged)
         if report:
             from telerig.io.report.run.report import write_track_report
 
@@ -201,57 +192,50 @@ def _record(run: RunData, options: TrackOptions, record: Mapping[str, Any]) -> d
     return content
 
 
-def _write_pictures(scene: Scene, summary: Mapping[str, Any], staged: Path) -> None:
-    """Write overlays and binary pictures of the worst frames."""
+def _write_pictures(
+    run: RunData, store: DetectionStore, summary: Mapping[str, Any], staged: Path
+) -> None:
+    """Write overlays and binary pictures of the worst frames, from the tables."""
     frames = [int(w["frame"]) for w in summary["worst_frames"]]
-    tasks = [(c, f, _labels(staged, c, f)) for f in frames for c in scene.run.cameras]
-    draw = partial(_draw, scene, staged)
-    for _ in ordered_map(draw, tasks, quick_workers(len(tasks))):
+    written = pd.read_csv(
+        staged / "detections.csv", dtype={"camera": str, "flags": str},
+        chunksize=20_000, keep_default_na=False, na_values=[""],
+    )  # fmt: skip
+    found, rejected = _drawn(written, frames), _drawn(store.tables("rejected"), frames)
+    tasks = [
+        (c, f, *(t[(t["frame"] == f) & (t["camera"] == c)] for t in (found, rejected)))
+        for f in frames
+        for c in run.cameras
+    ]
+    for _ in ordered_map(partial(_draw, run, staged), tasks, quick_workers(len(tasks))):
         pass
 
 
-def _labels(staged: Path, camera: str, frame: int) -> pd.DataFrame:
-    chunks = pd.read_csv(
-        staged / "detections.csv", usecols=["frame", "camera", "particle", "u_px", "v_px"],
-        dtype={"camera": str}, chunksize=20_000, keep_default_na=False, na_values=[""],
-    )  # fmt: skip
-    found = [c[(c["frame"] == frame) & (c["camera"] == camera)] for c in chunks]
-    return pd.concat(found, ignore_index=True)
+def _drawn(tables: Iterable[pd.DataFrame], frames: Sequence[int]) -> pd.DataFrame:
+    """Return the rows of tables that have a place in an image of these frames."""
+    return joined(
+        [t[t["frame"].isin(frames) & np.isfinite(t["u_px"].to_numpy(float))] for t in tables]
+    )
 
 
-def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> None:
+def _draw(run: RunData, staged: Path, task: tuple[str, int, pd.DataFrame, pd.DataFrame]) -> None:
     from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
 
-    camera, frame, labels = task
-    image, plain = scene.run.image(camera, frame), scene.image(camera, frame)
-    if image is None or plain is None:
+    camera, frame, found, rejected = task
+    image = run.image(camera, frame)
+    if image is None:
         return
-    level = scene.backgrounds[camera].of_frame(frame)
-    bubbles = find_bubbles(
-        plain, background=level, field=scene.fields.get(camera),
-        min_diameter_px=scene.min_diameter_px,
-    )  # fmt: skip
-    found, rejected = bubbles.accepted, bubbles.rejected
-    outlines = [outline_points(row, _OUTLINE_POINTS) for _, row in found.iterrows()]
-    named = [_particle(labels, row) for _, row in found.iterrows()]
-    words = [f"{n} {row['flags']}".strip() for n, (_, row) in zip(named, found.iterrows())]
+    rows = [row for _, row in found.fillna({"flags": ""}).iterrows()]
+    outlines = [outline_points(row, _OUTLINE_POINTS) for row in rows]
+    named = ["" if pd.isna(row["particle"]) else f"{int(row['particle'])}" for row in rows]
+    words = [f"{n} {row['flags']}".strip() for n, row in zip(named, rows)]
     colours = [_GREEN if n else _ORANGE for n in named]
-    places = rejected[["u_px", "v_px", "radius_px"]].to_numpy(float).tolist()
-    marks = [(u, v, r, str(why)) for (u, v, r), why in zip(places, rejected["reason"])]
+    marks = [*rejected[[*Rejected._fields]].itertuples(index=False)]
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks)
     _write_image(staged / "overlays" / camera / f"{frame:06d}.jpg", picture[..., ::-1])
     _write_image(
         staged / "binary" / camera / f"{frame:06d}.png", draw_binary(image.shape, outlines)
     )
-
-
-def _particle(labels: pd.DataFrame, row: pd.Series[Any]) -> str:
-    """Return the id of the track of a detection; "" for none."""
-    near = np.hypot(labels["u_px"] - row["u_px"], labels["v_px"] - row["v_px"])
-    if not len(near) or not near.min() < 1e-6:
-        return ""
-    particle = labels["particle"].iloc[int(near.argmin())]
-    return "" if np.isnan(particle) else f"{int(particle)}"
 
 
 def _write_image(path: Path, picture: Any) -> None:

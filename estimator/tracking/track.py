@@ -29,7 +29,6 @@ from telerig.estimator.tracking.corrections import Corrections, read_corrections
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     Progress,
-    Scene,
     described_fields,
     described_strip,
     detect_missing,
@@ -44,7 +43,6 @@ from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
-from telerig.io.machine.parallel import cores
 from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, POINT
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
@@ -85,7 +83,7 @@ class TrackingStream:
 
     linker : turns detections into rows of the tables.
     frames_without : for each camera, how often each reason for a frame without bubbles occurred.
-    scene : backgrounds of the images; None if all detections existed before.
+    store : detections of the images; None if the run has a table of them.
     marks : marks that were followed in the images; None without a strip of dots.
     linked : the rows, which are computed while they are read.
     detections, points, particles : numbers of detections and points, and ids of tracks, so far.
@@ -100,7 +98,7 @@ class TrackingStream:
     calibration: Calibration
     linker: RowMaker
     frames_without: dict[str, dict[str, int]]
-    scene: Scene | None
+    store: DetectionStore | None
     marks: FollowedMarks | None
     linked: Iterator[Linked]
     corrections: Corrections
@@ -271,7 +269,7 @@ def tracking_stream(
     calibration = pair_of_run(calibration, run.cameras)
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
-    first_id, labels, scene, marks = 0, None, None, None
+    first_id, labels, store, marks = 0, None, None, None
     batches: Callable[[], Iterator[pd.DataFrame]]
     if run.detections is not None:
         numbers, labels = numbers_of(ids_of(run.detections))
@@ -289,7 +287,7 @@ def tracking_stream(
         strip = described_strip(run)
         if strip is not None:
             inputs["references"] = repr(strip)
-        store = DetectionStore(work, fingerprint(run, inputs), run.frame_count, cores())
+        store = DetectionStore(work, fingerprint(run, inputs), run.frame_count)
         if strip is not None:
             from telerig.estimator.tracking.follow_marks import follow_references
 
@@ -314,7 +312,7 @@ def tracking_stream(
     corrections = read_corrections(run.path, numbered=labels is None)
     rows = corrections.applied(rows)
     return TrackingStream(
-        run, calibration, linker, without, scene, marks, rows, corrections, names=labels
+        run, calibration, linker, without, store, marks, rows, corrections, names=labels
     )
 
 

@@ -172,6 +172,56 @@ def test_an_interrupted_run_goes_on_and_ends_alike(
     assert not list(tmp_path.glob(".*work"))
 
 
+def test_another_number_of_cores_takes_up_old_detections(
+    rise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count, missing = 3000, list[int]()
+    run = telerig.load_run(rise / "runs" / "rise")
+    run = replace(run, frame_count=count, t_s=np.arange(count) / 100.0, position_mm=None)
+
+    def stops(_scene: Any, store: detect_run.DetectionStore, *_: Any) -> None:
+        missing.append(len(store.missing()))
+        store.path(store.missing()[0]).write_text("frame\n", encoding="utf-8")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(track_module, "make_scene", lambda *_: None)
+    monkeypatch.setattr(track_module, "detect_missing", stops)
+    for cores in ("2", "16", "1"):
+        monkeypatch.setenv("TELERIG_CORES", cores)
+        with pytest.raises(KeyboardInterrupt):
+            tracking_stream(run, truth_calibration(), tmp_path / "work")
+    assert missing[0] - missing[1] == missing[1] - missing[2] == 1
+
+
+def test_pictures_show_what_the_tables_say(
+    rise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Detection is made to find the bubble elsewhere than it is, and a shadow that is none."""
+    original = detect_run._detect
+
+    def elsewhere(scene: Any, camera: str, frame: int) -> Any:
+        found, rejected = original(scene, camera, frame)
+        speck = {"u_px": 30.0, "v_px": 40.0, "radius_px": 6.0, "reason": "a speck"}
+        speck |= {"frame": frame, "camera": camera}
+        found["v_px"] += 25.0
+        return found, pd.concat([rejected, pd.DataFrame([speck])])
+
+    monkeypatch.setattr(detect_run, "_detect", elsewhere)
+    tracked(rise, tmp_path / "out")
+    table = pd.read_csv(tmp_path / "out" / "detections.csv", dtype={"camera": str})
+    pictures = sorted((tmp_path / "out" / "binary").glob("*/*.png"))
+    assert len(pictures) == 16
+    for path in pictures:
+        camera = path.parent.name
+        row = table[(table["camera"] == camera) & (table["frame"] == int(path.stem))].iloc[0]
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        v, u = np.argwhere(picture).mean(0)
+        assert (u, v) == pytest.approx((row["u_px"], row["v_px"]), abs=0.3)
+        overlay = cv2.imread(str(tmp_path / "out" / "overlays" / camera / f"{path.stem}.jpg"))
+        colour = np.ptp(overlay[36:45, 20:81].astype(int), axis=2)
+        assert colour[:, :21].max() > 60 and colour[:, 40:].max() < 30
+
+
 def test_results_inside_the_run_are_no_input(rise: Path, tmp_path: Path) -> None:
     """A run that belongs to no dataset has its results, and its work folder, inside."""
     data = tmp_path / "data"
@@ -187,11 +237,11 @@ def test_results_inside_the_run_are_no_input(rise: Path, tmp_path: Path) -> None
 
 
 def test_other_options_do_not_take_up_old_detections(rise: Path, tmp_path: Path) -> None:
-    store = detect_run.DetectionStore(tmp_path / "work", "one", 20, 1)
+    store = detect_run.DetectionStore(tmp_path / "work", "one", 20)
     store.path(store.batches[0]).write_text("frame\n", encoding="utf-8")
-    same = detect_run.DetectionStore(tmp_path / "work", "one", 20, 1)
+    same = detect_run.DetectionStore(tmp_path / "work", "one", 20)
     assert len(same.missing()) == len(same.batches) - 1
-    other = detect_run.DetectionStore(tmp_path / "work", "two", 20, 1)
+    other = detect_run.DetectionStore(tmp_path / "work", "two", 20)
     assert other.missing() == other.batches
 
 
@@ -395,11 +445,11 @@ def test_a_resumed_run_is_as_crowded_as_one_in_one_go(
     mask[: height // 3] = 0
     cv2.imwrite(str(data / "mask.png"), mask)
     monkeypatch.setattr(track_module, "is_crowded", lambda share, *_: bool(shares.append(share)))
-    for _ in range(2):  # the second time, all detections are there
+    for _ in range(2):
         stream = tracking_stream(run, truth_calibration(), tmp_path / "work")
         list(stream.rows)
         stream.summary()
-    assert stream.scene is None
+        monkeypatch.delattr(track_module, "make_scene", raising=False)  # all detections are there
     assert shares[2:] == pytest.approx(shares[:2])
 
 

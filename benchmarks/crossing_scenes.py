@@ -84,6 +84,14 @@ def crossing(
     blob_mm : closer than this they are one detection, half-way.
     """
     t_s = np.arange(-half_s, half_s, 1 / rate_hz) + rng.uniform(0, 1 / rate_hz)
+    lab = close_pass(t_s, separation_mm, rng)
+    px = float(np.exp(rng.uniform(np.log(0.05), np.log(0.5))))
+    close = np.linalg.norm(lab[:, 1] - lab[:, 0], axis=1) < blob_mm
+    return _seen(t_s, lab, close, px, shake_mm, rng)
+
+
+def close_pass(t_s: Array, separation_mm: float, rng: np.random.Generator) -> Array:
+    """(F, 2, 3) two bubbles that pass within 0.1 mm at time 0, so far apart 10 ms later."""
     fine = np.union1d(t_s, [0.0, 0.01])
     a, b = path(fine, rng), path(fine, rng)
     between = b - a
@@ -92,10 +100,7 @@ def crossing(
     slope = (_direction(rng) * separation_mm - between[at_10] - want_0 + between[at_0]) / 0.01
     b = b - between[at_0] + want_0 + fine[:, None] * slope
     keep = np.isin(fine, t_s)
-    px = float(np.exp(rng.uniform(np.log(0.05), np.log(0.5))))
-    lab = np.stack([a[keep], b[keep]], 1)
-    close = np.linalg.norm(lab[:, 1] - lab[:, 0], axis=1) < blob_mm
-    return _seen(t_s, lab, close, px, shake_mm, rng)
+    return np.stack([a[keep], b[keep]], 1)
 
 
 def _direction(rng: np.random.Generator) -> Array:

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import telerig.estimator.dots.locate as dots
+import telerig
 
 sys.path.insert(0, str(Path(__file__).parent))
 from dot_renderer import Scene, centre_bound_px, picture, render, tilted_disc
@@ -194,7 +194,7 @@ def run_case(case: Case, seed: int, *, wanted: int) -> Score:
         clean = render(scene)
         for _ in range(2):
             image = picture(clean, case.noise * case.contrast, case.bits, rng)
-            table = dots.locate_dots(image)
+            table = telerig.locate_dots(image)
             centres, rows = matched(scene.centres_px, table[["u_px", "v_px"]].to_numpy())
             light = scene.light(*scene.centres_px.T)[:, None]
             errors.append((centres - scene.centres_px) / (bound / light))
@@ -276,7 +276,7 @@ def speed() -> list[str]:
     paths = sorted(folder.glob("*.jpeg"))
     if not paths:
         return lines
-    tables = [dots.locate_dots(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in paths]
+    tables = [telerig.locate_dots(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in paths]
     counts = [len(table) for table in tables]
     rings = {int(table.ring.sum()) for table in tables}
     seconds = _fastest(cv2.imread(str(paths[0]), cv2.IMREAD_GRAYSCALE), 5)
@@ -292,7 +292,7 @@ def _fastest(image: NDArray[np.generic], times: int) -> float:
     spent = []
     for _ in range(times):
         begin = time.process_time()
-        dots.locate_dots(image)
+        telerig.locate_dots(image)
         spent.append(time.process_time() - begin)
     return min(spent)
 

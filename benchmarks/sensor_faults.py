@@ -31,16 +31,8 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
-from sensor_fault_judging import (
-    LARGER,
-    PASSED,
-    Class,
-    Score,
-    checked,
-    judged,
-    mended_by_checks,
-    score,
-)
+from sensor_fault_checks import checked, mended_by_checks
+from sensor_fault_judging import LARGER, PASSED, Class, Score, judged, score
 from sensor_fault_kinds import ARMS, CONFIGURATIONS, FAULTS, Fault, copied, inputs_of
 from shake_scenarios import hash_of, posteriors
 from shake_scene import Run, cases, simulate

@@ -18,7 +18,8 @@ from telerig.estimator.bubbles.outline.rims import find_rims
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from bubble_outline_renderer import Drawn, draw
-from dense_bubbles import ELLIPSE, paired, swarm
+from dense_bubbles import ELLIPSE
+from dense_scenes import paired, swarm
 
 WHITE = 3000.0
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import imageio.v3 as iio
 import numpy as np
 import pandas as pd
 import tifffile
 from high_speed_files import write_cine, write_mraw
+from PIL import Image
 from scipy.io import savemat, wavfile
 from simulated_log import simulated_log
 
@@ -118,8 +118,8 @@ def _images(folder: Path, rng: np.random.Generator) -> None:
     ):
         tifffile.imwrite(folder / name, image, **options)
     for name in ("grey.png", "grey.bmp", "grey.jpg"):
-        iio.imwrite(folder / name, _picture(rng))
-    iio.imwrite(folder / "grey16.png", _picture(rng, np.uint16))
+        Image.fromarray(_picture(rng)).save(folder / name)
+    Image.fromarray(_picture(rng, np.uint16)).save(folder / "grey16.png")
 
 
 def _run_of_images(folder: Path, rng: np.random.Generator) -> None:

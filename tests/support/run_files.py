@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from telerig.errors import InputError
 from telerig.io.dataset.run import RunData, load_run
@@ -52,12 +53,10 @@ LEFT, RIGHT = movie(6, seed=1), movie(6, seed=2)
 def write_images(
     folder: Path, frames: NDArray[Any], names: Sequence[int] | None = None, suffix: str = ".tif"
 ) -> None:
-    import imageio.v3 as iio
-
     folder.mkdir(parents=True)
     for number, frame in zip(names or range(len(frames)), frames):
         file = folder / f"{number:06d}{suffix}"
-        tifffile.imwrite(file, frame) if suffix == ".tif" else iio.imwrite(file, frame)
+        tifffile.imwrite(file, frame) if suffix == ".tif" else Image.fromarray(frame).save(file)
 
 
 def write_video(file: Path, frames: NDArray[Any], codec: str, pixels: str, **options: str) -> None:

@@ -12,7 +12,7 @@ from telerig.io.report.page.figures import data_uri
 from telerig.io.report.page.page import link_to
 
 BUDGET_BYTES = 1_500_000
-"""Of JPEG: with the page's other parts a report stays below 8 MB."""
+"""Of JPEG: with the page's other parts a report stays below 5 MB."""
 
 SMALL_WIDTH_PX = 420
 _SMALL_QUALITY = 70

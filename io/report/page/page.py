@@ -55,12 +55,10 @@ def link_to(target: Path, page_folder: Path) -> str:
 
 def render_page(template: str, context: Mapping[str, Any], scene: str) -> str:
     """Return the page as text; ``context`` is escaped, ``scene`` is what `scene_text` gives."""
-    from markupsafe import Markup
-
     carried = {
-        "css": Markup(_package_file("report.css")),
-        "scene": Markup(scene),
-        "plotly": Markup(plotly_javascript()),
+        "css": _package_file("report.css"),
+        "scene": scene,
+        "plotly": plotly_javascript(),
     }
     return _environment().get_template(template).render({**context, **carried})
 
@@ -88,9 +86,8 @@ def glossary() -> dict[str, str]:
 
 @cache
 def plotly_javascript() -> str:
-    """Return plotly's JavaScript from the installed package, without importing plotly."""
-    file = resources.files("plotly") / "package_data" / "plotly.min.js"
-    return file.read_text(encoding="utf-8")
+    """Return plotly.js with the traces in space alone, a file of this package."""
+    return _package_file("plotly-gl3d.min.js")
 
 
 def prepare_page(template: str) -> None:

@@ -40,7 +40,7 @@ from telerig.io.results.stale import stale
 from telerig.rig.camera import Camera
 from telerig.short_text import flat_rows
 
-PAGE_BYTES = 7_600_000
+PAGE_BYTES = 4_600_000
 """Of all that is large; words and tables come on top."""
 
 _SMALL_WIDTH_PX = 560

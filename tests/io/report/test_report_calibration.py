@@ -51,7 +51,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_page_is_whole_small_and_loads_nothing(report: Path) -> None:
     page = Page(report)
-    assert report.name == "report.html" and report.stat().st_size < 8e6
+    assert report.name == "report.html" and report.stat().st_size < 5e6
     assert page.ids == SECTIONS
     inside = [load for load in page.loads if load.startswith("data:") or load.startswith("#")]
     assert sorted(set(page.loads) - set(inside)) == []

@@ -67,7 +67,7 @@ def test_a_dataset_gives_all_its_pages_calibration_first(dataset: Path) -> None:
     for name in PAGES:
         page = dataset / "results" / name / "report.html"
         text = page.read_text(encoding="utf-8")
-        assert page.stat().st_size < 8e6 and text.index('class="status"') < text.index("<h2")
+        assert page.stat().st_size < 5e6 and text.index('class="status"') < text.index("<h2")
         assert not re.search(r'(?:src|href)="https?:', text.split("<script>")[0])
 
 

@@ -63,7 +63,7 @@ def _judged(folder: Path) -> Any:
 def test_page_begins_with_the_smoothing_and_loads_nothing(whole: Path) -> None:
     page = Page(whole / "report.html")
     assert page.ids == SMOOTHING + TRACKING
-    assert (whole / "report.html").stat().st_size < 8e6
+    assert (whole / "report.html").stat().st_size < 5e6
     assert all(load.startswith("data:") for load in page.loads)
     of_smoothing, of_tracking = 3 + 3 + 3 + 3 + 4 + 3 + 2, 2 + 3 + 4 + 1 + 3 + 2
     assert page.pictures("svg+xml") and len(page.pictures("")) == of_smoothing + of_tracking

@@ -75,7 +75,7 @@ def _edit_table(folder: Path, name: str, **columns: Any) -> Path:
 
 def test_page_is_whole_small_and_loads_nothing(whole: Path) -> None:
     page = Page(whole / "report.html")
-    assert (whole / "report.html").stat().st_size < 8e6
+    assert (whole / "report.html").stat().st_size < 5e6
     assert page.ids == SECTIONS
     assert all(load.startswith("data:") for load in page.loads)
     assert len(page.pictures("svg+xml")) == 2 + 3 + 4 + 1 + 3 + 2
@@ -342,7 +342,7 @@ def test_a_hundred_thousand_rows_are_thinned(folder: Path) -> None:
     assert _repeated(folder / "tracks.csv", times, 60) > 100_000
     assert _repeated(folder / "detections.csv", times, 60) > 200_000
     page = write_track_report(folder)
-    assert page.stat().st_size < 8e6
+    assert page.stat().st_size < 5e6
     assert "are drawn" in page.read_text(encoding="utf-8")
 
 

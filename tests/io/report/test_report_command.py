@@ -117,6 +117,9 @@ def test_pages_in_a_browser_at_desk_and_pocket_width(
         assert seen.layout["broken"] == 0
         assert 0 < seen.layout["top"] < 200 and seen.layout["first"]
         assert seen.layout["scenes"] == (name != "batch")
+        buttons = seen.layout["buttons"]  # none of them sends the scene to a server
+        assert not any("hare" in title or "loud" in title for title in buttons)
+        assert any("Download" in title for title in buttons) == (name != "batch")
 
 
 @browser

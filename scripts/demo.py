@@ -42,7 +42,7 @@ def demo(
     from telerig.io.simulation.simulate import simulate
 
     say("simulating two telecentric cameras of 512 x 512 px: 12 views of a hand-held target,")
-    say("and a bubble of 5 mm that zigzags upwards, followed by the vibrating rig")
+    say("and a bubble of 4-5 mm that zigzags upwards, followed by the vibrating rig")
     begun = time.perf_counter()
     data = simulate(_config(), rng=np.random.default_rng(seed), out=out)
     simulated = time.perf_counter()

@@ -179,7 +179,7 @@ def dot_table(problem: Problem) -> pd.DataFrame:
 def residual_table(problem: Problem, state: State) -> pd.DataFrame:
     """Return the content of `residuals.csv`: `dot_table` with residuals, weights and reasons.
 
-    Residuals are measured minus predicted pixels. The reason says why a weight is less than 1.
+    Residuals are measured minus predicted centres of the dots' images. The reason says why a weight is less than 1.
     """
     residual = -pixel_residuals(problem, state)
     distance = np.sqrt(squared_distance(residual, problem.covariance_px2))
@@ -346,7 +346,7 @@ def _seen_in_space(problem: Problem, state: State) -> tuple[Array, Array]:
     kept = problem.kept
     found, row = np.unique(key[kept], return_inverse=True)
     pixels = np.full((len(problem.cameras), len(found), 2), np.nan)
-    pixels[problem.camera[kept], row] = problem.uv_px[kept]
+    pixels[problem.camera[kept], row] = problem.observations().uv_px
     several = np.isfinite(pixels[..., 0]).sum(0) > 1
     view, dot = np.divmod(found[several], len(problem.dot_ids))
     poses = state.rig_from_target[view]

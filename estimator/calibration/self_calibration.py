@@ -374,8 +374,7 @@ def _fit(
         sound = replace(final, weight=weighed.weight, covariance_px2=weighed.covariance_px2)
         start = held_at_nominal(final, start)
         begin = solve(sound, start, max_iterations=15, relative=1e-5).state
-    shift = eccentricity_px(final, begin)
-    final = replace(final, uv_px=final.uv_px - shift)
+    final = replace(final, eccentricity_px=eccentricity_px(final, begin))
     robust = robust_solve(final, begin, progress=progress)
     return Fit(robust, models, words, choice, held)
 

@@ -81,7 +81,9 @@ class Problem:
     nominal_mm, dot_sigma_mm : (N, 3) nominal position of each dot in the target's frame, and the
         prior standard deviations of the true one.
     view, camera, dot : (M,) indices of each measurement.
-    uv_px : (M, 2) measured pixels.
+    uv_px : (M, 2) measured pixels: the centre of each dot's image.
+    eccentricity_px : (M, 2) how far this lies from the image of the dot's centre; 0 before the lens
+        is known. `observations` are ``uv_px`` less this.
     covariance_px2 : (M, 2, 2), without weights.
     weight : (M,) from 0 to 1.
     free : for each camera the names of its free intrinsics.
@@ -107,6 +109,7 @@ class Problem:
     camera: Ints
     dot: Ints
     uv_px: Array
+    eccentricity_px: Array
     covariance_px2: Array
     weight: Array
     free: tuple[tuple[str, ...], ...]
@@ -165,8 +168,9 @@ class Problem:
     def _rows(self, keep: NDArray[np.bool_], whitener: Array) -> Observations:
         plate = (self.target.plate_thickness_mm, self.target.plate_index)
         return Observations(
-            self.view[keep], self.camera[keep], self.dot[keep], self.uv_px[keep], whitener,
-            self.plate_shift, plate, tuple(c.wall for c in self.cameras),
+            self.view[keep], self.camera[keep], self.dot[keep],
+            self.uv_px[keep] - self.eccentricity_px[keep], whitener, self.plate_shift, plate,
+            tuple(c.wall for c in self.cameras),
         )  # fmt: skip
 
     def with_model(self, model: str | Sequence[str]) -> Problem:
@@ -183,10 +187,8 @@ class Problem:
 
     def subset(self, rows: NDArray[np.bool_]) -> Problem:
         """Return the problem with only some of the measurements; views, dots and priors stay."""
-        parts = {
-            name: getattr(self, name)[rows]
-            for name in ("view", "camera", "dot", "uv_px", "covariance_px2", "weight")
-        }
+        names = ("view", "camera", "dot", "uv_px", "eccentricity_px", "covariance_px2", "weight")
+        parts = {name: getattr(self, name)[rows] for name in names}
         return replace(self, **parts)
 
     def renumbered(self, ids: Ints) -> Problem:
@@ -316,6 +318,7 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
         camera=camera[order],
         dot=np.searchsorted(ids, table["dot"].to_numpy(np.int64)),
         uv_px=table[["u_px", "v_px"]].to_numpy(float),
+        eccentricity_px=np.zeros((len(table), 2)),
         covariance_px2=covariance,
         weight=np.ones(len(table)),
         free=tuple(("scale_px_per_mm",) for _ in cameras),

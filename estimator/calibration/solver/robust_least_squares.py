@@ -159,7 +159,8 @@ def pixel_residuals(problem: Problem, state: State) -> Array:
 
     Dots that were left out of the fit are included.
     """
-    return pixels(state, problem.unweighted(), problem.rho_mm) - problem.uv_px
+    observed = problem.unweighted()
+    return pixels(state, observed, problem.rho_mm) - observed.uv_px
 
 
 def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:

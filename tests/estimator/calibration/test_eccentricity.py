@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
+import telerig
 from telerig.estimator.calibration.solver.problem import (
     cameras_from_state,
     eccentricity_px,
     problem_from_dots,
 )
 from telerig.estimator.calibration.start import known_target
+from telerig.io.simulation.presets import preset
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import Pose
 
@@ -67,3 +71,51 @@ def test_an_affine_camera_has_none(scene: Any) -> None:
     problem = problem_from_dots(made.dots, made.cameras, made.target)
     state = known_target.stereo_states(problem, problem.nominal_mm)[0]
     np.testing.assert_allclose(eccentricity_px(problem, state), 0, atol=1e-9)
+
+
+def test_results_hold_the_measured_centres_and_give_the_same_calibration_again(
+    tmp_path: Path,
+) -> None:
+    """Calibrated again, an entocentric lens's dots would be corrected a second time."""
+    paper = preset("paper")
+    cameras = tuple(
+        replace(
+            c, parameters={**c.parameters, "kappa_per_mm": 1 / 150},
+            nominal_telecentricity_per_mm=1 / 150,
+        )
+        for c in paper.cameras
+    )  # fmt: skip
+    data = telerig.simulate(
+        replace(paper, cameras=cameras), rng=np.random.default_rng(3), out=tmp_path, images=False
+    )
+    given = tmp_path / "calibration" / "dots.csv"
+    results = tmp_path / "results" / "calibration"
+    first = telerig.calibrate(data, model="kappa")
+    first.save(results)
+    measured, dots, residuals = (
+        pd.read_csv(f).sort_values(["view", "camera", "dot"])[["u_px", "v_px"]].to_numpy()
+        for f in (given, results / "dots.csv", results / "residuals.csv")
+    )
+    np.testing.assert_array_equal(dots, measured)
+    np.testing.assert_array_equal(residuals, measured)
+    given.write_bytes((results / "dots.csv").read_bytes())
+    again = telerig.calibrate(telerig.load_dataset(tmp_path), model="kappa")
+    for one, other in zip(first.cameras, again.cameras):
+        np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
+    assert largest_eccentricity_px(first) > 0.02
+
+
+def largest_eccentricity_px(calibration: telerig.Calibration) -> float:
+    """What the residuals lack of the measured centres less the projections of the dots' centres."""
+    place = {dot: i for i, dot in enumerate(calibration.dot_ids.tolist())}
+    table = calibration.residuals
+    assert table is not None
+    lengths = []
+    for (view, camera), part in table.groupby(["view", "camera"]):
+        dots = calibration.target_points_mm[[place[d] for d in part["dot"]]]
+        centre = calibration.project(camera, calibration.target_poses[view].apply(dots))
+        measured, residual = (
+            part[names].to_numpy() for names in (["u_px", "v_px"], ["du_px", "dv_px"])
+        )
+        lengths.append(np.linalg.norm(measured - centre - residual, axis=1))
+    return float(np.concatenate(lengths).max())

@@ -70,6 +70,7 @@ def with_view(problem: Any, state: State, pose: Any) -> tuple[Any, State]:
         "covariance_px2": np.tile(np.median(problem.covariance_px2, 0), (2 * len(dots), 1, 1)),
         "weight": np.ones(2 * len(dots)),
         "uv_px": np.zeros((2 * len(dots), 2)),
+        "eccentricity_px": np.zeros((2 * len(dots), 2)),
     }
     shift = np.r_[problem.plate_shift, np.zeros((1, 2))]
     grown = replace(

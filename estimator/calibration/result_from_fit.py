@@ -179,7 +179,8 @@ def dot_table(problem: Problem) -> pd.DataFrame:
 def residual_table(problem: Problem, state: State) -> pd.DataFrame:
     """Return the content of `residuals.csv`: `dot_table` with residuals, weights and reasons.
 
-    Residuals are measured minus predicted centres of the dots' images. The reason says why a weight is less than 1.
+    Residuals are measured minus predicted centres of the dots' images. The reason says why a
+    weight is less than 1.
     """
     residual = -pixel_residuals(problem, state)
     distance = np.sqrt(squared_distance(residual, problem.covariance_px2))

@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 from telerig.errors import InputError
 from telerig.io.files.atomic import write_text_atomic
+from telerig.io.rig_file.camera_names import check_camera_names
 from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
 from telerig.io.rig_file.rig_file import description_from_toml
+from telerig.io.rig_file.writer import toml_key
 
 PRACTICE_TARGET = """\
 layout = "grid"                    # or "points" with points_mm = [[x, y], ...]
@@ -37,7 +39,6 @@ _STEREO = """\
 # 90 about y: the other camera looks at the first one's right hand. It decides between the two
 # mirror images of the rig that fit the target equally well, so its sign matters.
 """
-_NAME = re.compile(r"[A-Za-z0-9_-]+")
 _NOT_IN_TOML = re.compile(r'["\\\x00-\x1f\x7f]')
 
 
@@ -70,13 +71,15 @@ def new_dataset(
     rig = place / "rig.toml"
     if rig.exists():
         raise InputError("there is a rig.toml already", where=str(rig), todo="edit it")
-    _check(cameras)
+    _check(cameras, str(rig))
     template = (resources.files("telerig.io.dataset") / "rig_template.toml").read_text(
         encoding="utf-8"
     )
     first, *others = cameras
     text = Template(template).substitute(
         name=_NOT_IN_TOML.sub("", place.resolve().name), first=first.name,
+        key=toml_key(first.name), axis=toml_key(f"axis_{first.name}"),
+        arm=toml_key(f"arm_{first.name}"),
         others="".join(_camera(camera) for camera in others),
         stereo=_stereo([camera.name for camera in cameras], angle_deg), target=target,
         width=first.image_size_px[0], height=first.image_size_px[1],
@@ -95,7 +98,7 @@ def _stereo(names: Sequence[str], angle_deg: float) -> str:
     if len(names) == 1:
         return ""
     rotations = [
-        f"{rotvec_key(name, names[0])} = [0.0, {i * float(angle_deg)}, 0.0]"
+        f"{toml_key(rotvec_key(name, names[0]))} = [0.0, {i * float(angle_deg)}, 0.0]"
         for i, name in enumerate(names[1:], 1)
     ]
     return _STEREO + "\n".join(rotations) + "\n\n"
@@ -106,21 +109,14 @@ def _camera(camera: NewCamera) -> str:
     width, height = camera.image_size_px
     size = f"image_size_px = [{width}, {height}]"
     scale = f"scale_px_per_mm = {float(camera.scale_px_per_mm)}"
-    return f"[cameras.{camera.name}]\n{size}\n{scale}\n\n"
+    return f"[cameras.{toml_key(camera.name)}]\n{size}\n{scale}\n\n"
 
 
-def _check(cameras: Sequence[NewCamera]) -> None:
+def _check(cameras: Sequence[NewCamera], where: str) -> None:
     """Raise InputError for camera names, image sizes or scales that cannot be."""
-    names = [camera.name for camera in cameras]
     if not 1 <= len(cameras) <= MOST_CAMERAS:
         raise InputError(f"{len(cameras)} cameras", todo=f"name one to {MOST_CAMERAS}")
-    for name in names:
-        if not _NAME.fullmatch(name) or name == "carriage":
-            raise InputError(
-                f"camera name {name!r}", todo="use letters, digits, _ and -; not 'carriage'"
-            )
-    if len(set(names)) < len(names):
-        raise InputError("two cameras have one name", todo="name them apart")
+    check_camera_names([camera.name for camera in cameras], where, "--cameras")
     for _, size, scale in cameras:
         if min(size) < 16:
             words = f"image size {size[0]} x {size[1]}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, make_dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,6 +14,7 @@ from telerig.errors import InputError, nearest, suggestion
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.files.text import read_text
 from telerig.io.files.toml import toml_content
+from telerig.io.rig_file.camera_names import camera_name_faults
 from telerig.io.rig_file.description import (
     CARRIAGE,
     MOST_CAMERAS,
@@ -34,7 +34,7 @@ from telerig.io.rig_file.description import (
 from telerig.io.rig_file.devices import devices_from_tables
 from telerig.io.rig_file.tables import Problem, Problems, field_types, read_table, subtables
 from telerig.io.rig_file.target import TargetTable, target_problems
-from telerig.io.rig_file.writer import rig_toml
+from telerig.io.rig_file.writer import rig_toml, toml_key
 from telerig.rig.target import Target
 
 TOP_LEVEL = [
@@ -199,17 +199,8 @@ def _cameras(raw: dict[str, Any], problems: Problems) -> dict[str, CameraDescrip
 
 
 def _check_camera_names(names: list[str], problems: Problems) -> None:
-    for name in names:
-        if not re.fullmatch(r"\w[\w-]*", name):
-            what = "the name cannot be used for a folder"
-            problems.add(f'cameras."{name}"', "", what, "use letters, digits, _ and - only")
-        if name.lower() == CARRIAGE:
-            what = f'"{CARRIAGE}" means the stage in mounted_on'
-            problems.add(f"cameras.{name}", "", what, "give the camera another name")
-    if len({name.lower() for name in names}) < len(names):
-        what = "two names differ only in upper and lower case"
-        todo = "give the cameras names that any file system keeps apart"
-        problems.add("cameras", "", what, todo)
+    for fault in camera_name_faults(names):
+        problems.add(f"cameras.{toml_key(fault.name)}", "", fault.what, fault.todo)
     if len(names) > MOST_CAMERAS:
         what = f"has {len(names)} cameras ({', '.join(names)}); a rig has {MOST_CAMERAS} at most"
         todo = f"keep {MOST_CAMERAS}; write another dataset for the others"

@@ -20,7 +20,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.io.files.names import check_name
+from telerig.io.rig_file.camera_names import check_camera_names
 from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
 from telerig.io.rig_file.writer import toml_key
 from telerig.rig.camera import Camera
@@ -79,18 +79,17 @@ def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> 
     The rig frame is that of the first camera; its origin is where the first two optical axes come
     closest (for one camera: at the depth of the world's origin).
 
-    names : of the cameras, all different.
-    Raises InputError if the number of names differs, if some cameras are mirrored, for a matrix
-    that is not that of a pinhole camera, and for distortion that telerig's model cannot express
-    exactly.
+    names : of the cameras, as rig.toml allows them.
+    Raises InputError if the number of names differs, for names that rig.toml cannot have, if some
+    cameras are mirrored, for a matrix that is not that of a pinhole camera, and for distortion that
+    telerig's model cannot express exactly.
     """
-    if len(names) != len(pinholes) or len(set(names)) != len(names):
+    if len(names) != len(pinholes):
         raise InputError(
             f"the files hold {len(pinholes)} cameras, but the names are {list(names)}",
-            todo=f"give {len(pinholes)} names, one for each camera, all different",
+            todo=f"give {len(pinholes)} names, one for each camera",
         )
-    for name, one in zip(names, pinholes):
-        check_name(name, one.where, "camera")
+    check_camera_names(names, ", ".join(dict.fromkeys(one.where for one in pinholes)), "--names")
     mirror = np.diag([1.0, 1.0, -1.0 if pinholes[0].mirrored else 1.0])
     for one in pinholes:
         _check(one)
@@ -214,10 +213,14 @@ def _camera(name: str, one: Pinhole, upper: Array, distance_mm: float, pose: Pos
 
 
 def nominal_toml(cameras: Sequence[Camera]) -> str:
-    """Return the tables [cameras.*] and [stereo] of rig.toml, for a calibration to start from."""
+    """Return the tables [cameras.*] and [stereo] of rig.toml, for a calibration to start from.
+
+    Raises InputError for a number of cameras and for names that rig.toml cannot have.
+    """
     if not 1 <= len(cameras) <= MOST_CAMERAS:
         todo = f"rig.toml describes one to {MOST_CAMERAS}"
         raise InputError(f"{len(cameras)} cameras", todo=todo)
+    check_camera_names([camera.name for camera in cameras], "nominal.toml")
     lines = []
     for camera in cameras:
         width, height = camera.image_size_px

@@ -81,7 +81,8 @@ def problem_of(
     return Problem(
         tuple(made), target, tuple(f"{v:02}" for v in range(views)), np.arange(dots),
         nominal, np.full((dots, 3), 0.02), view, camera, dot, rng.uniform(0, 900, (len(view), 2)),
-        np.zeros((len(view), 2)), 0.01 * factor @ np.swapaxes(factor, -1, -2), rng.uniform(0.1, 1, len(view)),
+        np.zeros((len(view), 2)), 0.01 * factor @ np.swapaxes(factor, -1, -2),
+        rng.uniform(0.1, 1, len(view)),
         (*of_camera, *of_camera)[:cameras], ((0, 11), 18.0, 0.001), np.zeros((views, cameras)),
     )  # fmt: skip
 

@@ -18,8 +18,9 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     coverage_on_grid,
     shape_from_axes,
 )
+from telerig.estimator.dots.fit.candidates import Polarity
 from telerig.estimator.dots.grid.numbering import Numbering, check_handedness, number_dots
-from telerig.estimator.dots.grid.seen_target import contradiction, seen_target
+from telerig.estimator.dots.grid.seen_target import SeenTarget, contradiction, seen_target
 from telerig.estimator.dots.locate import REJECTED, DotMeasurement, measure_dots
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
@@ -56,34 +57,63 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     ``image`` is no grey image.
     """
     measured = measure_dots(image, polarity=target.polarity)
-    return _clearly_numbered(measured, target, image.shape).table
+    return _clearly_numbered(image, measured, target).table
 
 
 def _clearly_numbered(
-    measured: DotMeasurement, target: Target, image_shape: tuple[int, ...]
+    image: NDArray[Any], measured: DotMeasurement, target: Target, min_diameter_px: float = 5.0
 ) -> TargetDetection:
-    """Number the target's dots; DetectionError, which says where marks are, if ambiguous."""
+    """Number the target's dots that were measured in an image.
+
+    Raises DetectionError, which says what of the target in rig.toml does not fit the image, if they
+    cannot be numbered or not in one way only.
+
+    min_diameter_px : as for `measure_dots`.
+    """
     try:
         found = numbered(measured, target)
-        if found.numbering.ambiguous:
-            raise ambiguous_numbering(found.numbering, target)
     except DetectionError as error:
-        words = _described_otherwise(measured, target, image_shape)
-        if words:
-            raise DetectionError(error.what, todo=words) from error
-        raise
+        words = _other_polarity(image, measured, target, min_diameter_px)
+        words = words or _described_otherwise(measured, target, image.shape)
+        raise DetectionError(error.what, todo=words or error.todo) from error
+    if found.numbering.ambiguous:
+        ambiguous = ambiguous_numbering(found.numbering, target)
+        words = _described_otherwise(measured, target, image.shape)
+        raise DetectionError(ambiguous.what, todo=words or ambiguous.todo)
     return found
+
+
+def _other_polarity(
+    image: NDArray[Any], measured: DotMeasurement, target: Target, min_diameter_px: float
+) -> str:
+    """Return what to do if the image shows the target, or else a grid, in the other polarity."""
+    other: Polarity = "black_on_white" if target.polarity == "white_on_black" else "white_on_black"
+    inverse = measure_dots(image, polarity=other, min_diameter_px=min_diameter_px)
+    try:
+        numbered(inverse, target)
+    except DetectionError:
+        if _grid(measured, image.shape) or not _grid(inverse, image.shape):
+            return ""
+    stated, seen = (name.replace("_", " ") for name in (target.polarity, other))
+    return (
+        f'the image shows dots {seen}, not {stated}: write polarity = "{other}" into [target] of '
+        "rig.toml"
+    )
+
+
+def _grid(measured: DotMeasurement, image_shape: tuple[int, ...]) -> SeenTarget | None:
+    """Return the grid that an image shows, None if it shows none."""
+    try:
+        return seen_target(measured.dots, image_shape)
+    except DetectionError:
+        return None
 
 
 def _described_otherwise(
     measured: DotMeasurement, target: Target, image_shape: tuple[int, ...]
 ) -> str:
-    if target.layout != "grid" or not len(measured.dots):
-        return ""
-    try:
-        return contradiction(seen_target(measured.dots, image_shape), target)
-    except DetectionError:
-        return ""
+    seen = _grid(measured, image_shape) if target.layout == "grid" else None
+    return "" if seen is None else contradiction(seen, target)
 
 
 def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
@@ -366,7 +396,7 @@ def _numbered_image(dataset: Dataset, image: NDArray[Any], view: View, camera: s
         where = str(view.image_paths[camera])
         raise InputError(error.what, where=where, todo=error.todo) from error
     try:
-        found = _clearly_numbered(measured, target, image.shape)
+        found = _clearly_numbered(image, measured, target, smallest_px)
     except DetectionError as error:
         words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
         rejected = rejected_table(measured, slice(None), error.what)

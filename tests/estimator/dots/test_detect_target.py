@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -96,6 +97,42 @@ def test_an_undecided_image_is_an_error_that_counts_the_marks() -> None:
     assert find_target(image, RING).numbering.ambiguous
     with pytest.raises(DetectionError, match=r"2 of the target's 3 marks were found"):
         detect_target(image, RING)
+
+
+SCATTERED = replace(
+    DESIGN, layout="points", rows=0, columns=0, pitch_mm=(1.0, 1.0), marks=(), dot_diameter_mm=2.0,
+    points_mm=tuple(map(tuple, np.random.default_rng(4).permutation(
+        np.stack(np.meshgrid(np.arange(5), np.arange(4)), -1).reshape(-1, 2)
+    )[:14] * 6.0 + np.random.default_rng(5).uniform(-1.5, 1.5, (14, 2)))),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("polarity", ["white_on_black", "black_on_white"])
+@pytest.mark.parametrize("target", [DESIGN, SCATTERED], ids=["grid", "points"])
+def test_a_wrong_polarity_is_named(target: Target, polarity: Any) -> None:
+    drawn = replace(target, polarity=polarity)
+    image, _ = draw(drawn, pixel_from_mm(12.0, 20, 5, False))
+    assert len(detect_target(image, drawn)) == len(drawn.ids())
+    other = {"white_on_black": "black_on_white", "black_on_white": "white_on_black"}[polarity]
+    with pytest.raises(DetectionError) as caught:
+        detect_target(image, replace(target, polarity=other))
+    assert f'polarity = "{polarity}"' in caught.value.todo
+    # a wrong polarity and a wrong grid: the polarity comes first
+    if target is DESIGN:
+        with pytest.raises(DetectionError) as caught:
+            detect_target(image, replace(target, polarity=other, marks=((0, 0),)))
+        assert f'polarity = "{polarity}"' in caught.value.todo
+
+
+def test_the_polarity_is_not_accused_of_other_faults() -> None:
+    image, _ = draw(DESIGN, pixel_from_mm(12.0, 20, 5, False))
+    blank = np.full_like(image, 128)
+    for spoilt, target in (
+        (image[:150, :150], DESIGN), (blank, DESIGN), (image, replace(DESIGN, marks=((0, 0),))),
+    ):  # fmt: skip
+        with pytest.raises(DetectionError) as caught:
+            detect_target(spoilt, target)
+        assert "polarity =" not in caught.value.todo
 
 
 def test_an_empty_image_is_an_error() -> None:

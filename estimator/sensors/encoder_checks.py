@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.samples import prediction_residual
+from telerig.short_text import counted, counted_list
 from telerig.statistics import robust_sd
 
 _SIGMAS = 10.0
@@ -101,7 +102,8 @@ def check_encoder(
     ]
     findings = []
     if grave:
-        more = f" (and {len(grave) - 1} more)" if len(grave) > 1 else ""
+        others = [f.words for f in grave[1:]]
+        more = f" (and {counted_list(others, 'more fault')})" if others else ""
         findings.append(
             Finding(
                 grave[0].words + more, where, grave[0].remedy, Code.ENCODER_JUMP,
@@ -111,7 +113,7 @@ def check_encoder(
     else:
         findings += [Finding(fault.words, where) for fault in jumps[:_SHOWN]]
         if len(jumps) > _SHOWN:
-            findings.append(Finding(f"and {len(jumps) - _SHOWN} more jumps", where))
+            findings.append(Finding(f"and {counted(len(jumps) - _SHOWN, 'more jump')}", where))
     if spikes:
         more = f" (and {len(spikes) - 1} more)" if len(spikes) > 1 else ""
         findings.append(Finding(f"{spikes[0].words}{more}; they are not used", where))

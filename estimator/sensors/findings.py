@@ -12,6 +12,7 @@ from enum import StrEnum
 from typing import Any
 
 from telerig.errors import InputError, suggestion
+from telerig.short_text import counted_list
 
 
 class Code(StrEnum):
@@ -65,7 +66,7 @@ class Finding:
 class SensorError(InputError):
     """A sensor's record contradicts the images, the rig, or another sensor.
 
-    The message is about the first finding; ``findings`` has all of them.
+    The message is about the first finding and names the others; ``findings`` has all of them.
     """
 
     def __init__(self, *args: Any, findings: Sequence[Finding] = (), **kwargs: Any) -> None:
@@ -93,7 +94,8 @@ def settled(findings: Sequence[Finding], accept: frozenset[Code]) -> list[str]:
     refused = [f for f in findings if f.code is not None and f.code not in accept]
     if refused:
         first = refused[0]
-        more = f" (and {len(refused) - 1} more faults)" if len(refused) > 1 else ""
+        others = [f"{f.where}: {f.words} ({f.code})" for f in refused[1:]]
+        more = "\nand " + counted_list(others, "more fault", "\n  ") if others else ""
         raise SensorError(
             first.words + more, where=first.where, code=str(first.code), findings=refused,
             todo=f'{first.todo}. To use the data as they are: --accept {first.code}, in Python '

@@ -33,6 +33,7 @@ from telerig.io.files.atomic import plain, write_json_atomic
 from telerig.io.files.hashing import hashed
 from telerig.io.files.names import fault_of_name
 from telerig.io.files.text import read_bytes
+from telerig.short_text import counted_list
 
 _LONGEST_MESSAGE = 400
 _DEEPEST = 64
@@ -164,12 +165,12 @@ class Record(Part):
 
 
 def _fault(error: ValidationError) -> str:
-    """Return the first fault with its key, in words short enough for a terminal."""
+    """Return the first fault with its key, and the keys of others, short enough for a terminal."""
     faults = error.errors(include_url=False, include_input=False, include_context=False)
-    key = ".".join(str(part)[:60] for part in faults[0]["loc"][:6])
+    key, *others = (".".join(str(part)[:60] for part in f["loc"][:6]) for f in faults)
     reason = faults[0]["msg"].removeprefix("Value error, ")
     words = f"garbles {key!r}: {reason}" if key else reason
-    more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
+    more = f" (and {counted_list([*map(repr, others)], 'more fault')})" if others else ""
     return words[:_LONGEST_MESSAGE] + more
 
 

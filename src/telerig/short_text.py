@@ -81,6 +81,16 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+MOST_LISTED = 12
+
+
+def counted_list(texts: Sequence[str], noun: str, between: str = ", ") -> str:
+    """Return the number of texts with their noun and the first dozen, as in "2 faults: a, b"."""
+    rest = len(texts) - MOST_LISTED
+    shown = [*texts[:MOST_LISTED], *([f"and {rest} more"] if rest > 0 else [])]
+    return f"{counted(len(texts), noun)}:{between.removeprefix(',')}{between.join(shown)}"
+
+
 def first_of(sentences: tuple[str, ...] | list[str]) -> str:
     """Return the first sentence and how many more there are; "" for none."""
     more = f" (and {len(sentences) - 1} more)" if len(sentences) > 1 else ""

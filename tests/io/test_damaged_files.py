@@ -56,6 +56,16 @@ def test_a_recording_whose_header_states_gigabytes_is_refused(tmp_path: Path) ->
         scan_log(file)
 
 
+def test_every_fault_of_a_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "batch.json").write_text('{"jobs": [{"dataset": 3, "host": {}}, 4]}')
+    with pytest.raises(InputError) as caught:
+        write_batch_report(tmp_path)
+    first, others = caught.value.what.split(" (and ")
+    faults = [first.split("'")[1], *others.split("'")[1::2]]
+    assert len(set(faults)) == len(faults) == 1 + int(others.split()[0])
+    assert {"jobs.0.dataset", "jobs.0.kind", "jobs.1"} <= set(faults)
+
+
 def test_a_batch_whose_job_garbles_its_host_is_refused(tmp_path: Path) -> None:
     job = dict.fromkeys(("dataset", "run", "kind", "status", "words"), "") | {"host": ["a"]}
     (tmp_path / "batch.json").write_text(json.dumps({"jobs": [job]}), encoding="utf-8")

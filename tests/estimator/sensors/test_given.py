@@ -11,7 +11,7 @@ import pytest
 
 from telerig.errors import InputError
 from telerig.estimator.sensors.accelerometer_checks import check_accelerometer
-from telerig.estimator.sensors.findings import Code, SensorError, settled
+from telerig.estimator.sensors.findings import Code, Finding, SensorError, settled
 from telerig.estimator.sensors.given import given_sensors, longest_increase, numbers, table_columns
 from telerig.io.rig_file.description import AccelerometerDescription
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
@@ -74,6 +74,21 @@ def test_a_wrong_unit_is_refused_and_its_fix_is_right(claimed: str, unit: str) -
     with pytest.raises(SensorError, match="--accept SENSOR_UNIT"):
         settled(found, frozenset())
     assert "accepted: SENSOR_UNIT" in settled(found, frozenset({Code.SENSOR_UNIT}))[0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 15])
+def test_every_refused_fault_is_named(count: int) -> None:
+    found = [
+        Finding(f"fault of {i}", f"sensor {i}", "mend it", Code.SENSOR_AXES) for i in range(count)
+    ]
+    with pytest.raises(SensorError) as caught:
+        settled([*found, Finding("a warning")], frozenset())
+    first, *others = caught.value.what.splitlines()
+    named = [f"  {one.where}: {one.words} (SENSOR_AXES)" for one in found[1:13]]
+    ends = ["  and 2 more"] if count == 15 else []
+    heads = {1: [], 2: ["and 1 more fault:"], 3: ["and 2 more faults:"]}
+    assert first == found[0].words
+    assert others == [*heads.get(count, ["and 14 more faults:"]), *named, *ends]
 
 
 @pytest.mark.parametrize(("factor", "code"), [(0, "SENSOR_GRAVITY"), (2, "SENSOR_GRAVITY")])

@@ -62,6 +62,13 @@ def init(
         made = new_dataset(dataset, rig, angle_deg=angle, target=seen.lines)
         for words in seen.words:
             say(words)
+        copies = [
+            f"the images of {source} to {dataset / 'calibration' / name}"
+            for name, source in seen.sources.items()
+        ]
+        first = f"copy {', '.join(copies)}"
+        if len(rig) > 1:
+            first += " (images of one view have the same name for all cameras)"
         missing = "the angles between the cameras" if len(rig) > 1 else "the cameras"
         if pitch is None:
             missing = f"pitch_mm, which stands for {seen.pitch_px:.1f} px, and {missing}"
@@ -73,10 +80,11 @@ def init(
             raise InputError(f"--size {size}", todo=todo)
         rig = [NewCamera(name, (int(width), int(height)), scale) for name in names]
         made = new_dataset(dataset, rig, angle_deg=angle, target=PRACTICE_TARGET)
+        first = f"put the images of the target into {dataset / 'calibration'}/CAMERA"
         missing = "the target and its size, the cameras"
     for path in made:
         say(f"made: {path}")
-    say(f"next: edit {made[0]} ({missing})")
+    say(f"next: {first}, and edit {made[0]} ({missing})")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +22,16 @@ from telerig.estimator.dots.grid.seen_target import (
 )
 from telerig.estimator.dots.locate import measure_dots
 from telerig.io.images.read import list_images, read_image
+from telerig.io.rig_file.description import MOST_CAMERAS
 
 MOST_IMAGES = 6
 """Images of each camera that are looked at, evenly spread over all."""
+_WHOLE_VIEWS = 0.8
+"""Share of the views with an image of every camera, above which names seem to name cameras."""
+_VIEW_AND_CAMERA = (
+    re.compile(r"(?P<view>.+)(?P<camera>[_-][^_-]+)"),
+    re.compile(r"(?P<camera>[^_-]+[_-])(?P<view>.+)"),
+)
 
 
 @dataclass(frozen=True)
@@ -35,12 +43,14 @@ class TargetProposal:
         larger, for a target that faces the camera.
     lines : content of the table [target] of rig.toml.
     words : sentences for the user.
+    sources : the folder of each camera's images.
     """
 
     cameras: tuple[tuple[str, tuple[int, int], float], ...]
     pitch_px: float
     lines: str
     words: tuple[str, ...]
+    sources: Mapping[str, Path]
 
 
 def target_from_images(
@@ -48,12 +58,15 @@ def target_from_images(
 ) -> TargetProposal:
     """Describe the target that images in a folder, or in one folder for each camera, show.
 
-    pitch_mm : the known distance of neighbouring dots (along x). scale_px_per_mm : nominal scale of
-    the first camera, used where no pitch is given. Raises InputError if there are no images
-    or if those of a camera differ in size, DetectionError if none shows a grid of dots.
+    pitch_mm : the known distance of neighbouring dots (along x).
+    scale_px_per_mm : nominal scale of the first camera, used where no pitch is given.
+
+    Raises InputError if there are no images, if one folder has those of several cameras, or if
+    those of a camera differ in size, DetectionError if none shows a grid of dots.
     """
     found, failures = [], []
-    for name, images in _images_by_camera(folder).items():
+    by_camera = _images_by_camera(folder)
+    for name, images in by_camera.items():
         some = images[:: -(-len(images) // MOST_IMAGES)]
         for path in some:
             image = read_image(path)
@@ -98,8 +111,14 @@ def target_from_images(
     sizes = {n: (int(w), int(h)) for n, (w, h), *_ in found}
     cameras = tuple((n, sizes[n], round(d / dot_mm, 4)) for n, d in diameter_px.items())
     words = _words(agreed, polarity, len(found), diameter_px[first], pitch_px)
+    if not set.intersection(*({p.stem for p in images} for images in by_camera.values())):
+        failures.append(
+            "no view has an image of every camera: give the images of one view the same name in "
+            "all folders"
+        )
+    sources = {name: by_camera[name][0].parent for name, *_ in cameras}
     return TargetProposal(
-        cameras, pitch_px, _lines(agreed, polarity, pitch_mm), (*words, *failures)
+        cameras, pitch_px, _lines(agreed, polarity, pitch_mm), (*words, *failures), sources
     )
 
 
@@ -119,6 +138,7 @@ def _refuse_sizes(sizes: Sequence[tuple[str, tuple[int, ...]]], folder: Path) ->
 def _images_by_camera(folder: Path) -> dict[str, list[Path]]:
     images = list_images(folder)
     if images:
+        _refuse_several_cameras(folder, [path.stem for path in images])
         return {"camera": images}
     folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
     found = {p.name: list_images(p) for p in folders}
@@ -127,6 +147,32 @@ def _images_by_camera(folder: Path) -> dict[str, list[Path]]:
         todo = "give a folder of images, or one that has a folder of images for each camera"
         raise InputError("holds no images", where=str(folder), todo=todo)
     return found
+
+
+def _refuse_several_cameras(folder: Path, names: Sequence[str]) -> None:
+    """Raise InputError if the names of images in one folder seem to be those of several cameras.
+
+    They do if most views, two at least, have an image with each of two to four endings, or
+    beginnings, like _0 and _1.
+    """
+    for pattern in _VIEW_AND_CAMERA:
+        split = [pattern.fullmatch(name) for name in names]
+        views: dict[str, set[str]] = {}
+        for found in filter(None, split):
+            views.setdefault(found["view"], set()).add(found["camera"])
+        cameras = sorted(set().union(*views.values()))
+        whole = sum(len(seen) == len(cameras) for seen in views.values())
+        several = all(split) and len(views) > 1 and 1 < len(cameras) <= MOST_CAMERAS
+        if several and whole > _WHOLE_VIEWS * len(views):
+            first, *_ = (view for view, seen in views.items() if len(seen) == len(cameras))
+            raise InputError(
+                f"the names of the {len(names)} images have {' or '.join(cameras)}, as if "
+                f"{len(cameras)} cameras had taken {len(views)} views",
+                where=str(folder),
+                todo="make a folder for each camera, named like the camera, in which an image of "
+                f"the same view has the same name (left/{first}, right/{first}), and give the "
+                "folder that holds these folders; if one camera took all, make one such folder",
+            )
 
 
 def _lines(seen: SeenTarget | SeenHexagon, polarity: Polarity, pitch_mm: float) -> str:

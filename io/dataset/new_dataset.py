@@ -116,7 +116,7 @@ def _check(cameras: Sequence[NewCamera], where: str) -> None:
     """Raise InputError for camera names, image sizes or scales that cannot be."""
     if not 1 <= len(cameras) <= MOST_CAMERAS:
         raise InputError(f"{len(cameras)} cameras", todo=f"name one to {MOST_CAMERAS}")
-    check_camera_names([camera.name for camera in cameras], where, "--cameras")
+    check_camera_names([camera.name for camera in cameras], where)
     for _, size, scale in cameras:
         if min(size) < 16:
             words = f"image size {size[0]} x {size[1]}"

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from target_pictures import draw, pixel_from_mm
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
@@ -17,6 +18,7 @@ from telerig.io.dataset.new_dataset import NewCamera, new_dataset
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
+from telerig.rig.target import Target
 from telerig.scripts.main import app
 
 
@@ -57,6 +59,21 @@ def test_init_makes_a_rig_file_that_says_what_was_asked(tmp_path):
     assert rig.name == "tank"
     assert (tmp_path / "tank" / "calibration" / "side").is_dir()
     assert (tmp_path / "tank" / "runs").is_dir()
+
+
+def test_init_from_images_says_where_the_images_go(tmp_path):
+    target = Target(rows=4, columns=5, pitch_mm=(7.0, 7.0), dot_diameter_mm=2.4)
+    image, _ = draw(target, pixel_from_mm(8.0, 20, 5, False), size_px=400)
+    for name in ("left/00_0", "right/00_1"):
+        (tmp_path / "images" / name).parent.mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), image)
+    tank, images = tmp_path / "tank", str(tmp_path / "images")
+    result = _asked("init", str(tank), "--from-images", images, "--pitch", "7")
+    assert result.exit_code == 0, result.output
+    text = result.output.replace("\n", " ")
+    for name in ("left", "right"):
+        assert f"{images}/{name} to {tank}/calibration/{name}" in text
+    assert "no view has an image of every camera" in text
 
 
 def test_init_of_four_cameras(tmp_path):

@@ -57,6 +57,8 @@ def test_the_description_from_images_numbers_them(
     rig = read_rig_toml(made[0])
     found = rig.target
     assert tuple(rig.cameras) == cameras
+    places = (folder,) if len(cameras) == 1 else tuple(folder / name for name in cameras)
+    assert dict(seen.sources) == dict(zip(cameras, places))
     assert found.mark_style == plate.mark_style and found.polarity == plate.polarity
     assert found.extent == "bounded" and len(found.marks) == 3
     assert sorted((found.rows, found.columns)) == [5, 7]
@@ -116,6 +118,29 @@ def test_folders_without_a_target(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "noise.png"), noise)
     with pytest.raises(DetectionError, match="no image shows a grid of dots"):
         target_from_images(tmp_path, pitch_mm=None, scale_px_per_mm=1.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "several"),
+    [
+        ([f"CalB-sys2-{v:04}_{c}" for v in range(1, 15) for c in (0, 1)], True),
+        ([f"cam{c}-{v}" for v in range(3) for c in "abc"], True),
+        ([f"{v}_left" for v in range(9)] + [f"{v}_right" for v in range(8)], True),
+        ([f"view_{v}" for v in range(4)], False),
+        ([f"{v}" for v in range(4)], False),
+        ([f"2024-05-{v:02}_b" for v in range(8)], False),
+        ([f"{v}_{c}" for v in range(6) for c in range(5)], False),
+        ([f"{v}_{v % 2}" for v in range(6)], False),
+    ],
+)
+def test_images_of_several_cameras_in_one_folder_are_noticed(
+    tmp_path: Path, names: list[str], several: bool
+) -> None:
+    for name in names:
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((16, 16), np.uint8))
+    with pytest.raises(InputError if several else DetectionError) as caught:
+        target_from_images(tmp_path, pitch_mm=None, scale_px_per_mm=1.0)
+    assert ("make a folder for each camera" in caught.value.todo) == several
 
 
 def test_images_that_disagree_are_named(tmp_path: Path) -> None:

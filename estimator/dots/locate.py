@@ -89,8 +89,9 @@ def locate_dots(
 ) -> pd.DataFrame:
     """Find all dots in a grey image (rows, columns).
 
-    polarity : "white_on_black", "black_on_white", or "auto", which decides this. min_diameter_px :
-    smaller dots are left out.
+    polarity : "white_on_black", "black_on_white", or "auto", which decides this.
+    min_diameter_px : smaller dots are left out.
+
     Returns a table with a row for each dot, in no particular order. Its columns are: ``u_px``,
     ``v_px`` centre; ``suu_px2``, ``suv_px2``, ``svv_px2`` its covariance; ``a_px`` >= ``b_px``
     semi-axes; ``angle_rad`` angle of the major axis from +u towards +v; ``chi2_dof`` chi-square per

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import shutil
@@ -199,6 +200,16 @@ def test_help_keeps_what_stands_in_brackets(command: str, words: str) -> None:
         text=True, capture_output=True, timeout=60, env={**os.environ, "COLUMNS": "160"},
     )  # fmt: skip
     assert words in done.stdout
+
+
+def test_each_parameter_of_a_public_docstring_begins_a_line() -> None:
+    things = {name: getattr(telerig, name) for name in telerig.__all__}
+    for name, thing in [*things.items()]:
+        if inspect.isclass(thing):
+            things |= {f"{name}.{n}": f for n, f in inspect.getmembers(thing, callable)}
+    glued = re.compile(r"^.*[.;)] (\w+(, \w+)*) :(?: .*)?$", re.MULTILINE)
+    for name, thing in things.items():
+        assert not glued.search(inspect.getdoc(thing) or ""), name
 
 
 def test_architecture_names_what_is_there() -> None:

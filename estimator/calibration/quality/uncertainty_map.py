@@ -37,7 +37,9 @@ def uncertainty_map(
     It is split into the share of the calibration and that of the pixels (see `UncertaintyMap`).
 
     sigma_px : standard deviation of a pixel coordinate; None takes the scatter of the calibration's
-        own dots. steps : number of grid points along each axis.
+        own dots.
+    steps : number of grid points along each axis.
+
     Raises CalibrationError for a single camera.
     """
     sigma = float(calibration.statistics.get("scatter_px", 0.02)) if sigma_px is None else sigma_px

@@ -18,7 +18,11 @@ import pandas as pd
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
-from telerig.estimator.calibration.result.calibration import Calibration, load_calibration
+from telerig.estimator.calibration.result.calibration import (
+    NO_COVARIANCE,
+    Calibration,
+    load_calibration,
+)
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.sensors.checks import Mounting
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
@@ -458,8 +462,6 @@ def plan_words(
     chosen, expected : the variants, the planned run first, and what each is expected to reach.
     """
     planned, first = next(iter(chosen.values())), next(iter(expected.values()))
-    share = uncertainty_map(calibration).calibration_mm2
-    um = 1e3 * np.sqrt(np.trace(share, axis1=1, axis2=2) / 3)
     sensors = ", ".join(rig.accelerometers) or "none"
     lines = [
         f"{counted(planned.bubbles, 'bubble')} for {planned.seconds:g} s at "
@@ -467,8 +469,7 @@ def plan_words(
         f"{planned.shake_mm:g} mm RMS at {planned.shake_hz:g} Hz",
         f"encoder: {'yes' if rig.stage else 'no'}; accelerometers: {sensors}; marks in each view: "
         f"{planned.marks}",
-        f"the calibration moves all points together by {np.median(um):.2g} µm per axis, in the "
-        f"worst corner of the working volume by {um.max():.2g} µm",
+        _common_words(calibration),
         "",
         f"{'':30}{'position, µm':>20}{'velocity, mm/s':>22}",
         f"{'standard deviation':30}{'x':>7}{'y':>7}{'z':>7}{'x':>8}{'y':>7}{'z':>7}  verdict",
@@ -480,6 +481,18 @@ def plan_words(
     known = "".join(f"{v:7.3g}" for v in first.known_um)
     lines += [f"{'(as planned, shake known)':30}{known}", "", _advice(chosen, expected)]
     return lines
+
+
+def _common_words(calibration: Calibration) -> str:
+    """Return the sentence on the errors of the calibration, which all points have in common."""
+    if not calibration.covariance_known:
+        return NO_COVARIANCE
+    share = uncertainty_map(calibration).calibration_mm2
+    um = 1e3 * np.sqrt(np.trace(share, axis1=1, axis2=2) / 3)
+    return (
+        f"the calibration moves all points together by {np.median(um):.2g} µm per axis, in the "
+        f"worst corner of the working volume by {um.max():.2g} µm"
+    )
 
 
 def _advice(chosen: dict[str, Experiment], expected: dict[str, Expected]) -> str:

@@ -187,7 +187,7 @@ def _implausible(camera: Camera) -> list[str]:
 def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
     """Return the note on the effect of one standard deviation of a window's orientation."""
     sd = max((calibration.sd(f"{camera.name}.{n}") for n in wall_freedom(camera)), default=0.0)
-    if sd == 0 or camera.wall is None:
+    if not sd > 0 or camera.wall is None:
         return []
     turned = camera.with_parameters(wall_x_rad=camera["wall_x_rad"] + sd)
     points = working_volume((camera,))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import pair_of_run
+from telerig.estimator.calibration.result.calibration import NO_COVARIANCE, pair_of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
@@ -224,7 +224,8 @@ def smooth(
     summary = summary_of(solution, evidence, frames, done.sensors)
     summary["accepted"] = sorted(accepted)
     summary["warnings"] = [
-        *warnings, *sample_warnings(evidence), *speed_warnings(problem, evidence.mean_velocities)
+        *warnings, *sample_warnings(evidence), *speed_warnings(problem, evidence.mean_velocities),
+        *([] if calibration.covariance_known else [NO_COVARIANCE]),
     ]  # fmt: skip
     change = refined_change(solution, calibration)
     if change is not None:

@@ -22,7 +22,11 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
-from telerig.estimator.calibration.result.calibration import Calibration, pair_of_run
+from telerig.estimator.calibration.result.calibration import (
+    NO_COVARIANCE,
+    Calibration,
+    pair_of_run,
+)
 from telerig.estimator.rig_drift import PairCollector, with_change
 from telerig.estimator.tracking.backtracking import Tables
 from telerig.estimator.tracking.corrections import Corrections, read_corrections
@@ -157,7 +161,7 @@ class TrackingStream:
                 todo="look at the images; bubbles must be darker than the screen, and wider than "
                 "--min-diameter",
             )
-        change = self._pairs.found()
+        change, known = self._pairs.found(), self.calibration.covariance_known
         content: dict[str, Any] = {
             "schema": 1,
             "kind": "telerig tracks",
@@ -174,12 +178,15 @@ class TrackingStream:
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
             "pairs": with_change(model, change, self.calibration),
             "shape_sigma": self.linker.shape_sigma,
-            "covariance": "Of the measurement. The calibration's share, common to all points, is "
-            "in calibration_sx_mm, calibration_sy_mm and calibration_sz_mm.",
+            "covariance": "Of the measurement."
+            + known
+            * " The calibration's share, common to all points, is in calibration_sx_mm, "
+            "calibration_sy_mm and calibration_sz_mm.",
             "warnings": [
                 *_window_warnings(run, self.calibration),
                 *self._crowded(),
                 *self.corrections.warnings,
+                *([] if known else [NO_COVARIANCE]),
             ],
             "notes": list(run.notes),
         }

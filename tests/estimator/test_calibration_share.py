@@ -13,7 +13,12 @@ from shake_learning_data import CAMERAS, run, true_model
 
 import telerig
 from telerig.errors import TelerigWarning
-from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.quality.comparison import compare_calibrations
+from telerig.estimator.calibration.result.calibration import (
+    NO_COVARIANCE,
+    Calibration,
+    calibration_from_cameras,
+)
 from telerig.estimator.smoothing.graph import crowd
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.problem.problem import SmoothingProblem
@@ -147,6 +152,27 @@ def test_trajectories_have_the_share_whatever_the_tracks_have(swarm: Swarm) -> N
     both = found.merge(swarm.tracks.table, on=["frame", "particle"], suffixes=("", "_tracked"))
     for name in CALIBRATION_SHARE:
         np.testing.assert_allclose(both[name], both[f"{name}_tracked"], rtol=0.2, atol=1e-4)
+
+
+def test_the_unknown_share_of_an_imported_calibration_is_not_zero(swarm: Swarm) -> None:
+    imported = calibration_from_cameras(swarm.calibration.cameras)
+    assert swarm.calibration.covariance_known and not imported.covariance_known
+    run = swarm.dataset.runs["swarm"].load()
+    tracks = telerig.track(run, imported)
+    assert not set(CALIBRATION_SHARE) & set(tracks.table)
+    assert "calibration_sd_mm" not in tracks.summary
+    assert tracks.summary["warnings"][-1] == NO_COVARIANCE
+    smoothing = telerig.smooth(tracks, imported, stage=run, model="default")
+    assert not set(CALIBRATION_SHARE) & set(smoothing.trajectories)
+    assert smoothing.summary["warnings"].count(NO_COVARIANCE) == 1
+    for words in (tracking_words(tracks.summary, 1.0), smoothing_words(smoothing)):
+        assert "The calibration adds errors of" not in words
+    for name in imported.covariance_names:
+        assert np.isnan(imported.sd(name))
+    assert imported.to_pandas()["sd"].isna().all()
+    assert np.isnan(imported.to_xarray()["covariance"]).all()
+    compared = compare_calibrations(imported, swarm.calibration)
+    assert compared.known == (False, True)
 
 
 def spread_out(bubbles: int) -> tuple[SmoothingProblem, Array]:

@@ -12,12 +12,13 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import NO_COVARIANCE, calibration_from_cameras
 from telerig.estimator.plan import (
     Experiment,
     centre_sigma_px,
     expect,
     expected_calibration,
+    plan_words,
     planned_problem,
     variants,
 )
@@ -117,7 +118,9 @@ def test_impossible_experiments(wrong: dict[str, float]) -> None:
 
 
 def test_a_rig_that_does_not_shake(rig: RigDescription, calibration: telerig.Calibration) -> None:
-    still = expect(rig, calibration, replace(S2, shake_mm=0.0, seconds=0.2))
+    quiet = replace(S2, shake_mm=0.0, seconds=0.2)
+    still = expect(rig, calibration, quiet)
+    assert NO_COVARIANCE in plan_words(rig, calibration, {"still": quiet}, {"still": still})
     assert still.verdict == "RESOLVED"
     np.testing.assert_allclose(still.position_um, still.known_um, rtol=1e-6)
 

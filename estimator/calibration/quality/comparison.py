@@ -109,6 +109,7 @@ class RigComparison:
     p_moved : probability that errors alone cause changes of the poses as large as these.
     exchanged : whether two cameras have exchanged their scales.
     media : "air" or "water", for each of the two calibrations.
+    known : whether the covariance is known, for each of the two calibrations.
     """
 
     cameras: tuple[str, ...]
@@ -117,6 +118,7 @@ class RigComparison:
     p_moved: float
     exchanged: bool = False
     media: tuple[str, str] = ("air", "air")
+    known: tuple[bool, bool] = (True, True)
 
     @property
     def identical(self) -> bool:
@@ -158,7 +160,9 @@ class RigComparison:
                 f", so the rig has changed ({chance}); use each calibration only for the runs of "
                 "its own time"
             )
-        return "; ".join([first, *self._scale_words(), second, *self._medium_words()])
+        return "; ".join(
+            [first, *self._scale_words(), second, *self._medium_words(), *self._unknown_words()]
+        )
 
     def _size(self, camera: int) -> str:
         """Return in words how far a camera (by index) moved relative to the first."""
@@ -194,6 +198,14 @@ class RigComparison:
             "a refractive window that [walls] of rig.toml lacks appears as a change of the rig"
         ]
 
+    def _unknown_words(self) -> list[str]:
+        named = zip(("the earlier calibration", "this calibration"), self.known)
+        return [
+            f"the uncertainty of {name} is unknown and taken as zero, so changes look surer than "
+            "they are"
+            for name, known in named if not known
+        ]  # fmt: skip
+
     def as_dict(self) -> dict[str, Any]:
         """Return the content of `comparison.json`."""
         return {
@@ -221,7 +233,8 @@ def compare_calibrations(first: Calibration, second: Calibration) -> RigComparis
     """
     check_same_rig(first.cameras, second.cameras)
     found = compare_rigs(_rig(first), _rig(second))
-    return replace(found, media=(first.medium, second.medium))
+    known = (first.covariance_known, second.covariance_known)
+    return replace(found, media=(first.medium, second.medium), known=known)
 
 
 class Named(Protocol):

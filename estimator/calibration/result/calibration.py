@@ -53,9 +53,9 @@ class Calibration(ShortText):
         rotation (rad) and translation (mm) of the pose of each camera but the first.
         covariance_names : of these P parameters, with units.
     free : for each camera, the names of its free intrinsics.
-    verdict : "status" (a word) and "reasons" (sentences). statistics, twin, model, diagnostics :
-        the parts of `calibration.json` with these names (`docs/files.md`); "twin" is the mirror
-        ambiguity.
+    verdict : "status" (a word) and "reasons" (sentences).
+    statistics, twin, model, diagnostics : the parts of `calibration.json` with these names
+        (`docs/files.md`); "twin" is the mirror ambiguity.
     notes : sentences for the user.
     stage : `StageAxis.as_dict`; empty if it is not known.
     medium : "air" or "water", in which the target was. With refractive windows, points that are
@@ -85,6 +85,14 @@ class Calibration(ShortText):
     joint_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     dots: Any = None
     residuals: Any = None
+
+    @property
+    def covariance_known(self) -> bool:
+        """Whether the errors of the calibration are known; of imported cameras they are not.
+
+        Unknown ones stand as zeros in ``covariance``, and as NaN in `sd`.
+        """
+        return bool(np.any(self.covariance))
 
     def title(self) -> str:
         """Return the name of the rig and the verdict."""
@@ -122,8 +130,8 @@ class Calibration(ShortText):
 
         Its index is the name of the parameter, which ends in its unit. The columns are the
         estimated value, NaN for the small motion of a camera's pose, and the standard deviation
-        ``sd``, 0 for a parameter that was held fixed. The errors are correlated: ``covariance``
-        has all of them.
+        ``sd``, 0 for a parameter that was held fixed, NaN if it is not known. The errors are
+        correlated: ``covariance`` has all of them.
         """
         import pandas as pd
 
@@ -140,16 +148,17 @@ class Calibration(ShortText):
         """Return the table of `to_pandas` with its covariance as an `xarray.Dataset`.
 
         ``value`` and ``sd`` have the dimension ``parameter``, along which the coordinate ``units``
-        lies; ``covariance`` (parameter, parameter_of) is 0 for parameters that were held fixed.
-        Raises InputError if xarray is not installed.
+        lies; ``covariance`` (parameter, parameter_of) is 0 for parameters that were held fixed, and
+        NaN if it is not known. Raises InputError if xarray is not installed.
         """
         from telerig.io.exchange.export.run_results import unit_of
 
         table = self.to_pandas()
         place = {name: i for i, name in enumerate(table.index)}
         free = [place[name] for name in self.covariance_names]
-        covariance = np.zeros((len(table), len(table)))
-        covariance[np.ix_(free, free)] = self.covariance
+        covariance = np.full((len(table), len(table)), 0.0 if self.covariance_known else np.nan)
+        if self.covariance_known:
+            covariance[np.ix_(free, free)] = self.covariance
         names = table.index.to_numpy()
         words = {"comment": "each in the unit of its parameter: the coordinate units"}
         return xarray_dataset(
@@ -309,9 +318,9 @@ class Calibration(ShortText):
     ) -> Array:
         """Return the part of the covariance of triangulated points that the calibration causes.
 
-        points_mm : (..., 3) in the rig frame. information_px : (..., 2C, 2C) inverse covariance of
-        the points' pixels in the C cameras, 0 in cameras that do not see a point; None for equal
-        noise of all pixels.
+        points_mm : (..., 3) in the rig frame.
+        information_px : (..., 2C, 2C) inverse covariance of the points' pixels in the C cameras, 0
+            in cameras that do not see a point; None for equal noise of all pixels.
         Returns (..., 3, 3) in mm^2. The errors that it describes are common to all points of a run.
         """
         points = np.asarray(points_mm, float)
@@ -331,13 +340,13 @@ class Calibration(ShortText):
         """Return columns of tracks.csv that state the calibration's part of the points' errors.
 
         points_mm : (N, 3) in the rig frame. The columns are `CALIBRATION_SHARE` in mm, if the
-        calibration has a covariance, and `EXTRAPOLATED`, if its dots are known (see
+        covariance is known, and `EXTRAPOLATED`, if its dots are known (see
         `telerig.io.results.tracking`).
         """
         from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED
 
         columns: dict[str, NDArray[Any]] = {}
-        if self.covariance.size:
+        if self.covariance_known:
             variance = np.diagonal(self.common_covariance(points_mm), axis1=-2, axis2=-1)
             columns |= dict(zip(CALIBRATION_SHARE, np.sqrt(variance.clip(0)).T))
         beyond = self.beyond_dots(points_mm)
@@ -437,19 +446,20 @@ class Calibration(ShortText):
     def sd(self, name: str) -> float:
         """Return the standard deviation of a parameter in ``covariance_names``; 0 if held fixed.
 
-        Raises InputError, with the most similar name, for one that is no parameter of this rig.
+        It is NaN if it is not known. Raises InputError, with the most similar name, for one that is
+        no parameter of this rig.
         """
         if name not in self.covariance_names:
             lens = [f"{camera.name}.{p}" for camera in self.cameras for p in PARAMETERS]
             poses = [f"{c.name}.{p}" for c in self.cameras[1:] for p in POSE_COMPONENTS]
             if name in lens or name in poses:
-                return 0.0
+                return 0.0 if self.covariance_known else float("nan")
             raise InputError(
                 f"no parameter is called {name!r}", where="Calibration.sd",
                 todo=suggestion(name, [*lens, *poses]),
             )  # fmt: skip
         i = self.covariance_names.index(name)
-        return float(np.sqrt(self.covariance[i, i]))
+        return float(np.sqrt(self.covariance[i, i])) if self.covariance_known else float("nan")
 
     def report(self) -> str:
         """Return a summary in plain words, as text of several lines."""
@@ -627,8 +637,8 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
 
 
 NO_COVARIANCE = (
-    "imported: the calibration's own uncertainty is unknown and taken as zero, so covariances of "
-    "points contain the noise of the pixels only"
+    "the uncertainty of the imported calibration is unknown and taken as zero, so standard "
+    "deviations of points contain the noise of the pixels only"
 )
 
 
@@ -645,8 +655,8 @@ def calibration_from_cameras(
     sigma_px : standard deviation of pixels that `Calibration.triangulate` assumes.
     notes : further sentences for the user, for example the names of the cameras' files.
 
-    The result has no free intrinsics, and the covariance of its poses is zero; its first note says
-    that the uncertainty is unknown. Raises CalibrationError if there is no camera, if two have the
+    The result has no free intrinsics, and the covariance of its poses is zero and not known; its
+    first note says so. Raises CalibrationError if there is no camera, if two have the
     same name, if the first frame is not the rig frame, or if sigma_px is not positive.
     """
     names = [c.name for c in cameras]

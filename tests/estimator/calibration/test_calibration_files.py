@@ -130,15 +130,6 @@ def test_tables(calibration: Calibration, saved: Path) -> None:
     assert residuals.loc[~out, "reason"].isna().all()
 
 
-def test_residuals_are_measured_minus_projected(calibration: Calibration) -> None:
-    table = calibration.residuals
-    where = dict(zip(calibration.dot_ids, calibration.target_points_mm))
-    for row in table.iloc[::17].itertuples():
-        rig = calibration.target_poses[row.view].apply(np.atleast_2d(where[row.dot]))
-        gap = np.array([row.u_px, row.v_px]) - calibration.project(row.camera, rig)[0]
-        np.testing.assert_allclose([row.du_px, row.dv_px], gap, atol=1e-9)
-
-
 def test_it_loads_without_the_full_covariance(calibration: Calibration, saved: Path) -> None:
     (saved / "covariance.npz").unlink()
     loaded = load_calibration(saved)

@@ -133,22 +133,6 @@ def test_a_reader_that_has_gone_is_no_fault():
     assert done.stdout.split()[-1] == "141"
 
 
-def test_residuals_are_measured_minus_predicted(calibrated, paper_images):
-    out, _ = calibrated
-    calibration = telerig.load_calibration(out)
-    row = pd.read_csv(out / "residuals.csv", dtype={"view": str}).iloc[7]
-    index = list(calibration.dot_ids).index(row["dot"])
-    pose = calibration.target_poses[row["view"]]
-    point = pose.apply(calibration.target_points_mm[index : index + 1])
-    predicted = calibration.project(row["camera"], point)[0]
-    # up to the eccentricity of the dot's image, which is below a milli-pixel here
-    np.testing.assert_allclose(
-        row[["u_px", "v_px"]].to_numpy(float) - predicted,
-        row[["du_px", "dv_px"]].to_numpy(float),
-        atol=1e-3,
-    )
-
-
 def test_calibration_agrees_with_the_truth(calibrated, paper_images):
     from telerig.estimator.calibration.quality.truth import compare_with_truth
 

@@ -89,7 +89,7 @@ def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> 
             f"the files hold {len(pinholes)} cameras, but the names are {list(names)}",
             todo=f"give {len(pinholes)} names, one for each camera",
         )
-    check_camera_names(names, ", ".join(dict.fromkeys(one.where for one in pinholes)), "--names")
+    check_camera_names(names, "names of the cameras", "--names")
     mirror = np.diag([1.0, 1.0, -1.0 if pinholes[0].mirrored else 1.0])
     for one in pinholes:
         _check(one)

@@ -7,20 +7,27 @@ import one_thread  # noqa: F401 - before NumPy
 # isort: split
 
 import os
+import pickle
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from batch_dataset import make_results
+from made_once import made_once
 from run_files import LEFT, RIG, RIGHT, write_images
 
+import telerig
+from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.calibrate import nominal_cameras
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.estimator.smoothing.graph import accelerations
+from telerig.factors.bubble_motion import Inertia, LowPasses
 from telerig.io.machine import parallel
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.simulation.calibration.scene import View, hand_held_views, true_cameras, true_target
@@ -49,7 +56,8 @@ def rigidly_aligned(points: Any, onto: Any) -> Any:
 class Scene:
     """A simulated calibration: what is measured and known, and the truth.
 
-    dots : the table that `self_calibrate` takes.  exact : noise-free pixels of the same rows.
+    dots : the table that `self_calibrate` takes, not to be changed in place.
+    exact : noise-free pixels of the same rows.
     outlier : (M,) which rows were displaced.  cameras : nominal;  true_cameras : by name.
     """
 
@@ -62,11 +70,15 @@ class Scene:
     true_cameras: dict[str, Camera]
     true_views: dict[str, View]
     true_dots_mm: dict[int, Any]
+    found: dict[str, Calibration] = field(default_factory=dict, init=False, repr=False)
 
-    def calibrate(self, model: str = "radial", **options: Any) -> Calibration:
-        """`self_calibrate` on this scene."""
+    def calibrate(self, model: Any = "radial", **options: Any) -> Calibration:
+        """`self_calibrate` on this scene, done once for each choice of options."""
         given = {"nominal_rotvec_deg": self.nominal_rotvec_deg, "model": model} | options
-        return self_calibrate(self.dots, self.cameras, self.target, **given)
+        key = repr((sorted(given.items()), self_calibration.next_view))
+        if key not in self.found:
+            self.found[key] = self_calibrate(self.dots, self.cameras, self.target, **given)
+        return self.found[key]
 
     def changed(self, change: Callable[[pd.DataFrame], pd.DataFrame]) -> Scene:
         """The scene with its table of measured dots changed."""
@@ -121,8 +133,20 @@ def make_scene(
     outlier_px: float = 20.0,
     **changes: Any,
 ) -> Scene:
-    """A scene from a preset (with changed fields) or a configuration."""
+    """A scene from a preset (with changed fields) or a configuration; equal ones are one object."""
     settings = preset(config, **changes) if isinstance(config, str) else config
+    key = pickle.dumps((settings, seed, outlier_share, outlier_px))
+    if key not in _scenes:
+        _scenes[key] = _new_scene(settings, seed, outlier_share, outlier_px)
+    return _scenes[key]
+
+
+_scenes: dict[bytes, Scene] = {}
+
+
+def _new_scene(
+    settings: SimulationConfig, seed: int, outlier_share: float, outlier_px: float
+) -> Scene:
     scene_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     cameras = dict(true_cameras(settings))
     target = true_target(settings, scene_rng)
@@ -150,20 +174,49 @@ def scene() -> Callable[..., Scene]:
     return make_scene
 
 
+@pytest.fixture
+def without_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrations in this process propose no next view: a quarter of their time, or more."""
+    monkeypatch.setattr(self_calibration, "next_view", _no_view)
+
+
+def _no_view(*_: object) -> None:
+    return None
+
+
 @pytest.fixture(scope="session")
 def paper_images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The preset `paper` with images; read only."""
-    import telerig
 
-    folder = tmp_path_factory.mktemp("paper") / "set"
-    telerig.simulate("paper", rng=np.random.default_rng(11), out=folder)
-    return folder
+    def make(folder: Path) -> None:
+        telerig.simulate("paper", rng=np.random.default_rng(11), out=folder)
+
+    return made_once(tmp_path_factory, "paper", make)
 
 
 @pytest.fixture
 def paper_copy(paper_images: Path, tmp_path: Path) -> Path:
     """A copy of `paper_images` to spoil."""
     return Path(shutil.copytree(paper_images, tmp_path / "set"))
+
+
+@pytest.fixture(scope="session")
+def tank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of `batch_dataset` with all of its results; read only."""
+    return made_once(tmp_path_factory, "tank", make_results)
+
+
+@pytest.fixture
+def tank_copy(tank: Path, tmp_path: Path) -> Path:
+    """A copy of `tank` to spoil."""
+    return Path(shutil.copytree(tank, tmp_path / "my tank"))
+
+
+@pytest.fixture
+def known_low_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smoothings in this process do not learn the low-pass of the forces: half of a short one."""
+    known = Inertia((0.002,) * 3)
+    monkeypatch.setattr(accelerations, "learned_low_passes", lambda *_: LowPasses(known, known))
 
 
 @pytest.fixture

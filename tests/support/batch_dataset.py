@@ -1,17 +1,45 @@
-"""A small dataset for batches."""
+"""A small dataset for commands, and the same with all of its results."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
+from typer.testing import CliRunner
 
+from telerig.errors import TelerigError
+from telerig.estimator.batch import batch
+from telerig.estimator.batch.jobs import Job
 from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
+from telerig.scripts.main import app
 
 
 def make_dataset(folder: Path, seed: int) -> Path:
     """A rig with 12 views as dots, a short run as detections with arm sensors: no images."""
-    config = run_preset("rise", frames=15)
+    config = run_preset("rise", frames=24)
     config = replace(config, stage=replace(config.stage, accelerometers=("left", "right")))
     simulate(config, rng=np.random.default_rng(seed), out=folder, images=False)
     return folder
+
+
+def outcome_here(job: Job) -> dict[str, Any]:
+    """A job's result without a process of its own; to take the place of `batch._outcome`."""
+    try:
+        return batch.do_job(job)
+    except TelerigError as error:
+        return batch.failure(batch.FAILED, str(error))
+
+
+def make_results(folder: Path) -> None:
+    """The dataset with what `telerig batch` makes of it, whose own results are in ``batch/``."""
+    make_dataset(folder, 5)
+    words = ["batch", str(folder), "--out", str(folder / "batch"), "--no-report", "--workers", "1"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch, "_outcome", outcome_here)
+        done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    (folder / "batch" / "said.txt").write_text(done.output, encoding="utf-8")

@@ -7,6 +7,7 @@ time.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from itertools import combinations
 
 import numpy as np
@@ -410,6 +411,8 @@ WINDOW = 3
 FARTHEST = 2
 """Largest offset, in views, that is tried."""
 MOST_WINDOWS = 12
+WORST_WINDOWS = 3
+"""In so many windows, those that fit worst, other offsets are tried first."""
 FAR_BETTER = 0.02
 """With the right offset the cost falls at least to this share."""
 
@@ -457,17 +460,23 @@ def wrong_pairs(problem: Problem, dots_mm: Array) -> str:
     if count < WINDOW:
         return ""
     starts = np.unique(np.linspace(0, count - WINDOW, MOST_WINDOWS).round().astype(int))
-    for c in range(1, len(problem.cameras)):
-        offsets = [0, *(s * n for n in range(1, FARTHEST + 1) for s in (1, -1))]
-        costs = np.array([[_cost(problem, dots_mm, c, v, s) for s in offsets] for v in starts])
-        best = costs.argmin(1)
-        # a window that has no solution, for example without a shared view, proves nothing
-        clear = (best > 0) & np.isfinite(costs[:, 0])
-        clear &= costs.min(1) < FAR_BETTER * np.where(clear, costs[:, 0], 0.0)
+    offsets = [s * n for n in range(1, FARTHEST + 1) for s in (1, -1)]
+    own = np.array([_cost(problem, dots_mm, 0, v, 0) for v in starts])
+    # a window that has no solution, for example without a shared view, proves nothing
+    solved = np.flatnonzero(np.isfinite(own))
+    for c in range(1, len(problem.cameras) if len(solved) else 0):
+        cost = cache(partial(_cost, problem, dots_mm, c))
+        # images of other views fit worst: if they are right even there, they are everywhere
+        for some in (solved[np.sort(np.argsort(-own[solved])[:WORST_WINDOWS])], solved):
+            costs = np.array([[cost(v, s) for s in offsets] for v in starts[some]])
+            clear = costs.min(1) < FAR_BETTER * own[some]
+            if not clear.any():
+                break
         if not clear.any():
             continue
+        best = costs.argmin(1)
         chosen = int(np.bincount(best[clear]).argmax())
-        first = int(starts[clear & (best == chosen)][0])
+        first = int(starts[some[clear & (best == chosen)]][0])
         camera, offset = problem.cameras[c].name, offsets[chosen]
         own_view, right_view = problem.views[first], problem.views[first + offset]
         side = "later" if offset > 0 else "earlier"
@@ -485,11 +494,14 @@ def _cost(problem: Problem, dots_mm: Array, camera: int, first: int, offset: int
     last = first + WINDOW
     if not 0 <= first + offset <= len(problem.views) - WINDOW:
         return float(np.inf)
-    view = problem.view - np.where(problem.camera == camera, offset, 0) - first
-    part = problem.subset((view >= 0) & (view < WINDOW))
+    mine = problem.camera == camera
+    view = problem.view - np.where(mine, offset, 0) - first
+    inside = (view >= 0) & (view < WINDOW)
+    if camera and len(np.intersect1d(view[inside & mine], view[inside & ~mine])) < 2:
+        return float(np.inf)  # two cameras can be turned so that any single view fits
     part = replace(
-        part,
-        view=view[(view >= 0) & (view < WINDOW)],
+        problem.subset(inside),
+        view=view[inside],
         views=problem.views[first:last],
         plate_shift=problem.plate_shift[first:last],
     ).with_model("none")

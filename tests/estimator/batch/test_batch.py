@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from batch_dataset import make_dataset
+from batch_dataset import make_dataset, outcome_here
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
-from telerig.estimator.batch.batch import Journal, local_executor, perform, run_batch, write_batch
+from telerig.estimator.batch import batch as work
+from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
 from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
 from telerig.scripts.main import app
 
@@ -26,26 +27,26 @@ def datasets(tmp_path_factory) -> list[Path]:
     return [make_dataset(base / name, seed) for seed, name in enumerate(["monday", "tuesday"])]
 
 
-def _jobs(datasets: list[Path]) -> list[Job]:
-    """One of them with its report: drawing takes most of the time."""
-    return [
-        replace(job, report=job.kind == "smooth" and Path(job.dataset).name == "monday")
-        for job in jobs_of(datasets)
-    ]
+def _begun(monkeypatch, result=lambda job: {"status": "done", "words": "", "figures": {}}) -> list:
+    """The jobs that are begun from now on, which write next to nothing."""
+    begun = []
+
+    def perform_nothing(job: Job) -> dict:
+        begun.append((job.kind, job.only_report))
+        if job.report:
+            job.results.mkdir(parents=True, exist_ok=True)
+            (job.results / "report.html").touch()
+            job.result.write_text("{}")
+        return result(job)
+
+    monkeypatch.setattr(work, "perform", perform_nothing)
+    return begun
 
 
-@pytest.fixture(scope="module")
-def first_run(datasets) -> tuple[Path, list[dict]]:
-    """Both datasets done, by two workers."""
-    out = datasets[0].parent / "out"
-    with local_executor(2) as executor:
-        records = run_batch(_jobs(datasets), executor, Journal(out))
-    write_batch(records, out)
-    return out, records
-
-
-def _tables(dataset: Path) -> dict[str, bytes]:
-    return {name: (dataset / "results" / name).read_bytes() for name in RESULTS}
+def _again(jobs: list[Job], out: Path) -> list[bool]:
+    """Which of the jobs are not done again."""
+    with ThreadPoolExecutor(2) as executor:
+        return [bool(r.get("resumed")) for r in run_batch(jobs, executor, Journal(out))]
 
 
 def test_a_dataset_is_calibrated_then_tracked_then_smoothed(datasets):
@@ -75,70 +76,59 @@ def test_shares_keep_a_dataset_together_and_cover_all(datasets):
     assert sorted(j.name for s in shares for j in s) == sorted(j.name for j in jobs)
 
 
-def test_all_is_done_and_summed_up(first_run, datasets):
-    out, records = first_run
-    assert [r["status"] for r in records] == ["done"] * 6, [r["words"] for r in records]
-    table = pd.read_csv(out / "batch.csv")
-    assert list(table["kind"]) == ["calibrate", "track", "smooth"] * 2
-    calibrated = json.loads((datasets[0] / "results/calibration/calibration.json").read_bytes())
+def test_all_is_done_and_summed_up(tank):
+    table = pd.read_csv(tank / "batch" / "batch.csv")
+    assert list(table["kind"]) == ["calibrate", "track", "smooth"]
+    assert list(table["status"]) == ["done"] * 3
+    calibrated = json.loads((tank / "results/calibration/calibration.json").read_bytes())
     assert table["rms_px"][0] == pytest.approx(calibrated["statistics"]["rms_px"])
-    assert (table.loc[table["kind"] == "smooth", "sy_um"] > 0).all()
-    page = (out / "report.html").read_text()
-    assert "2 of 2 runs done" in page
-    assert 'href="../monday/results/rise/report.html"' in page
-    assert "../tuesday" not in page
+    assert table["sy_um"][2] > 0
+    assert all((tank / "results" / name).is_file() for name in RESULTS)
+    said = (tank / "batch" / "said.txt").read_text(encoding="utf-8").splitlines()
+    assert said[3:5] == ["calibrate: 1 done (1 GOOD)", "track: 1 done"]
 
 
-def test_what_is_done_is_not_done_again_until_an_input_changes(first_run, datasets):
-    out, _ = first_run
-    before = [_tables(d) for d in datasets]
-    stamps = [(d / "results" / name).stat().st_mtime_ns for d in datasets for name in RESULTS]
-    with local_executor(2) as executor:
-        again = run_batch(_jobs(datasets), executor, Journal(out))
-    assert all(r["resumed"] for r in again)
-    assert stamps == [
-        (d / "results" / name).stat().st_mtime_ns for d in datasets for name in RESULTS
-    ]
-    missing = datasets[0] / "results" / "rise" / "report.html"
-    words = missing.read_text(encoding="utf-8")
-    missing.unlink()
-    with local_executor(2) as executor:
-        quick = [replace(job, report=False) for job in _jobs(datasets)]
-        silent = run_batch(quick, executor, Journal(out))
-        assert not missing.is_file()
-        drawn = run_batch(_jobs(datasets), executor, Journal(out))
-    assert all(r["resumed"] for r in [*silent, *drawn])
-    assert len(missing.read_text(encoding="utf-8")) == pytest.approx(len(words), rel=0.01)
-    assert [_tables(d) for d in datasets] == before
-    job = _jobs(datasets)[4]
-    same = fingerprint(job)
-    table = datasets[1] / "runs" / "rise" / "detections.csv"
-    os.utime(table, ns=(1, 1))
-    assert fingerprint(job) != same
-    with local_executor(2) as executor:
-        third = run_batch(_jobs(datasets), executor, Journal(out))
-    assert [bool(r.get("resumed")) for r in third] == [True] * 4 + [False] * 2
-    assert [_tables(d) for d in datasets] == before
+def test_what_is_done_is_not_done_again_until_an_input_changes(tmp_path, monkeypatch):
+    data, out = make_dataset(tmp_path / "data", 5), tmp_path / "out"
+    begun, jobs = _begun(monkeypatch), jobs_of([data])
+    assert _again(jobs, out) == [False] * 3 and len(begun) == 3
+    (data / "results" / "rise" / "report.html").unlink()
+    begun.clear()
+    assert _again([replace(job, report=False) for job in jobs], out) == [True] * 3 and not begun
+    assert _again(jobs, out) == [True] * 3
+    assert begun and all(drawn for _, drawn in begun)
+    begun.clear()
+    same = fingerprint(jobs[1])
+    os.utime(data / "runs" / "rise" / "detections.csv", ns=(1, 1))
+    assert fingerprint(jobs[1]) != same
+    assert _again(jobs, out) == [True, False, False]
+    assert begun == [("track", False), ("smooth", False)]
+    assert _again(jobs, out) == [True] * 3
+
+
+def test_a_missing_report_is_drawn(tank_copy):
+    job = jobs_of([tank_copy])[0]
+    assert job.lacks_report
+    assert do_job(replace(job, only_report=True))["status"] == "done"
+    assert not job.lacks_report
 
 
 def test_a_failure_stops_only_what_needs_it(datasets, tmp_path, monkeypatch):
-    begun = []
-
-    def perform_but_fail_at_monday(job: Job) -> dict:
-        begun.append(job.name)
+    def but_monday(job: Job) -> dict:
         failed = job.kind == "calibrate" and Path(job.dataset).name == "monday"
         return {"status": "failed" if failed else "done", "words": "no light", "figures": {}}
 
-    monkeypatch.setattr("telerig.estimator.batch.batch.perform", perform_but_fail_at_monday)
-    jobs = jobs_of(datasets)
+    begun = _begun(monkeypatch, but_monday)
+    jobs = jobs_of(datasets, report=False)
     with ThreadPoolExecutor(2) as executor:
         records = run_batch(jobs, executor, Journal(tmp_path / "out"))
     assert [r["status"] for r in records] == ["failed", "left out", "left out"] + ["done"] * 3
     assert all(f"needs {jobs[0].name}, which was failed" in r["words"] for r in records[1:3])
-    assert sorted(begun) == sorted(j.name for j in [jobs[0], *jobs[3:]])
+    assert sorted(begun) == [(k, False) for k in ("calibrate", "calibrate", "smooth", "track")]
 
 
-def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path):
+def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path, monkeypatch):
+    monkeypatch.setattr(work, "_outcome", outcome_here)
     broken = make_dataset(tmp_path / "broken", 7)
     (broken / "calibration" / "dots.csv").write_text("view,camera,dot,u_px,v_px\n")
     no_rig = tmp_path / "no_rig"
@@ -147,7 +137,7 @@ def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path):
     shutil.rmtree(good / "runs")
     out = tmp_path / "out"
     given = [str(place) for place in (no_rig, broken, good)]
-    result = CliRunner().invoke(app, ["batch", *given, "--out", str(out)])
+    result = CliRunner().invoke(app, ["batch", *given, "--model", "none", "--out", str(out)])
     assert result.exit_code == 1, result.output
     table = pd.read_csv(out / "batch.csv", keep_default_na=False)
     assert list(table["status"]) == ["failed", "failed", "done"]
@@ -155,6 +145,7 @@ def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path):
     assert "dots.csv" in table["words"][1]
     page = (out / "report.html").read_text()
     assert "What failed" in page and "dots.csv" in page
+    assert 'href="../good/results/calibration/report.html"' in page
 
 
 def test_a_folder_that_this_machine_does_not_see_is_named(tmp_path):
@@ -180,23 +171,34 @@ def test_bad_requests_are_told_in_words(datasets, tmp_path, arguments, words):
     result = CliRunner().invoke(app, ["batch", *given, "--out", str(tmp_path / "out")])
     assert result.exit_code == 2, result.output
     assert words in result.output
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "out").exists() and not (datasets[0] / "results").exists()
 
 
-def test_run_does_everything_for_one_dataset(tmp_path):
-    data = make_dataset(tmp_path / "data", 5)
-    result = CliRunner().invoke(app, ["run", str(data), "--no-report", "--quiet"])
-    assert result.exit_code == 0, result.output
-    assert result.output == (
-        "calibrate: 1 done (1 GOOD)\ntrack: 1 done\nsmooth: 1 done (1 UNRESOLVED)\n"
-    )
-    assert all((data / "results" / name).is_file() for name in RESULTS)
+@pytest.mark.parametrize(
+    ("status", "lines", "code"),
+    [
+        ("done", ["calibrate: 1 done (1 GOOD)", "track: 1 done (1 GOOD)"], 0),
+        ("rejected", ["calibrate: 1 rejected", "track: 1 left out"], 1),
+    ],
+)
+def test_run_does_everything_for_one_dataset(datasets, monkeypatch, status, lines, code):
+    result = {"status": status, "words": "", "figures": {"verdict": "GOOD"}}
+    monkeypatch.setattr(work, "do_job", lambda *_: result)
+    words = ["run", str(datasets[0]), "--no-report", "--quiet"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == code, done.output
+    assert [line for line in done.output.splitlines() if line.startswith(("cal", "tr"))] == lines
 
 
-def test_run_refuses_an_unknown_run(datasets):
-    result = CliRunner().invoke(app, ["run", str(datasets[0]), "--only", "fall"])
+@pytest.mark.parametrize(
+    "words",
+    [["--only", "fall"], ["--model", "nothing"], ["--calibration", "nothing"]],
+)
+def test_run_refuses_before_work_begins(datasets, words):
+    result = CliRunner().invoke(app, ["run", str(datasets[0]), *words])
     assert result.exit_code == 2
-    assert "no dataset has a run 'fall'" in result.output
+    assert words[1] in result.output
+    assert not (datasets[0] / "results").exists()
 
 
 def test_unknown_runs_are_an_error_of_the_library_too(datasets):
@@ -204,22 +206,11 @@ def test_unknown_runs_are_an_error_of_the_library_too(datasets):
         jobs_of(datasets, only=["fall"])
 
 
-@pytest.mark.parametrize("command", ["run", "batch"])
-@pytest.mark.parametrize("option", ["--model", "--calibration"])
-def test_an_option_that_cannot_be_used_is_refused_before_work_begins(
-    tmp_path, monkeypatch, command, option
-):
-    monkeypatch.chdir(tmp_path)
-    data = make_dataset(tmp_path / "data", 5)
-    result = CliRunner().invoke(app, [command, str(data), option, "nothing"])
-    assert result.exit_code == 2, result.output
-    assert not (data / "results").exists() and not (tmp_path / "telerig-batch").exists()
-
-
 def test_a_run_named_calibration_does_not_mix_with_the_calibration(tmp_path):
     data = make_dataset(tmp_path / "data", 5)
     (data / "runs" / "rise").rename(data / "runs" / "calibration")
-    result = CliRunner().invoke(app, ["run", str(data), "--no-report", "--quiet"])
+    words = ["run", str(data), "--no-report", "--quiet", "--model", "none"]
+    result = CliRunner().invoke(app, words)
     assert result.exit_code == 1, result.output
     assert "track: 1 failed" in result.output and "rename the folder" in result.output
     assert "written" not in result.output
@@ -232,29 +223,24 @@ def test_a_run_named_calibration_does_not_mix_with_the_calibration(tmp_path):
 
 def test_an_input_that_changes_during_the_work_is_done_again(tmp_path, monkeypatch):
     data = make_dataset(tmp_path / "data", 5)
-    jobs = jobs_of([data])[:1]
 
-    def perform_slowly(job: Job) -> dict:
-        job.result.parent.mkdir(parents=True, exist_ok=True)
-        job.result.write_text("{}")
+    def slowly(job: Job) -> dict:
         os.utime(data / "rig.toml", ns=(1, 1))
         return {"status": "done", "words": "", "figures": {}}
 
-    monkeypatch.setattr("telerig.estimator.batch.batch.perform", perform_slowly)
-    resumed = []
-    for _ in range(3):
-        with ThreadPoolExecutor(1) as executor:
-            (record,) = run_batch(jobs, executor, Journal(tmp_path / "out"))
-        resumed.append(bool(record.get("resumed")))
-    assert resumed == [False, False, True]
+    _begun(monkeypatch, slowly)
+    jobs = jobs_of([data])[:1]
+    assert [_again(jobs, tmp_path / "out") for _ in range(3)] == [[False], [False], [True]]
 
 
-def test_datasets_of_the_same_name_are_told_apart(tmp_path):
+def test_datasets_of_the_same_name_are_told_apart(tmp_path, monkeypatch):
+    monkeypatch.setattr(work, "_outcome", outcome_here)
     places = [tmp_path / day / "tank" for day in ("monday", "tuesday")]
     for place in places:
         place.mkdir(parents=True)
     given = [str(place) for place in places]
-    result = CliRunner().invoke(app, ["batch", *given, "--out", str(tmp_path / "out")])
+    words = ["batch", *given, "--no-report", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, words)
     assert result.exit_code == 1, result.output
     told = [line for line in result.output.splitlines() if line.startswith("[")]
     assert all(sum(place in line.split(": failed")[0] for line in told) == 1 for place in given)

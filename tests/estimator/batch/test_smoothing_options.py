@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import telerig
 from telerig.errors import InputError
 from telerig.estimator.batch.jobs import Job, jobs_of, shake_model
-from telerig.io.simulation.presets import run_preset
-from telerig.io.simulation.simulate import simulate
+from telerig.estimator.smoothing import results_folder
 from telerig.scripts.main import app
 
 
@@ -24,77 +23,73 @@ def command(line: str, code: int = 0) -> str:
     return result.output
 
 
-@pytest.fixture(scope="module")
-def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A calibrated dataset with the tracked runs rise and fall, and none smoothed."""
-    data = tmp_path_factory.mktemp("tracked") / "data"
-    config = run_preset("rise", frames=24)
-    simulate(config, rng=np.random.default_rng(1), out=data, images=False)
-    shutil.copytree(data / "runs" / "rise", data / "runs" / "fall")
-    command(f"telerig run {data} --only calibrate --only track --model radial --no-report --quiet")
-    assert not list(data.rglob("smoothing.json"))
+@pytest.fixture
+def data(tank: Path, tmp_path: Path) -> Path:
+    """A calibrated dataset with the tracked runs rise and fall."""
+    data = Path(shutil.copytree(tank, tmp_path / "data"))
+    for folder in ("runs", "results"):
+        shutil.copytree(data / folder / "rise", data / folder / "fall")
     return data
 
 
 @pytest.fixture
-def data(tracked: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(tracked, tmp_path / "data"))
+def asked(tank: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """What smoothings are asked for from now on. None is done; their result is the dataset's."""
+    found, calls = telerig.load_smoothing(tank / "results" / "rise"), list[dict[str, Any]]()
+
+    def smooth_run(run: Any, _: Any, tracks: Path, folder: Path, **options: Any) -> Any:
+        if not (Path(tracks) / "tracks.csv").is_file():
+            raise InputError("not tracked", where=str(tracks))
+        kept = ("model", "refine_rig", "accept", "report")
+        options = {"accept": [], "refine_rig": False} | options
+        where = {"run": run.path, "tracks": Path(tracks), "out": Path(folder)}
+        calls.append(where | {name: options[name] for name in kept})
+        calls[-1]["accept"] = list(options["accept"])
+        return found
+
+    monkeypatch.setattr(results_folder, "smooth_run", smooth_run)
+    return calls
 
 
-def smoothed(folder: Path) -> bytes:
-    return (folder / "trajectories.csv").read_bytes() + (folder / "shake.csv").read_bytes()
-
-
-def test_several_runs_are_smoothed_with_one_call(data: Path) -> None:
-    """As one by one, also with options; a batch does the same."""
-    options = "--model default --refine-rig --accept SENSOR_MOUNT"
-    runs = f"{data}/runs/rise {data}/runs/fall"
-    said = command(f"telerig smooth {runs} {options} --no-report --quiet")
+@pytest.mark.parametrize("apart", [False, True])
+def test_several_runs_are_smoothed_with_one_call(
+    data: Path, asked: list[dict[str, Any]], apart: bool
+) -> None:
+    """With the options, and with folders of their own; `run` and `batch` do the same."""
+    options = "--model default --refine-rig --accept SENSOR_MOUNT --no-report"
+    if apart:
+        shutil.move(data / "results" / "rise", data / "elsewhere" / "rise")
+        shutil.move(data / "results" / "fall", data / "elsewhere" / "fall")
+        options += f" --tracks {data}/elsewhere"
+    said = command(f"telerig smooth {data}/runs/fall {data}/runs/rise {options} --quiet")
     assert said.endswith("2 of 2 runs are smoothed\n") and f"{data}/runs/fall:\n" in said
-    found = {name: smoothed(data / "results" / name) for name in ("rise", "fall")}
-    content = json.loads((data / "results" / "fall" / "smoothing.json").read_text())
-    assert content["accepted"] == ["SENSOR_MOUNT"] and content["rig_change"]
-    manifest = (data / "results" / "fall" / "manifest.json").read_text()
-    assert f"telerig smooth {data}/runs/fall --model=default --refine-rig --accept" in manifest
-
-    command(f"telerig smooth {data}/runs/rise {options} --no-report --quiet --out {data}/alone")
-    assert smoothed(data / "alone") == found["rise"]
-
-    for name in found:
-        (data / "results" / name / "trajectories.csv").unlink()
-    command(
-        f"telerig batch {data} --only smooth {options} --no-report --quiet --workers 1 "
-        f"--out {data}/b"
-    )
-    assert {name: smoothed(data / "results" / name) for name in found} == found
+    tracks, results = data / ("elsewhere" if apart else "results"), data / "results"
+    expected = [
+        {"run": data / "runs" / name, "tracks": tracks / name, "out": results / name,
+         "model": "default", "refine_rig": True, "accept": ["SENSOR_MOUNT"], "report": False}
+        for name in ("fall", "rise")
+    ]  # fmt: skip
+    assert asked == expected
+    command(f"telerig run {data} --only smooth {options} --quiet")
+    assert asked == 2 * expected
+    if apart:
+        command(f"telerig smooth {data}/runs/fall {data}/runs/rise {options} --out {data}/new")
+        assert [call["out"] for call in asked[4:]] == [data / "new/fall", data / "new/rise"]
 
 
-def test_tracks_and_results_of_several_runs_have_a_folder_each(data: Path) -> None:
-    shutil.move(data / "results" / "rise", data / "elsewhere" / "rise")
-    shutil.copytree(data / "results" / "fall", data / "elsewhere" / "fall")
-    runs = f"{data}/runs/rise {data}/runs/fall"
-    command(
-        f"telerig smooth {runs} --tracks {data}/elsewhere --out {data}/new --model default --quiet "
-        "--no-report"
-    )
-    command(f"telerig run {data} --only smooth --tracks {data}/elsewhere --model default "
-            "--no-report --quiet")  # fmt: skip
-    assert smoothed(data / "new" / "rise") == smoothed(data / "results" / "rise")
-
-
-def test_a_run_that_fails_does_not_stop_the_others(data: Path) -> None:
+def test_a_run_that_fails_does_not_stop_the_others(data: Path, asked: list[dict[str, Any]]) -> None:
     (data / "results" / "rise" / "tracks.csv").unlink()
     runs = f"{data}/runs/rise {data}/runs/fall"
     said = command(f"telerig smooth {runs} --model default --no-report --quiet", code=1)
     assert f"{data}/runs/rise: not smoothed:" in said
     assert "1 of 2 runs are smoothed; failed: rise" in said
-    assert (data / "results" / "fall" / "smoothing.json").is_file()
+    assert [call["run"].name for call in asked] == ["fall"]
     command(f"telerig smooth {data}/runs/rise --no-report", code=2)
 
 
-def test_jobs_are_chosen_by_kind_and_run(tracked: Path) -> None:
+def test_jobs_are_chosen_by_kind_and_run(data: Path) -> None:
     def named(*only: str) -> list[tuple[str, str]]:
-        jobs = jobs_of([tracked], only=only)
+        jobs = jobs_of([data], only=only)
         names = {job.name for job in jobs}
         assert all(set(job.needs) <= names for job in jobs)
         return [(job.kind, job.run) for job in jobs]
@@ -107,13 +102,13 @@ def test_jobs_are_chosen_by_kind_and_run(tracked: Path) -> None:
         named("smoothe")
 
 
-def test_a_job_says_the_command_that_does_the_same(tracked: Path) -> None:
-    (job, _) = jobs_of(
-        [tracked], only=["smooth"], shake="default", refine_rig=True, accept=["A", "B"],
+def test_a_job_says_the_command_that_does_the_same(tank: Path) -> None:
+    (job,) = jobs_of(
+        [tank], only=["smooth"], shake="default", refine_rig=True, accept=["A", "B"],
         tracks=Path("/t"), report=False,
     )  # fmt: skip
     assert job.command == (
-        f"telerig smooth {tracked}/runs/fall --tracks /t/fall --model=default --refine-rig "
+        f"telerig smooth {tank}/runs/rise --tracks /t/rise --model=default --refine-rig "
         "--accept A --accept B --no-report"
     )
     assert Job.from_json(job.as_json()) == job
@@ -132,12 +127,12 @@ def test_model_means_the_shake_where_only_smoothing_is_done() -> None:
             shake_model(model, shake, only)
 
 
-def test_one_folder_for_two_runs_is_refused(tracked: Path, tmp_path: Path) -> None:
-    run = tracked / "runs" / "rise"
+def test_one_folder_for_two_runs_is_refused(tank: Path, tmp_path: Path) -> None:
+    run = tank / "runs" / "rise"
     for option in ("--out", "--tracks"):
         said = command(f"telerig smooth {run} {run} {option} {tmp_path}/x", code=2)
         assert "several runs are named 'rise'" in said
-    said = command(f"telerig batch {tracked} --tracks {tmp_path} --out {tmp_path}/b", code=2)
+    said = command(f"telerig batch {tank} --tracks {tmp_path} --out {tmp_path}/b", code=2)
     assert "add --only smooth" in said
     assert not list(tmp_path.iterdir())
 

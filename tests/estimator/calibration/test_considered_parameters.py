@@ -27,6 +27,8 @@ from telerig.io.simulation.presets import preset
 from telerig.rig.lens_parameters import GROUPS
 from telerig.rig.triangulation import aligned_shift, triangulate
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 NONE: frozenset[str] = frozenset()
 STRETCH = frozenset({"affine"})
 
@@ -154,14 +156,15 @@ def test_of_many_dots_some_are_as_uncertain_as_in_the_whole(
     assert np.abs((parts - whole) / np.outer(sd, sd)).max() < 1e-5
 
 
-def test_the_points_errors_are_those_of_the_covariance(scene: Any) -> None:
+@pytest.mark.parametrize("seeds", [1, pytest.param(6, marks=pytest.mark.slow)])
+def test_the_points_errors_are_those_of_the_covariance(scene: Any, seeds: int) -> None:
     """A stretch of the right camera that is too small to be named, beside a large one of the left.
 
     Errors of points over their stated standard deviations, mean square per direction: without
     what is considered several times too large.
     """
     found, plain = [], []
-    for seed in range(6):
+    for seed in range(seeds):
         made = stretched(scene, 3e-5, seed)
         calibration = made.calibrate("auto")
         bare = made.calibrate(calibration.model["name"])
@@ -174,7 +177,7 @@ def test_the_points_errors_are_those_of_the_covariance(scene: Any) -> None:
         )
         found.append(nees(made, calibration))
         plain.append(nees(made, bare))
-    assert len(found) >= 4
+    assert len(found) >= 0.6 * seeds
     assert np.mean(found) < 1.6
     assert np.mean(plain) > 2.0
 

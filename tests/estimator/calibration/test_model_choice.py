@@ -34,6 +34,8 @@ from telerig.factors.calibration import whitened_error
 from telerig.io.simulation.presets import preset
 from telerig.rig.lens_parameters import GROUPS, name_of, rich_groups
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 RICH = rich_groups(mono=False, strong=False)
 LENS: dict[str, dict[str, float]] = {
     "none": {},

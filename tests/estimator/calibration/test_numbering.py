@@ -12,6 +12,8 @@ from turned_images import settled, turned
 from telerig.errors import CalibrationError
 from telerig.rig.target import Target
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 SQUARE = Target(
     rows=5, columns=5, pitch_mm=(5.0, 5.0), dot_diameter_mm=2.0, scale_dots=(0, 24)
 )  # fmt: skip
@@ -40,10 +42,10 @@ def test_turns_are_turns() -> None:
             ) < 1e-9  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
-    "target", [None, SQUARE, HEXAGON], ids=["2-fold", "4-fold", "6-fold, listed points"]
-)
+    ("target", "seed"), [(None, 0), (SQUARE, 1), (HEXAGON, 0)],
+    ids=["2-fold", "4-fold", "6-fold, listed points"],
+)  # fmt: skip
 def test_images_turned_at_random(seed: int, target: Target | None, scene: Any) -> None:
     changes = {} if target is None else {"target": target}
     right = scene("symmetric", seed, **changes)

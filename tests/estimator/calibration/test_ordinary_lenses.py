@@ -20,6 +20,8 @@ from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.target import Target
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 Array = NDArray[np.float64]
 SIZE = (1280, 1024)
 NOISE_PX = 0.03
@@ -67,7 +69,7 @@ def calibrated(
 
 @pytest.mark.parametrize(
     ("focal_px", "angle_deg", "base"),
-    [(3000.0, 45.0, 0.0), (3000.0, 0.0, 0.15), (5000.0, 4.0, 0.15), (8000.0, 1.0, 0.0)],
+    [(3000.0, 45.0, 0.0), (3000.0, 0.0, 0.15), (8000.0, 1.0, 0.0)],
 )
 def test_centres_and_angle_are_as_good_as_stated(
     focal_px: float, angle_deg: float, base: float
@@ -90,10 +92,11 @@ def test_centres_and_angle_are_as_good_as_stated(
     assert ("nearly parallel" in found.diagnostics["gauge"]) == (angle_deg < 10)
 
 
-def test_a_smooth_error_of_the_lens_model_widens_the_standard_deviations() -> None:
+@pytest.mark.parametrize("seeds", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_smooth_error_of_the_lens_model_widens_the_standard_deviations(seeds: int) -> None:
     """Independent errors of the dots would give centres that are up to 20 of them off."""
     squares = []
-    for seed in range(3):
+    for seed in range(seeds):
         found = calibrated(3000.0, 45.0, 0.0, seed, wave_px=0.15)
         widening = found.diagnostics["structure"]["widening"]
         assert 3.0 < widening < 8.0

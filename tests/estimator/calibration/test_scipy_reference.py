@@ -159,7 +159,7 @@ class Reference:
 
 
 def solved(scene: Any, preset: str, model: str, lens: tuple[str, ...]) -> Any:
-    made = scene(preset, 7)
+    made = scene(preset, 7, views=5)
     problem = problem_from_dots(made.dots, made.cameras, made.target).with_model(model)
     start = known_target.stereo_states(problem, problem.nominal_mm)[0]
     ours = graph.solve(problem, start)

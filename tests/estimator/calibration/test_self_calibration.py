@@ -10,10 +10,7 @@ import pandas as pd
 import pytest
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.calibrate import nominal_cameras
-from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.io.simulation.presets import preset
-from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
 
 
@@ -45,28 +42,6 @@ def test_presets(preset: str, model: str, chosen: set[str], limit_um: float, sce
     assert calibration.statistics["share_kept"] > 0.99
     assert made.space_rms_um(calibration) < limit_um
     assert calibration.twin["decided_by"] == "nominal rotation"
-
-
-def test_through_the_files_of_the_simulator(tmp_path: Any) -> None:
-    dataset = simulate("paper", rng=np.random.default_rng(3), out=tmp_path / "set", images=False)
-    rig = dataset.rig
-    calibration = self_calibrate(
-        dataset.dots(),
-        nominal_cameras(rig),
-        dataset.target,
-        nominal_rotvec_deg=rig.rotvec_from_first_deg,
-    )
-    truth = dataset.truth
-    assert truth is not None
-    for camera in calibration.cameras:
-        expected = truth["cameras"][camera.name]["parameters"]
-        sd = calibration.sd(f"{camera.name}.scale_px_per_mm")
-        assert abs(camera["scale_px_per_mm"] - expected["scale_px_per_mm"]) < 4 * sd
-        assert abs(camera["k1"] - expected["k1"]) < 4 * calibration.sd(f"{camera.name}.k1")
-    axis = np.array(truth["cameras"]["right"]["camera_from_rig"]["rotation"])[2]
-    s = calibration.statistics
-    off = s["axes_angle_deg"] - np.degrees(np.arccos(axis[2]))
-    assert abs(off) < 4 * s["axes_angle_sd_deg"]
 
 
 def test_unbounded_target(scene: Any) -> None:
@@ -124,10 +99,9 @@ def one_camera(scene: Any) -> Any:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_one_camera(seed: int, scene: Any) -> None:
+def test_one_camera(scene: Any) -> None:
     """The tilts' signs follow from the dots' relief: with wrong ones the floor is 0.1 px."""
-    made = one_camera(scene("paper", seed, outlier_share=0.03))
+    made = one_camera(scene("paper", 0, outlier_share=0.03))
     calibration = made.calibrate("radial")
     s = calibration.statistics
     assert s["noise_floor_px"] == 0
@@ -152,8 +126,7 @@ def test_views_of_one_camera_only(scene: Any) -> None:
     assert sum("does not connect the cameras" in n for n in calibration.notes) == 6
 
 
-@pytest.mark.parametrize("preset", ["paper", "near_telecentric"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("preset", "seed"), [("paper", 0), ("near_telecentric", 1)])
 def test_outliers(preset: str, seed: int, scene: Any) -> None:
     """5 % of the dots are off by 20 px: all are found, no other is blamed."""
     made = scene(preset, seed, outlier_share=0.05)
@@ -190,7 +163,7 @@ def _shifted(dots: pd.DataFrame, row: int, by_px: float) -> pd.DataFrame:
 
 
 def test_a_fifth_of_outliers_is_found_but_rejected(scene: Any) -> None:
-    made = scene("paper", 1, outlier_share=0.2)
+    made = scene("paper", 1, outlier_share=0.2, views=8)
     calibration = made.calibrate("radial")
     np.testing.assert_array_equal(made.weights(calibration) < 1, made.outlier)
     assert calibration.verdict["status"] == "REJECTED"
@@ -199,13 +172,13 @@ def test_a_fifth_of_outliers_is_found_but_rejected(scene: Any) -> None:
 
 
 def test_it_is_deterministic(paper: Any) -> None:
-    a, b = (paper.calibrate("auto") for _ in range(2))
-    shuffled = paper.changed(lambda d: d.sample(frac=1, random_state=1)).calibrate("auto")
-    for other in (b, shuffled):
-        for x, y in zip(a.cameras, other.cameras):
-            np.testing.assert_array_equal(x.intrinsics, y.intrinsics)
-        np.testing.assert_array_equal(a.joint_covariance, other.joint_covariance)
-        assert a.report() == other.report()
+    """To the last bit, whatever the order of the rows."""
+    once = paper.calibrate("auto")
+    again = paper.changed(lambda d: d.sample(frac=1, random_state=1)).calibrate("auto")
+    for x, y in zip(once.cameras, again.cameras):
+        np.testing.assert_array_equal(x.intrinsics, y.intrinsics)
+    np.testing.assert_array_equal(once.joint_covariance, again.joint_covariance)
+    assert once.report() == again.report()
 
 
 def test_the_start_does_not_need_the_nominal_scale(paper: Any) -> None:
@@ -245,20 +218,21 @@ def test_the_nominal_side_decides(paper: Any) -> None:
 
 
 @pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.0, 180.0, 0.0), (90.0, 0.0, 0.0)])
-def test_a_tie_is_an_error(rotvec: Any, paper: Any) -> None:
+def test_a_tie_is_an_error(rotvec: Any, scene: Any) -> None:
+    few = scene("paper", 1, views=4)
     with pytest.raises(
         CalibrationError, match=r"mirror solutions are \d+ and \d+ degrees.*too similar"
     ):
-        paper.calibrate("radial", nominal_rotvec_deg=rotvec)
+        few.calibrate("radial", nominal_rotvec_deg=rotvec)
 
 
-def test_no_nominal_rotation_is_an_error(paper: Any) -> None:
+def test_no_nominal_rotation_is_an_error(scene: Any) -> None:
     with pytest.raises(CalibrationError, match="both mirror solutions fit equally well"):
-        paper.calibrate("radial", nominal_rotvec_deg=None)
+        scene("paper", 1, views=4).calibrate("radial", nominal_rotvec_deg=None)
 
 
 def test_the_plate_of_a_two_sided_target_decides(scene: Any) -> None:
-    made = scene("two_sided", 1, outlier_share=0.03)
+    made = scene("two_sided", 1, outlier_share=0.03, views=8)
     alone = made.calibrate("radial", nominal_rotvec_deg=None)
     assert alone.twin["decided_by"] == "refraction in the plate"
     assert made.space_rms_um(alone) < 1.5
@@ -320,8 +294,8 @@ def test_noise_floor_with_dots_that_are_well_known(scene: Any, more_px: float) -
     )  # fmt: skip
     made = scene("paper", 0, target=target, views=8, cameras=paper.cameras[:1])
     noise = more_px * np.random.default_rng(0).standard_normal((len(made.dots), 2))
-    made.dots[["u_px", "v_px"]] += noise
-    calibration = made.calibrate("radial")
+    moved = made.dots[["u_px", "v_px"]] + noise
+    calibration = made.with_dots(made.dots.assign(**moved)).calibrate("radial")
     assert calibration.statistics["noise_floor_px"] == pytest.approx(more_px, rel=0.05)
     assert calibration.statistics["chi2_dof"] == pytest.approx(1, abs=0.06)
     assert calibration.verdict["status"] == "GOOD" or more_px

@@ -89,22 +89,19 @@ def test_exact_without_noise(lens: dict[str, float]) -> None:
     np.testing.assert_allclose(found.basis.T @ np.c_[found.basis, AXIS], np.eye(2, 3), atol=1e-9)
 
 
-def test_a_scale_error_of_one_percent_is_found_to_100_ppm() -> None:
-    for seed in range(20):
-        found = stage_axis_of(CALIBRATION, *views(np.random.default_rng(seed)))
-        assert found.scale == pytest.approx(0.01, abs=1e-4)
-        assert found.scale_sd < 5e-5
-        assert 0.6 < found.chi2_dof < 1.5
-
-
-def test_covariance_equals_the_monte_carlo_spread() -> None:
-    """100 draws: squared errors over the stated covariance are chi-square with 3 degrees."""
+@pytest.mark.parametrize("draws", [16, pytest.param(100, marks=pytest.mark.slow)])
+def test_covariance_equals_the_monte_carlo_spread(draws: int) -> None:
+    """Squared errors over the stated covariance are chi-square with 3 degrees of freedom."""
     rng = np.random.default_rng(5)
-    found = [stage_axis_of(CALIBRATION, *views(rng)) for _ in range(100)]
+    found = [stage_axis_of(CALIBRATION, *views(rng)) for _ in range(draws)]
+    for one in found:
+        assert one.scale == pytest.approx(0.01, abs=1e-4)
+        assert one.scale_sd < 5e-5
+        assert 0.6 < one.chi2_dof < 1.5
     errors = np.array([tangent_error(f) for f in found])
     scores = [e @ np.linalg.solve(f.joint_covariance, e) for e, f in zip(errors, found)]
-    assert np.mean(scores) == pytest.approx(3.0, abs=4 * np.sqrt(6 / 100))
-    assert np.std(errors[:, 2]) == pytest.approx(found[0].scale_sd, rel=0.25)
+    assert np.mean(scores) == pytest.approx(3.0, abs=4 * np.sqrt(6 / draws))
+    assert np.std(errors[:, 2]) == pytest.approx(found[0].scale_sd, rel=2.5 / draws**0.5)
     assert found[0].scale_sd == pytest.approx(np.sqrt(found[0].joint_covariance[2, 2]))
 
 
@@ -139,17 +136,18 @@ def test_outliers_and_a_wrong_reading() -> None:
     assert "10 of 330 dots" in words
 
 
-def test_a_stage_that_wanders_says_so() -> None:
+@pytest.mark.parametrize("draws", [10, pytest.param(40, marks=pytest.mark.slow)])
+def test_a_stage_that_wanders_says_so(draws: int) -> None:
     """5 µm across and 5 µm in the reading, 1 µm stated: the covariance grows to cover it."""
     rng = np.random.default_rng(6)
     scores, told = [], 0
-    for _ in range(40):
+    for _ in range(draws):
         table, positions = views(rng, reading_sigma_mm=0.005, wander_mm=0.005)
         found = stage_axis_of(CALIBRATION, table, positions)
         error = tangent_error(found)
         scores.append(error @ np.linalg.solve(found.joint_covariance, error))
         told += any("deviates from a straight line" in w for w in found.words)
-    assert told > 33
+    assert told > 0.8 * draws
     assert np.median(scores) < 5.0
 
 

@@ -23,6 +23,7 @@ from telerig.scripts.main import app
 
 PAIRS = (("left", "middle"), ("middle", "right"))
 NAMES = ("a", "b", "c", "d")
+plain = pytest.mark.usefixtures("without_advice")
 
 
 def space_ratio(calibration: Any, made: Any) -> float:
@@ -94,6 +95,7 @@ def test_the_next_view_may_be_for_any_two_cameras(fan: Any, calibrated: Any) -> 
     assert all("midway between cameras" in w for w in words)
 
 
+@plain
 def test_comparison_names_the_camera_that_moved(scene: Any, calibrated: Any) -> None:
     still = scene("three", 2).calibrate("radial")
     assert not compare_calibrations(calibrated, still).moved
@@ -104,6 +106,7 @@ def test_comparison_names_the_camera_that_moved(scene: Any, calibrated: Any) -> 
     assert "between cameras left and right" in found.words()
 
 
+@plain
 def test_a_chain_of_overlaps_is_enough(scene: Any) -> None:
     cameras = tuple(CameraConfig(name, (512, 512)) for name in NAMES)
     made = scene(
@@ -114,6 +117,7 @@ def test_a_chain_of_overlaps_is_enough(scene: Any) -> None:
     assert 0.1 < space_ratio(calibration, made) < 2.5
 
 
+@plain
 def test_views_of_two_cameras_only_leave_an_offset_open(scene: Any) -> None:
     made = scene("three", 4, seen_by=PAIRS)
     calibration = made.calibrate("radial")
@@ -129,14 +133,19 @@ def test_views_of_two_cameras_only_leave_an_offset_open(scene: Any) -> None:
     assert own @ block @ own > 1.0
 
 
-@pytest.mark.parametrize("solver", ["gtsam", "schur"])
-def test_opposite_first_cameras_leave_the_origin_to_the_third(scene: Any, solver: str) -> None:
+@plain
+def test_opposite_first_cameras_leave_the_origin_to_the_third(scene: Any) -> None:
     """Cameras at 0, 90, 180 degrees have the same origin and depths in the order 0, 180, 90."""
     target = replace(scene("three", 0).target, two_sided=True)
-    made = scene("three", 1, target=target, angle_deg=90.0, seen_by=(("left", "middle", "right"),))
+    made = scene(
+        "three", 1, target=target, angle_deg=90.0, seen_by=(("left", "middle", "right"),), views=6
+    )
     left, middle, right = made.cameras
     points, sd = np.array([[1.0, 2.0, 3.0], [5.0, -4.0, 2.0]]), []
-    for cameras in ([left, middle, right], [left, right, middle]):
+    opposite = [left, right, middle]
+    for cameras, solver in (
+        ([left, middle, right], "gtsam"), (opposite, "gtsam"), (opposite, "schur"),
+    ):  # fmt: skip
         found = replace(made, cameras=cameras).calibrate("radial", solver=solver)
         assert found.verdict["status"] == "GOOD" and not found.notes, (found.verdict, found.notes)
         assert abs(found.camera("middle").rig_from_camera.translation_mm[2]) < 1e-5
@@ -144,7 +153,7 @@ def test_opposite_first_cameras_leave_the_origin_to_the_third(scene: Any, solver
         covariance = found.triangulate(uv, sigma_px=0.05).covariance_mm2
         sd.append(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
     assert "the optical axes of cameras 'left' and 'middle' come" in found.diagnostics["gauge"]
-    np.testing.assert_allclose(sd[0], sd[1], rtol=1e-3)
+    np.testing.assert_allclose(sd[1:], [sd[0]] * 2, rtol=1e-3)
 
 
 def test_two_groups_without_a_common_view_are_named(scene: Any) -> None:
@@ -161,21 +170,23 @@ def test_one_view_in_common_is_too_little(scene: Any) -> None:
         made.calibrate("radial")
 
 
-def test_views_of_three_cameras_settle_the_side_of_each(fan: Any) -> None:
+@plain
+def test_views_of_three_cameras_settle_the_side_of_each(scene: Any, fan: Any) -> None:
     """Then the nominal rotation of one camera decides for all."""
     one = fan.calibrate("radial", nominal_rotvec_deg={"right": (0, 120, 0)})
     assert space_ratio(one, fan) < 2.5
-    wrong = {"middle": (0, 60, 0), "right": (0, -120, 0)}
+    few, wrong = scene("three", 1, views=4), {"middle": (0, 60, 0), "right": (0, -120, 0)}
     with pytest.raises(CalibrationError, match="too similar to choose") as caught:
-        fan.calibrate("radial", nominal_rotvec_deg=wrong)
+        few.calibrate("radial", nominal_rotvec_deg=wrong)
     assert "middle_from_left_rotvec_deg and right_from_left_rotvec_deg" in str(caught.value)
     with pytest.raises(CalibrationError, match="both mirror solutions fit equally well") as caught:
-        fan.calibrate("radial", nominal_rotvec_deg=None)
+        few.calibrate("radial", nominal_rotvec_deg=None)
     assert "add middle_from_left_rotvec_deg = [0.0, 90.0, 0.0]" in str(caught.value)
 
 
+@plain
 def test_pairs_of_a_flat_target_need_each_cameras_nominal_rotation(scene: Any) -> None:
-    made = scene("three", 4, seen_by=PAIRS, print_factor=0.0)
+    made = scene("three", 4, seen_by=PAIRS, print_factor=0.0, views=8)
     calibration = made.calibrate("radial")
     turn = calibration.cameras[2].camera_from_rig.rotation[2]
     assert turn @ made.true_cameras["right"].camera_from_rig.rotation[2] > 0.9999
@@ -184,6 +195,7 @@ def test_pairs_of_a_flat_target_need_each_cameras_nominal_rotation(scene: Any) -
     assert "right_from_left_rotvec_deg = " in str(caught.value)
 
 
+@plain
 def test_a_symmetric_target_in_three_cameras(scene: Any) -> None:
     target = replace(scene("symmetric", 0).target, scale_distance_mm=None)
     right = scene("three", 5, target=target)
@@ -194,6 +206,7 @@ def test_a_symmetric_target_in_three_cameras(scene: Any) -> None:
     assert any("numbered so that all cameras and all views agree" in n for n in calibration.notes)
 
 
+@plain
 def test_unknown_dots_in_three_cameras(scene: Any) -> None:
     made = scene("three", 6, views=18)
     target = replace(made.target, print_sigma_mm=2.0)

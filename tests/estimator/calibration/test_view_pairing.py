@@ -11,6 +11,8 @@ import pytest
 
 from telerig.errors import CalibrationError
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 
 @pytest.fixture(scope="module")
 def paper(scene: Any) -> Any:
@@ -28,9 +30,10 @@ def offset(dots: pd.DataFrame, camera: str, first: int, by: int) -> pd.DataFrame
     return out.drop_duplicates(["view", "camera", "dot"], keep="last", ignore_index=True)
 
 
-@pytest.mark.parametrize(("first", "by"), [(0, -1), (5, 2), (9, -1)])
+@pytest.mark.parametrize(("first", "by"), [(0, -1), (2, 2)])
 def test_images_under_the_names_of_other_views_are_refused(first: int, by: int, paper: Any) -> None:
-    made = paper.changed(lambda dots: offset(dots, "right", first, by))
+    eight = paper.changed(lambda dots: dots[dots["view"] < "view08"])
+    made = eight.changed(lambda dots: offset(dots, "right", first, by))
     with pytest.raises(CalibrationError) as caught:
         made.calibrate("radial")
     text = str(caught.value)

@@ -104,7 +104,9 @@ def test_views_are_solved_as_they_arrive_and_enough_ends_it(
         it.wait_for("1 complete view; 5 more needed. Next: face the plate")
         arrive(paper_images, empty, names[1])
         it.wait_for("2 complete views")
-        for count, name in enumerate(names[2:], 3):
+        for name in names[2:5]:
+            arrive(paper_images, empty, name)
+        for count, name in enumerate(names[5:], 6):
             arrive(paper_images, empty, name)
             until(lambda c=count: it.said(f"{c} complete views") or it.result, str(count))  # type: ignore[misc]
             if it.result:
@@ -270,10 +272,10 @@ def test_standing_in_words(scene: Any, paper_images: Path) -> None:
 
 def test_ctrl_c_writes_the_results_once_and_ends_well(paper_images: Path, empty: Path) -> None:
     names = views(paper_images)
-    for name in names[:4]:
+    for name in names[:2]:
         arrive(paper_images, empty, name)
     command = [sys.executable, "-m", "telerig.scripts.main", "calibrate", str(empty), "--watch",
-               "--poll", str(POLL_S), "--model", "radial"]  # fmt: skip
+               "--poll", str(POLL_S), "--model", "radial", "--no-report"]  # fmt: skip
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
@@ -283,7 +285,7 @@ def test_ctrl_c_writes_the_results_once_and_ends_well(paper_images: Path, empty:
         lines = []
         for line in process.stdout:
             lines.append(line)
-            if "4 complete views" in line:
+            if "2 complete views" in line:
                 break
         assert not (empty / "results").exists()
         process.send_signal(signal.SIGINT)
@@ -291,12 +293,11 @@ def test_ctrl_c_writes_the_results_once_and_ends_well(paper_images: Path, empty:
     finally:
         process.kill()
     assert process.returncode == 0, errors
-    assert "written:" in rest and "4 views" in rest
+    assert "written:" in rest and "2 views" in rest
     results = empty / "results" / "calibration"
     content = json.loads((results / "calibration.json").read_text())
-    assert list(content["views"]) == [Path(n).stem for n in names[:4]]
-    assert len(list((results / "overlays").rglob("*.jpg"))) == 8
-    assert (results / "report.html").is_file()
+    assert list(content["views"]) == [Path(n).stem for n in names[:2]]
+    assert len(list((results / "overlays").rglob("*.jpg"))) == 4
     assert json.loads((results / "run.json").read_text())["options"]["watch"] is True
 
 

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from seeds import few_or_many
 
 from telerig.errors import DetectionError
 from telerig.estimator.dots.grid.lattice import (
@@ -63,9 +64,10 @@ def agrees(lattice: Lattice, rows_columns: Array) -> bool:
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.4, 0.5])
-def test_random_views_of_a_grid_with_gaps_and_dirt(ratio: float) -> None:
+@few_or_many(8, 60)
+def test_random_views_of_a_grid_with_gaps_and_dirt(ratio: float, draws: int) -> None:
     failures = 0
-    for seed in range(60):
+    for seed in range(draws):
         rng = np.random.default_rng([int(10 * ratio), seed])
         rows, columns = 9, 11
         xy = grid(rows, columns, (7.0 * ratio, 7.0))

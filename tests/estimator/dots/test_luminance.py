@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from seeds import few_or_many
 
 from telerig.estimator.dots.fit import luminance
 from telerig.estimator.dots.fit.blurred_ellipse import coverage_on_grid, shape_from_axes
@@ -73,17 +74,20 @@ def test_recovers_a_clean_dot(axes: tuple[float, float]) -> None:
     assert result.background == pytest.approx(40.0, abs=0.1)
 
 
+@few_or_many(60, 250)
 @pytest.mark.parametrize("radius", [4.0, 10.0])
-def test_spread_equals_prediction_and_the_bound(radius: float) -> None:
+def test_spread_equals_prediction_and_the_bound(radius: float, draws: int) -> None:
     rng = np.random.default_rng(11)
     shape, noise = np.array([radius, 0.0, radius]), 3.0
     clean = picture(shape)
-    fits = [fit(clean + noise * rng.standard_normal(clean.shape), shape, noise) for _ in range(250)]
+    fits = [
+        fit(clean + noise * rng.standard_normal(clean.shape), shape, noise) for _ in range(draws)
+    ]
     error = np.array([f.centre_px - CENTRE for f in fits])
     predicted = np.sqrt(np.mean([np.trace(f.covariance_px2) / 2 for f in fits]))
     bound = noise / 150.0 * np.sqrt(2 * SIGMA / (np.sqrt(np.pi) * radius))
     spread = np.sqrt(np.mean(error**2))
-    assert spread / predicted == pytest.approx(1.0, abs=0.1)
+    assert spread / predicted == pytest.approx(1.0, abs=1.6 / np.sqrt(draws))
     assert predicted / bound == pytest.approx(1.0, abs=0.08)
     assert np.mean([f.chi2_dof for f in fits]) == pytest.approx(1.0, abs=0.02)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
+from seeds import few_or_many
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.grid.numbering import (
@@ -196,9 +197,10 @@ def is_right(
         (replace(CODED, marks=((0, 40), (0, 45), (0, 60)), mark_style="ring"), View(false=0.2)),
     ],
 )
-def test_random_views_are_numbered_right(target: Target, view: View) -> None:
+@few_or_many(4, 20)
+def test_random_views_are_numbered_right(target: Target, view: View, draws: int) -> None:
     wrong = []
-    for seed in range(20):
+    for seed in range(draws):
         dots, truth = photograph(target, view, np.random.default_rng([11, seed]))
         numbering = number_dots(dots, target)
         good = is_right(numbering, truth) and not numbering.ambiguous
@@ -208,10 +210,13 @@ def test_random_views_are_numbered_right(target: Target, view: View) -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns", "order"), [(7, 12, 2), (8, 8, 4)])
-def test_symmetric_targets_list_every_equivalent(rows: int, columns: int, order: int) -> None:
+@few_or_many(5, 25)
+def test_symmetric_targets_list_every_equivalent(
+    rows: int, columns: int, order: int, draws: int
+) -> None:
     target = replace(LARGE, rows=rows, columns=columns, marks=())
     assert target.symmetry_order() == order
-    for seed in range(25):
+    for seed in range(draws):
         dots, truth = photograph(target, View(), np.random.default_rng([12, seed]))
         numbering = number_dots(dots, target)
         assert numbering.equivalents.shape == (order, len(numbering.table))

@@ -41,21 +41,17 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.estimator.smoothing.problem.tables import calibration_share
 from telerig.estimator.smoothing.result import trajectories
-from telerig.estimator.smoothing.verdict.evidence import shake_of
-from telerig.estimator.smoothing.verdict.identifiability import (
-    axis_verdict,
-    shake_share,
-    without_sensors,
-)
+from telerig.estimator.smoothing.verdict.identifiability import expected_shake, verdicts
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
-from telerig.io.results.smoothing import AXES, Verdict
+from telerig.io.results.smoothing import AXES, AxisVerdict, Verdict, vertical_axis, worst_of
+from telerig.io.results.verdict_words import number_words
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.simulation.calibration.scene import hand_held_views, true_cameras, true_target
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
-from telerig.short_text import counted
+from telerig.short_text import counted, share
 
 _SAMPLE_HZ = 2000.0
 _FORCE_HZ, _DAMPING = 60.0, 0.03
@@ -134,18 +130,28 @@ class Expected:
 
     All are medians over the run without its first and last tenth.
 
-    verdict : the verdict on the worst axis.
+    axes : the verdict along "x", "y" and "z" with its numbers, as of a run.
+    vertical : the axis nearest to the vertical.
     position_um, velocity_mm_s : (3,) standard deviations of positions and velocities along the
         rig's axes.
-    known_um : (3,) standard deviations that positions would have if the shake were known.
     sigma_px : standard deviation of a bubble's centre in the images that was assumed.
     """
 
-    verdict: Verdict
+    axes: dict[str, AxisVerdict]
+    vertical: str
     position_um: Array
     velocity_mm_s: Array
-    known_um: Array
     sigma_px: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the worst axis."""
+        return worst_of(self.axes)
+
+    @property
+    def known_um(self) -> Array:
+        """Standard deviations (3,) that positions would have if the shake were known."""
+        return np.array([1e3 * (axis.sigma_shake_known_mm or 0.0) for axis in self.axes.values()])
 
 
 def centre_sigma_px(diameter_px: float) -> float:
@@ -240,27 +246,12 @@ def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -
     problem = planned_problem(rig, pair, planned, sigma_px)
     model = planned_model(problem, rig, planned)
     solution = solve(problem, model, Options(robust=False))
-    known = solve(
-        without_sensors(problem),
-        replace(model.without_shake(), carriage=CarriageModel(), encoder_scale_sigma=0.0),
-        Options(robust=False),
-    )
-    free = solution
-    if model.encoder_scale_sigma:
-        free = solve(problem, replace(model, encoder_scale_sigma=0.0), Options(robust=False))
-    inner = _inner(solution)
-    table = trajectories(solution, None).iloc[inner]
-    ours, theirs = (_position_sd(one)[inner] for one in (free, known))
-    eta = shake_share(solution, shake_of(solution))
-    axes = [
-        Verdict(str(axis_verdict(ours[:, i], theirs[:, i], eta[i], planned.shake_mm, ()).verdict))
-        for i in range(3)
-    ]
+    table = trajectories(solution, None).iloc[_inner(solution)]
     return Expected(
-        max(axes, key=list(Verdict).index),
+        verdicts(solution, expected_shake(solution), read=False),
+        vertical_axis(problem.up),
         1e3 * table[[f"s{a}_mm" for a in AXES]].median().to_numpy(float),
         table[[f"sv{a}_mm_s" for a in AXES]].median().to_numpy(float),
-        1e3 * np.median(theirs, axis=0),
         sigma_px,
     )
 
@@ -405,12 +396,6 @@ def _inner(solution: Solution) -> Ints:
     return np.flatnonzero((frames >= edge) & (frames <= frames.max() - edge))
 
 
-def _position_sd(solution: Solution) -> Array:
-    assert solution.covariances is not None
-    rows, covariance = solution.graph.bubble.position, solution.covariances.bubbles
-    return np.asarray(np.sqrt(np.einsum("id,nde,ie->ni", rows, covariance, rows, optimize=True)))
-
-
 def variants(rig: RigDescription, planned: Experiment) -> dict[str, Experiment]:
     """Return the planned experiment and the same with one addition each, keyed by a description.
 
@@ -445,6 +430,7 @@ def plan_table(expected: dict[str, Expected]) -> pd.DataFrame:
             **{f"s{a}_um": v for a, v in zip(AXES, one.position_um)},
             **{f"sv{a}_mm_s": v for a, v in zip(AXES, one.velocity_mm_s)},
             **{f"s{a}_shake_known_um": v for a, v in zip(AXES, one.known_um)},
+            **{f"eta_{a}": one.axes[a].eta for a in AXES},
         }
         for name, one in expected.items()
     ]  # fmt: skip
@@ -470,14 +456,18 @@ def plan_words(
         f"encoder: {'yes' if rig.stage else 'no'}; accelerometers: {sensors}; marks in each view: "
         f"{planned.marks}",
         _common_words(calibration),
+        f"as planned: {number_words(first.axes, first.vertical)} {first.verdict}",
         "",
-        f"{'':30}{'position, µm':>20}{'velocity, mm/s':>22}",
-        f"{'standard deviation':30}{'x':>7}{'y':>7}{'z':>7}{'x':>8}{'y':>7}{'z':>7}  verdict",
+        f"{'':30}{'position, µm':>20}{'velocity, mm/s':>22}   of the shake",
+        f"{'standard deviation':30}{'x':>7}{'y':>7}{'z':>7}{'x':>8}{'y':>7}{'z':>7}   removed in "
+        f"{first.vertical}  verdict",
     ]
     for name, one in expected.items():
         place = "".join(f"{v:7.3g}" for v in one.position_um)
         speed = "".join(f"{v:7.2g}" for v in one.velocity_mm_s)
-        lines.append(f"{name:30}{place} {speed}  {one.verdict}")
+        eta = one.axes[one.vertical].eta
+        removed = "" if eta is None else share(eta, 1.0)
+        lines.append(f"{name:30}{place} {speed}  {removed:>13}  {one.verdict}")
     known = "".join(f"{v:7.3g}" for v in first.known_um)
     lines += [f"{'(as planned, shake known)':30}{known}", "", _advice(chosen, expected)]
     return lines

@@ -87,10 +87,14 @@ class Smoothing(ShortText):
         return self.tables.bodies
 
     def title(self) -> str:
-        """Return the name of the run and the verdict."""
-        flags = ", ".join(self.verdict.get("flags", ()))
-        words = str(self.verdict.get("verdict", "not judged")) + (f" ({flags})" if flags else "")
-        return f"Smoothing{self.name and f' of run {self.name!r}'}: {words}"
+        """Return the name of the run, to what its paths are good, and the verdict."""
+        from telerig.io.results.smoothing import SmoothingFile
+        from telerig.io.results.verdict_words import number_words
+
+        file = SmoothingFile.model_validate(self.verdict)
+        flags = f" ({', '.join(file.flags)})" if file.flags else ""
+        words = f"{number_words(file.axes, file.vertical)} {file.verdict or 'not judged'}{flags}"
+        return f"Smoothing{self.name and f' of run {self.name!r}'}: {words.strip()}"
 
     def facts(self) -> dict[str, str]:
         """Return the size, the verdict along each axis, the accuracy and the warnings, in words."""
@@ -368,12 +372,10 @@ def _travel(solution: Solution) -> dict[str, Any]:
     travel = solution.graph.problem.travel
     if travel is None or solution.graph.problem.stage is None:
         return {}
-    place, _ = considered_variance(solution)
     return {
         "axis": travel.axis.tolist(),
         "axis_from": "stage_axis" if travel.source == "stage_axis" else "rig.toml",
         "axis_sd_deg": np.degrees(np.sqrt(np.diagonal(travel.covariance)[:2])).tolist(),
-        "left_open_mm": np.sqrt(np.median(place, axis=0)).tolist() if len(place) else [0.0] * 3,
     }
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from telerig.io.files.csv_table import Column
@@ -33,11 +34,29 @@ class Verdict(StrEnum):
     CONTRADICTED = "CONTRADICTED"
 
 
+RESOLVED_Q, PARTIAL_Q = 1.25, 2.0
+"""Largest q (`AxisVerdict`) of an axis that is RESOLVED whatever its eta, and of one that is
+PARTIAL. A quarter is less than the scatter of a standard deviation from a few periods of shake; at
+2, three quarters of a position's variance are the shake's.
+"""
+RESOLVED_ETA, PARTIAL_ETA = 0.95, 0.75
+"""Smallest eta of an axis that is RESOLVED whatever its q, and of one that is PARTIAL. At most 22 %
+of the shake's RMS is then left in the paths, and at most half of it.
+"""
+
+
 class Flag(StrEnum):
-    """Name a condition under which a verdict has to be read with care."""
+    """Name a condition under which a verdict has to be read with care.
+
+    LABEL_AMBIGUOUS : an oscillation may be the bubbles' or the rig's.
+    SHAKE_BELOW_NOISE : the shake is smaller than the noise of the positions.
+    SHAKE_UNMEASURED : nothing but the motion of one bubble at a time shows the shake, so that all
+        numbers depend on the priors.
+    """
 
     LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
+    SHAKE_UNMEASURED = "SHAKE_UNMEASURED"
 
 
 class Remedy(StrEnum):
@@ -45,6 +64,7 @@ class Remedy(StrEnum):
 
     STRIP = "strip"
     ARMS = "arms"
+    BARE_ARMS = "bare arms"
     LONGER = "longer"
 
 
@@ -114,8 +134,11 @@ class AxisVerdict(Part):
 
     Numbers are None where they were not computed.
     q : standard deviation of a position divided by the one it would have if the shake were known.
-    eta : share of the shake's prior variance that the data have removed, 1 at best.
+    eta : share of the shake's variance that the data have removed, 1 at best. The shake is the one
+        that the run shows: its estimate's mean square plus variance.
     sigma_mm, sigma_shake_known_mm : these two standard deviations of a position in mm.
+    sigma_encoder_mm : standard deviation that the encoder's scale and the travel axis add to all
+        positions alike, in mm. `sigma_mm` is without it.
     shake_rms_mm : RMS of the shake in mm of the camera that shakes most.
     lines : the spectral lines that were attributed to the rig or to the bubbles.
     """
@@ -126,9 +149,21 @@ class AxisVerdict(Part):
     eta: float | None = None
     sigma_mm: float | None = None
     sigma_shake_known_mm: float | None = None
+    sigma_encoder_mm: float | None = None
     shake_rms_mm: float | None = None
     lines: tuple[AttributedLine, ...] = ()
     words: str = ""
+
+
+def worst_of(axes: Mapping[str, AxisVerdict]) -> Verdict:
+    """Return the worst of the verdicts along the axes, which is that of the run."""
+    found = [axis.verdict for axis in axes.values() if axis.verdict is not None]
+    return max(found, key=list(Verdict).index)
+
+
+def vertical_axis(up: Vector3) -> str:
+    """Return the axis nearest to the vertical; up : (3,) unit vector against gravity."""
+    return AXES[int(np.abs(up).argmax())]
 
 
 class Contradiction(Part):

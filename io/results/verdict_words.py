@@ -5,11 +5,13 @@ The smoother, the report and the terminal make their sentences here. The smoothe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from telerig.io.results.smoothing import (
     AXES,
+    RESOLVED_ETA,
+    RESOLVED_Q,
     AxisVerdict,
     Contradiction,
     Disagreement,
@@ -23,9 +25,10 @@ from telerig.io.results.smoothing import (
     Use,
     Verdict,
 )
+from telerig.short_text import number, share
 
-HARDLY_WIDER = 1.25
-"""Ratio of standard deviations up to which the shake is said to hardly widen the bands."""
+_MUCH = 0.5
+"""Share of a position's standard deviation from which on what the encoder adds is named."""
 
 
 class VerdictWords(NamedTuple):
@@ -78,11 +81,17 @@ FLAG_WORDS: dict[str, str] = {
         "The shake is smaller than what the images can show. It does no harm here: the bubbles' "
         "motion is as good as it would be on a rig that stands still."
     ),
+    Flag.SHAKE_UNMEASURED: (
+        "Nothing in this run but the motion of one bubble at a time shows the shake, and the "
+        "data do not say what of it is the rig's. The bands hold if the assumptions about bubbles "
+        "and shake are right, which nothing tests."
+    ),
 }
 
 REMEDY_WORDS = {
     Remedy.STRIP: "fix a strip of dots to the tank inside both views",
     Remedy.ARMS: "mount one accelerometer on each camera arm",
+    Remedy.BARE_ARMS: "mount an accelerometer on the camera arm that has none",
     Remedy.LONGER: "take a longer record, or one with more bubbles in view",
 }
 
@@ -99,6 +108,44 @@ MODE_REMEDIES = {
 _WEAK_DAMPING, _SLOW_HZ = 0.02, 5.0
 
 
+def number_words(axes: Mapping[str, AxisVerdict], vertical: str) -> str:
+    """Return what every verdict says first: how much of the shake is removed along the vertical,
+    and to what the paths are good.
+
+    axes : the verdicts by axis.
+    vertical : the axis nearest to the vertical. Returns "" where it or its numbers are missing.
+    """
+    sds = {name: axis.sigma_mm for name, axis in axes.items() if axis.sigma_mm is not None}
+    if vertical not in sds:
+        return ""
+    where: dict[str, list[str]] = {}
+    for name, sd in sds.items():
+        if name != vertical:
+            where.setdefault(f"{number(1e3 * sd, 2)} µm", []).append(name)
+    good = [f"paths good to {number(1e3 * sds[vertical], 2)} µm (1 sd)"]
+    good += [f"{sd} in {' and '.join(names)}" for sd, names in where.items()]
+    removed = _removed(axes[vertical])
+    text = f"Vertical: {removed}{'; ' if removed else ''}{', '.join(good)}"
+    if any(Flag.SHAKE_UNMEASURED in axis.flags for axis in axes.values()):
+        text += ", if the assumptions about bubbles and shake are right"
+    more = max(((axis.sigma_encoder_mm or 0.0, name) for name, axis in axes.items()), default=None)
+    if more is not None and more[0] > _MUCH * sds.get(more[1], 0.0):
+        text += (
+            f". The encoder's scale and the travel axis add {number(1e3 * more[0], 2)} µm along "
+            f"{more[1]}, which are the same for all bubbles and grow with the travel"
+        )
+    return f"{text}."
+
+
+def _removed(axis: AxisVerdict) -> str:
+    """Return how much of the shake is removed along an axis; "" where this is not known."""
+    if Flag.SHAKE_BELOW_NOISE in axis.flags:
+        return "the shake is below the noise"
+    if axis.eta is None or axis.verdict == Verdict.CONTRADICTED:
+        return ""
+    return f"{share(axis.eta, 1.0)} of the shake's variance removed"
+
+
 def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
     """Return the verdict along one axis as sentences.
 
@@ -109,18 +156,25 @@ def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
     if axis.verdict is None or axis.q is None or sd is None or sd_known is None or rms is None:
         return axis.words
     title = f"{name} (vertical)" if vertical else name
+    removed = "" if Flag.SHAKE_BELOW_NOISE in axis.flags else _removed(axis)
     text = (
-        f"{title}: {VERDICT_WORDS[axis.verdict].of_axis.format(q=axis.q)} (standard deviation of a "
-        f"position {1e3 * sd:.3g} µm; {1e3 * sd_known:.3g} µm if the shake were known)."
+        f"{title}: {VERDICT_WORDS[axis.verdict].of_axis.format(q=axis.q)} ({removed}"
+        f"{'; ' if removed else ''}standard deviation of a position {1e3 * sd:.3g} µm; "
+        f"{1e3 * sd_known:.3g} µm if the shake were known)."
     )
     if Flag.SHAKE_BELOW_NOISE in axis.flags:
         text += f" The shake ({1e3 * rms:.3g} µm RMS) is below the noise."
+    if Flag.SHAKE_UNMEASURED in axis.flags:
+        text += " Nothing but the motion of one bubble shows the shake."
     if Flag.LABEL_AMBIGUOUS in axis.flags:
-        lines = sorted({f"{x.frequency_hz:.3g} Hz" for x in axis.lines if x.ambiguous})
-        text += (
-            f" The oscillation at {', '.join(lines)} could be the bubble's as well as the rig's."
-        )
+        hz = _ambiguous(axis)
+        text += f" The oscillation at {hz} could be the bubble's as well as the rig's."
     return text
+
+
+def _ambiguous(axis: AxisVerdict) -> str:
+    """Return the frequencies of the ambiguous lines along an axis."""
+    return ", ".join(sorted({f"{x.frequency_hz:.3g} Hz" for x in axis.lines if x.ambiguous}))
 
 
 _WORDS_OF_TEST = {
@@ -147,6 +201,36 @@ def words_of_contradiction(one: Contradiction) -> str:
     return f"{who}{axis} from {one.from_s:.3g} s to {one.to_s:.3g} s{why}."
 
 
+def conclusion_words(file: SmoothingFile) -> str:
+    """Return the verdict of a run as one sentence, with the reason if it is not RESOLVED.
+
+    Returns "" for a run without a verdict.
+    """
+    if file.verdict is None:
+        return ""
+    if file.verdict == Verdict.RESOLVED:
+        return f"{VERDICT_WORDS[file.verdict].headline}."
+    if file.contradictions:
+        return f"{file.verdict}: {words_of_contradiction(file.contradictions[0])}"
+    worst = [(name, axis) for name, axis in file.axes.items() if axis.verdict == file.verdict]
+    return f"{file.verdict}: {_why(*worst[0])}." if worst else f"{file.verdict}."
+
+
+def _why(name: str, axis: AxisVerdict) -> str:
+    """Return why an axis without contradictions is not RESOLVED."""
+    if Flag.SHAKE_UNMEASURED in axis.flags:
+        return f"nothing but the motion of one bubble shows the shake along {name}"
+    if Flag.LABEL_AMBIGUOUS in axis.flags:
+        hz = _ambiguous(axis)
+        return f"the oscillation at {hz} along {name} could be the bubble's as well as the rig's"
+    left = share(1.0 - (axis.eta or 0.0), 1.0)
+    return (
+        f"along {name}, {left} of the shake's variance is left and widens the positions "
+        f"{axis.q or 1.0:.2g} times ({100 * (1 - RESOLVED_ETA):.0f} % or {RESOLVED_Q:g} times is "
+        "RESOLVED)"
+    )
+
+
 def contradiction_words(found: Sequence[Contradiction]) -> str:
     """Return the sentences on all contradictions, the worst first."""
     return " ".join(words_of_contradiction(one) for one in found)
@@ -163,12 +247,12 @@ def consequence_words(file: SmoothingFile) -> str:
         if axis.q is not None and axis.sigma_mm is not None
         and axis.sigma_shake_known_mm is not None
     ]  # fmt: skip
-    if file.verdict == Verdict.RESOLVED and known and max(known)[0] > HARDLY_WIDER:
+    if file.verdict == Verdict.RESOLVED and known and max(known)[0] > RESOLVED_Q:
         q, name, sd, sd_known = max(known)
         text = (
-            "The data remove at least 99 % of the shake's variance. What is left of it widens the "
-            f"bands below up to {q:.2g} times (along {name}: {1e3 * sd:.3g} µm now; "
-            f"{1e3 * sd_known:.3g} µm if the shake were known)."
+            f"The data remove at least {100 * RESOLVED_ETA:.0f} % of the shake's variance. What is "
+            f"left of it widens the bands below up to {q:.2g} times (along {name}: "
+            f"{1e3 * sd:.3g} µm now; {1e3 * sd_known:.3g} µm if the shake were known)."
         )
     if file.verdict == Verdict.CONTRADICTED and file.inflation:
         factors = ", ".join(f"{a} {f:.2g}" for a, f in zip(AXES, file.inflation))
@@ -211,7 +295,7 @@ def words_of_refusals(file: SmoothingFile) -> list[str]:
         if not what:
             continue
         axis = file.axes.get(name, AxisVerdict())
-        by_shake = (axis.q or 1.0) > HARDLY_WIDER
+        by_shake = (axis.q or 1.0) > RESOLVED_Q
         shaken.add(by_shake)
         text = f"Along {name}, {' and '.join(what)}: "
         part = "mostly" if (axis.q or 1.0) ** 2 > 2 else "partly"
@@ -269,11 +353,8 @@ def remedy_words(remedies: Sequence[Remedy]) -> str:
 
 
 def to_resolve(remedy: str) -> str:
-    """Return the sentence "To resolve it, ..." with a remedy.
-
-    If ``remedy`` is empty, it is one that always helps: a strip of dots or accelerometers.
-    """
-    return f"To resolve it, {remedy or remedy_words((Remedy.STRIP, Remedy.ARMS))}."
+    """Return the sentence "To resolve it, ..." with a remedy; "" without one."""
+    return f"To resolve it, {remedy}." if remedy else ""
 
 
 def mode_remedy(mode: Mode) -> str:

@@ -239,6 +239,7 @@ class StageConfig:
         following error, which the encoder measures.
     encoder_sigma_mm, encoder_rate_hz : noise and sampling rate of the encoder.
     encoder_scale : its relative scale error; it reads 1 + encoder_scale times the travel.
+    scale_sigma : what rig.toml states of it, 0 for an exact encoder; None to state nothing.
     axis_views, axis_travel_mm : number of views of a target at rest from different positions of the
         stage, 0 for none, and the travel that they span.
     shake_mm : amplitude A of the shake: the offset of every camera along the axis of travel has the
@@ -261,6 +262,7 @@ class StageConfig:
     encoder_sigma_mm: float = 0.001
     encoder_rate_hz: float = 1000.0
     encoder_scale: float = 0.0
+    scale_sigma: float | None = None
     axis_views: int = 0
     axis_travel_mm: float = 30.0
     shake_mm: float = 0.2

@@ -75,6 +75,7 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
             (x, y, z),
             (x, y, z),
             max(config.stage.encoder_sigma_mm, 1e-4),
+            config.stage.scale_sigma,
             gravity_m_s2=config.stage.gravity_m_s2,
         )
         unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -54,7 +54,8 @@ def test_texts_are_short_and_say_the_verdict(chain: Chain) -> None:
         assert len(repr(one)) < 1000 and repr(one).count("\n") < 10
     assert repr(chain.calibration).startswith("Calibration 'imported': IMPORTED\n")
     verdict = chain.smoothing.verdict["verdict"]
-    assert repr(chain.smoothing).startswith(f"Smoothing of run 'rise': {verdict}")
+    first = repr(chain.smoothing).splitlines()[0]
+    assert first.startswith("Smoothing of run 'rise': Vertical: ") and f". {verdict}" in first
     assert "1 track" in repr(chain.tracks) and "12 points in frames 0 to 11" in repr(chain.tracks)
     assert "3 points" in repr(points(chain.calibration))
 

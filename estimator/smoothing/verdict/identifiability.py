@@ -1,9 +1,12 @@
 """Computes how well a run separates the motion of the bubbles from the shake of the rig, by axis.
 
 q is the ratio of a position's standard deviation to the one that it would have if the shake were
-known. eta is the share of the shake's prior variance that the data remove. In addition, a spectral
-line can be ambiguous: an oscillation of the bubbles as well as one of the rig
-(`telerig.estimator.smoothing.learning.spectral_lines`).
+known. eta is the share of the shake's variance that the data remove, of the shake that the run
+shows; a wide prior would make any shake look removed. In addition, a spectral line can be
+ambiguous: an oscillation of the bubbles as well as one of the rig
+(`telerig.estimator.smoothing.learning.spectral_lines`). And q and eta mean nothing where one bubble
+alone shows the shake: its motion and the rig's can be exchanged without changing the likelihood, so
+that both numbers follow from the priors.
 """
 
 from __future__ import annotations
@@ -15,90 +18,158 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
+from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.learning.learn import Learning, groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.learning.spectral_lines import attributions
 from telerig.estimator.smoothing.learning.window import first_of_most_seen
 from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
     CarriageModel,
     Observations,
     ShakeModel,
     SmoothingProblem,
 )
 from telerig.estimator.smoothing.problem.window import Window, cut_out
-from telerig.estimator.smoothing.verdict.evidence import Shake
+from telerig.estimator.smoothing.verdict.evidence import Shake, shake_of
 from telerig.factors.motion import start
-from telerig.io.results.smoothing import AXES, AttributedLine, AxisVerdict, Flag, Verdict
+from telerig.io.results.smoothing import (
+    AXES,
+    PARTIAL_ETA,
+    PARTIAL_Q,
+    RESOLVED_ETA,
+    RESOLVED_Q,
+    AttributedLine,
+    AxisVerdict,
+    Flag,
+    Verdict,
+)
 
-RESOLVED_Q, PARTIAL_Q, RESOLVED_ETA = 1.25, 2.0, 0.99
 _MOST_FRAMES, _MOST_BUBBLES = 2000, 3
 _EDGE = 0.1
 _SEEN = 0.25
+_MOSTLY = 0.5
+"""Share of the frames in which a second bubble has to be seen."""
 
 
 def verdicts(
     solution: Solution,
     shake: Shake | None,
-    inflation: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    inflation: Sequence[float] = (1.0, 1.0, 1.0),
+    *,
+    read: bool = True,
 ) -> dict[str, AxisVerdict]:
     """Return the identifiability along "x", "y" and "z"; {} without bubbles or covariances.
 
     shake : sums over the run; None without a shake in the model.
-    inflation : factors of the standard deviations because of contradictions.
+    inflation : (3,) factors of the standard deviations because of contradictions.
+    read : whether the problem holds readings, in which spectral lines can be looked for; those of a
+        planned run are made up.
     """
     if solution.covariances is None or not solution.graph.problem.bubbles:
         return {}
     window = window_of(solution)
     if not window.problem.bubbles:
         return {}
-    sigma, known = _sigmas(solution, window)
+    sigma, known, encoder = _sigmas(solution, window)
     eta, rms = shake_share(solution, shake), shake_rms(solution, shake)
-    resolved = all(e is not None and e >= RESOLVED_ETA for e in eta)
-    lines = [] if resolved else _lines(window.problem, solution.graph.model)
-    out = {}
-    for axis, name in enumerate(AXES):
-        mine = tuple(line for part, line in lines if part[axis] > 0.7)
-        out[name] = axis_verdict(
-            sigma[:, axis], known[:, axis], eta[axis], rms[axis], mine, inflation[axis]
+    lines = _lines(window.problem, solution.graph.model) if read else []
+    measured, given = axes_with_measured_shake(solution), solution.graph.model.name == "given"
+    return {
+        name: axis_verdict(
+            sigma[:, axis], known[:, axis], encoder[:, axis], eta[axis], rms[axis],
+            tuple(line for part, line in lines if part[axis] > 0.7),
+            inflation[axis], measured=measured[axis], given=given,
         )
-    return out
+        for axis, name in enumerate(AXES)
+    }  # fmt: skip
 
 
 def axis_verdict(
     sigma: Array,
     known: Array,
+    encoder: Array,
     eta: float | None,
     rms: float,
     lines: tuple[AttributedLine, ...],
     inflation: float = 1.0,
+    *,
+    measured: bool = True,
+    given: bool = False,
 ) -> AxisVerdict:
     """Return the identifiability along one axis.
 
     sigma, known : (n,) standard deviations (mm) of positions, as they are and with known shake.
+    encoder : (n,) standard deviations (mm) that the encoder's scale and the travel axis add.
     eta, rms, lines : as in `AxisVerdict`.
     inflation : factor of the standard deviations because of contradictions.
+    measured : whether anything but one bubble alone shows the shake. If not, eta does not count.
+    given : whether the user states the shake's prior. If nothing measures the shake and nobody
+        states it, q does not count either.
     """
     q, base = float(np.median(sigma / known)), float(np.median(known))
-    verdict = Verdict.UNRESOLVED
-    if q <= RESOLVED_Q or (eta is not None and eta >= RESOLVED_ETA):
-        verdict = Verdict.RESOLVED
-    elif q <= PARTIAL_Q:
-        verdict = Verdict.PARTIAL
-    agree = inflation <= RESOLVED_Q
+    ambiguous = any(
+        line.ambiguous and (line.rms_mm or 0.0) > base and (line.owner == "rig" or measured)
+        for line in lines
+    )
+    agree, known_shake = inflation <= RESOLVED_Q, measured or given
     flags = []
-    if any(x.owner == "rig" and x.ambiguous and (x.rms_mm or 0.0) > base for x in lines):
+    if ambiguous:
         flags.append(Flag.LABEL_AMBIGUOUS)
-    if rms < base and q <= RESOLVED_Q and agree:
+    if rms < base and q <= RESOLVED_Q and agree and known_shake:
         flags.append(Flag.SHAKE_BELOW_NOISE)
+    if not known_shake:
+        flags.append(Flag.SHAKE_UNMEASURED)
+    verdict = Verdict.CONTRADICTED
+    if agree:
+        counted = eta if measured else None
+        verdict = rule(q, counted, ambiguous=ambiguous) if known_shake else Verdict.UNRESOLVED
     return AxisVerdict(
-        verdict=verdict if agree else Verdict.CONTRADICTED, flags=tuple(flags), q=q * inflation,
-        eta=eta, sigma_mm=float(np.median(sigma)) * inflation, sigma_shake_known_mm=base,
-        shake_rms_mm=float(rms), lines=lines,
+        verdict=verdict, flags=tuple(flags), q=q * inflation, eta=eta,
+        sigma_mm=float(np.median(sigma)) * inflation, sigma_shake_known_mm=base,
+        sigma_encoder_mm=float(np.median(encoder)) * inflation, shake_rms_mm=float(rms),
+        lines=lines,
     )  # fmt: skip
 
 
-def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
-    """Return standard deviations (n, 3) of positions: as they are, and with known shake.
+def rule(q: float, eta: float | None, *, ambiguous: bool) -> Verdict:
+    """Return the verdict on an axis whose measurements agree.
+
+    q, eta : as in `AxisVerdict`.
+    ambiguous : whether a spectral line that is larger than the noise may be the bubbles' or the
+        rig's. Then the estimate of the shake, and with it eta, may be of the bubbles' motion.
+    """
+    share = -np.inf if eta is None else eta
+    if q <= RESOLVED_Q or (share >= RESOLVED_ETA and not ambiguous):
+        return Verdict.RESOLVED
+    return Verdict.PARTIAL if q <= PARTIAL_Q or share >= PARTIAL_ETA else Verdict.UNRESOLVED
+
+
+def axes_with_measured_shake(solution: Solution) -> tuple[bool, bool, bool]:
+    """Return for x, y and z whether the shake is measured.
+
+    It is by a second bubble in most frames, by an accelerometer on the carriage, and, for
+    an axis that a camera sees, by marks in its images or an accelerometer on its arm. The motion of
+    a single bubble does not measure it.
+    """
+    graph, problem = solution.graph, solution.graph.problem
+    count = np.bincount(graph.frame_of_row, minlength=len(problem.t_s))
+    several = np.count_nonzero(count > 1) > _MOSTLY * np.count_nonzero(count)
+    carriage = any(sensor.camera == CARRIAGE for sensor in problem.accelerometers)
+    if several or carriage:
+        return True, True, True
+    seen = [
+        direction
+        for camera in problem.arms_with_sensor | set(problem.references.camera.tolist())
+        for direction in graph.shake.seen[camera]
+    ]
+    x, y, z = (bool(any(direction[axis] ** 2 > _SEEN for direction in seen)) for axis in range(3))
+    return x, y, z
+
+
+def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array, Array]:
+    """Return standard deviations (n, 3) of positions: as they are, with known shake, and what the
+    encoder's scale and the travel axis add to the first.
 
     Frames outside the encoder's record do not count: there both contain a carriage whose position
     is not known, so that their ratio says nothing about the shake.
@@ -117,11 +188,12 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
     rows = rows[inside] if inside.any() else rows
     bubble, frame = ours.bubble_of_row[rows], ours.frame_of_row[rows] + window.first
     same = whole.row(window.bubbles[bubble], frame)
-    known = _position_sigma(still, rows)
+    sigma = everything = _position_sigma(solution, same)
     if solution.graph.encoder_flags[0]:
         model = replace(solution.graph.model, encoder_scale_sigma=0.0)
-        return _position_sigma(solve(window.problem, model, Options(robust=False)), rows), known
-    return _position_sigma(solution, same), known
+        sigma = _position_sigma(solve(window.problem, model, Options(robust=False)), rows)
+    more = everything**2 - sigma**2 + considered_variance(solution)[0][same]
+    return sigma, _position_sigma(still, rows), np.sqrt(more.clip(0))
 
 
 def without_sensors(problem: SmoothingProblem) -> SmoothingProblem:
@@ -150,23 +222,36 @@ def _position_sigma(solution: Solution, rows: Ints) -> Array:
 def shake_share(solution: Solution, shake: Shake | None) -> list[float | None]:
     """Return eta along x, y and z: the least over the directions near the axis that a camera sees.
 
-    An axis without such a direction gets None.
+    An axis without such a direction, or without shake, gets None.
     """
-    graph = solution.graph
     least: list[float | None] = [None, None, None]
     if shake is None:
         return least
-    before, _ = start(graph.shake.components)
-    for camera, seen in enumerate(graph.shake.seen):
-        for direction, variance in zip(seen, shake.variance[camera]):
-            row = direction @ graph.shake.offset[camera]
-            prior = float(row @ before @ row)
-            if prior <= 0:
+    for seen, variances, squares in zip(
+        solution.graph.shake.seen, shake.variance, shake.square, strict=True
+    ):
+        for direction, variance, square in zip(seen, variances, squares, strict=True):
+            if square <= 0:
                 continue
             for axis in np.flatnonzero(direction**2 > _SEEN):
-                eta, known = 1 - float(variance) / shake.frames / prior, least[axis]
+                eta, known = 1 - float(variance / square), least[axis]
                 least[axis] = eta if known is None else min(known, eta)
     return least
+
+
+def expected_shake(solution: Solution) -> Shake | None:
+    """Return the sums that a run is expected to show whose readings are still to come.
+
+    The expectation of an estimate's square plus its variance is the variance of the prior. None
+    without a shake in the model or covariances.
+    """
+    shake, graph = shake_of(solution), solution.graph
+    if shake is None:
+        return None
+    prior, _ = start(graph.shake.components)
+    rows = [seen @ offset for seen, offset in zip(graph.shake.seen, graph.shake.offset)]
+    square = tuple(shake.frames * np.einsum("kd,de,ke->k", r, prior, r) for r in rows)
+    return replace(shake, square=square)
 
 
 def shake_rms(solution: Solution, shake: Shake | None) -> Array:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.contradiction import contradictions
@@ -17,10 +15,18 @@ from telerig.estimator.smoothing.verdict.evidence import Evidence
 from telerig.estimator.smoothing.verdict.identifiability import verdicts
 from telerig.estimator.smoothing.verdict.modes import shake_modes
 from telerig.estimator.smoothing.verdict.purposes import uses
-from telerig.io.results.smoothing import AXES, AxisVerdict, Flag, Remedy, Verdict
+from telerig.io.results.smoothing import (
+    AxisVerdict,
+    Flag,
+    Remedy,
+    Verdict,
+    vertical_axis,
+    worst_of,
+)
 from telerig.io.results.verdict_words import (
     contradiction_words,
     mode_remedy,
+    number_words,
     remedy_words,
     to_resolve,
     unseen_words,
@@ -59,17 +65,17 @@ def judge(
     if not found:
         return out
     usable = [use.content() for use in uses(solution, draws, disagree.inflation)]
-    vertical = AXES[int(np.abs(problem.up).argmax())]
+    vertical = vertical_axis(problem.up)
     axes = {
         name: axis.content() | {"words": words_of_axis(name, axis, vertical=name == vertical)}
         for name, axis in found.items()
     }
-    worst = max((Verdict(axis["verdict"]) for axis in axes.values()), key=list(Verdict).index)
+    worst = worst_of(found)
     sound = not disagree.found and worst != Verdict.RESOLVED
     remedies = remedies_of(problem) if sound else ()
-    words = [contradiction_words(disagree.found)] if disagree.found else []
+    words = [number_words(found, vertical), contradiction_words(disagree.found)]
     words += [axis["words"] for axis in axes.values()]
-    words += [to_resolve(remedy_words(remedies))] if remedies else []
+    words += [to_resolve(remedy_words(remedies))]
     words += ["The shake's modes were learned from this run."] if model.name == "learned" else []
     depths = {camera.name: camera.camera_from_rig.rotation[2] for camera in problem.cameras}
     return {
@@ -78,7 +84,7 @@ def judge(
         "usable_for": usable,
         "flags": [str(flag) for flag in _flags(found)],
         "axes": axes,
-        "words": " ".join(words),
+        "words": " ".join(word for word in words if word),
         "remedy": remedy_words(remedies),
         "remedies": [str(remedy) for remedy in remedies],
         "vertical": vertical,
@@ -87,18 +93,19 @@ def judge(
 
 
 def _flags(found: dict[str, AxisVerdict]) -> list[Flag]:
-    """Return the flags of the run: ambiguous if any axis is, below noise only if all are."""
-    flags = []
-    if any(Flag.LABEL_AMBIGUOUS in axis.flags for axis in found.values()):
-        flags.append(Flag.LABEL_AMBIGUOUS)
-    if all(Flag.SHAKE_BELOW_NOISE in axis.flags for axis in found.values()):
-        flags.append(Flag.SHAKE_BELOW_NOISE)
+    """Return the flags of the run: those of any axis, but below noise only if all axes are."""
+    flags = [flag for flag in Flag if any(flag in axis.flags for axis in found.values())]
+    if not all(Flag.SHAKE_BELOW_NOISE in axis.flags for axis in found.values()):
+        flags = [flag for flag in flags if flag != Flag.SHAKE_BELOW_NOISE]
     return flags
 
 
 def remedies_of(problem: SmoothingProblem) -> tuple[Remedy, ...]:
     """Return the missing measurements that would separate shake and motion better."""
-    has_arms = len(problem.arms_with_sensor) == len(problem.cameras)
-    if len(problem.references):
-        return (Remedy.LONGER,) if has_arms else (Remedy.ARMS,)
-    return (Remedy.STRIP,) if has_arms else (Remedy.STRIP, Remedy.ARMS)
+    arms, every = problem.arms_with_sensor, set(range(len(problem.cameras)))
+    missing = []
+    if set(problem.references.camera.tolist()) != every:
+        missing.append(Remedy.STRIP)
+    if arms != every:
+        missing.append(Remedy.BARE_ARMS if arms else Remedy.ARMS)
+    return tuple(missing) or (Remedy.LONGER,)

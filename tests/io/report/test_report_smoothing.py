@@ -112,12 +112,24 @@ def test_without_smoothing_the_page_is_of_the_tracking_alone(folder: Path) -> No
 def test_each_verdict_has_its_words_colour_and_remedy(
     folder: Path, word: str | None, colour: str, headline: str
 ) -> None:
-    changed(folder, "words", "axes", "remedy", verdict=word)
+    changed(folder, "words", "axes", "remedy", verdict=word, remedies=["strip", "arms"])
     told = _judged(folder)
     assert (told.colour, told.warnings) == (colour, ())
     assert headline in told.headline
     remedied = any("strip of dots" in s and "accelerometer" in s for s in told.sentences)
     assert remedied == (word in ("PARTIAL", "UNRESOLVED"))
+
+
+def test_the_number_stands_before_the_word(folder: Path) -> None:
+    changed(folder, vertical="y")
+    told = _judged(folder).headline
+    assert told.startswith("Vertical: 99.6 % of the shake's variance removed; paths good to 23 µm")
+    assert told.index("23 µm in x and z") < told.index("RESOLVED")
+
+
+def test_a_file_that_names_no_remedy_gets_no_advice(folder: Path) -> None:
+    changed(folder, verdict="UNRESOLVED", remedies=[])
+    assert not any("To resolve it" in sentence for sentence in _judged(folder).sentences)
 
 
 def test_the_remedy_of_the_file_is_said_once(folder: Path) -> None:

@@ -31,6 +31,7 @@ from telerig.io.results.verdict_words import (
     VERDICT_WORDS,
     consequence_words,
     mode_remedy,
+    number_words,
     remedy_words,
     to_resolve,
     words_of_axes,
@@ -89,6 +90,7 @@ _COLOURS = {
 _HARMLESS = {Flag.SHAKE_BELOW_NOISE}
 _HEADS = {
     "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
+    "sigma_encoder_mm": "sd that the encoder's scale and the travel axis add, µm",
 }  # fmt: skip
 _IN_UM = {"mm": ("µm", 1e3)}
 
@@ -104,6 +106,7 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headli
     if file.verdict is not None:
         colour = _COLOURS[file.verdict]
         headline, meaning = VERDICT_WORDS[file.verdict].headline, consequence_words(file)
+        headline = f"{number_words(file.axes, file.vertical)} {headline}".strip()
     of_axes = words_of_axes(file)
     sentences = [meaning, *map(words_of_contradiction, file.contradictions)]
     sentences += of_axes or [file.words]

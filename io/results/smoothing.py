@@ -162,7 +162,10 @@ def worst_of(axes: Mapping[str, AxisVerdict]) -> Verdict:
 
 
 def vertical_axis(up: Vector3) -> str:
-    """Return the axis nearest to the vertical; up : (3,) unit vector against gravity."""
+    """Return the axis nearest to the vertical.
+
+    up : (3,) unit vector against gravity.
+    """
     return AXES[int(np.abs(up).argmax())]
 
 

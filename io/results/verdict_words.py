@@ -264,7 +264,7 @@ QUANTITY_WORDS = {
     Quantity.MEAN_VELOCITY: "mean velocity",
     Quantity.VELOCITY: "velocity in a frame",
     Quantity.ACCELERATION: "acceleration in a frame",
-    Quantity.PATH: "path",
+    Quantity.PATH: "path about a line",
     Quantity.ZIGZAG_AMPLITUDE: "zigzag amplitude",
     Quantity.ZIGZAG_FREQUENCY: "zigzag frequency",
 }

@@ -197,12 +197,12 @@ def test_the_page_says_what_the_run_is_good_for(folder: Path) -> None:
     changed(folder, usable_for=uses)
     rows = [row.cells for row in use_rows(read(folder))]
     assert [row[:3] for row in rows] == [
-        ("good", "path below 19 Hz", "x"), ("good", "mean velocity", "y"),
+        ("good", "path about a line below 19 Hz", "x"), ("good", "mean velocity", "y"),
         ("no", "velocity in a frame", "x"),
     ]  # fmt: skip
     assert rows[1][3:] == ("-277.0 ±\u00a02.8 mm/s", "encoder")
     assert uses_words(read(folder).file.usable_for) == [
-        "good for: path (x), mean velocity (y)",
+        "good for: path about a line (x), mean velocity (y)",
         "not good for: velocity in a frame (x)",
         "nothing in this run confirms the sign, unit and scale of: encoder",
     ]
@@ -222,9 +222,9 @@ def test_the_page_says_why_it_is_not_good_for_more_and_what_to_add(folder: Path)
         "noise."
     )
     assert by_shake == (
-        "Along y, path (1.2 of its standard deviations): mostly because of the shake (standard "
-        "deviation of a position 154 µm; 15.9 µm if the shake were known). At no frequency is the "
-        "path nine times the power of its errors."
+        "Along y, path about a line (1.2 of its standard deviations): mostly because of the shake "
+        "(standard deviation of a position 154 µm; 15.9 µm if the shake were known). At no "
+        "frequency is the path nine times the power of its errors."
     )
     assert "accelerometer on each camera arm" in remedies[0] and "pixels per mm" in remedies[1]
     axes["y"] |= {"q": 1.3, "sigma_mm": 0.0208, "sigma_shake_known_mm": 0.016}

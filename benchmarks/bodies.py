@@ -22,7 +22,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS, HARMONICS
-from telerig.estimator.bubbles.shape.volume_centroid import Bodies, fit_bodies
+from telerig.estimator.bubbles.shape.body import Bodies, fit_bodies
+from telerig.estimator.bubbles.shape.learning import learn_shapes
+from telerig.estimator.bubbles.shape.shapes import Shapes
+from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -37,13 +40,20 @@ VERTICAL_FROM_Z = Rotation.from_rotvec([np.pi / 2, 0, 0])
 MODES = [(2, 0), (2, 1), (2, 2), (3, 0), (3, 1), (3, 2), (3, 3), *((4, m) for m in range(5))]
 
 
-def rig() -> tuple[Camera, Camera]:
-    """Two ideal telecentric cameras at right angles, the vertical shared."""
-    side = Pose.from_rotvec([0, np.pi / 2, 0])
-    return (
-        Camera.create("left", (1280, 800), SCALE_PX_PER_MM),
-        Camera.create("right", (1280, 800), SCALE_PX_PER_MM, camera_from_rig=side),
-    )
+UP = np.array([0.0, -1.0, 0.0])
+RIGS = {2: (0, 90), 3: (0, 60, 120), 4: (0, 45, 90, 135)}
+"""Directions of the cameras about the vertical (degrees), by their number."""
+
+
+def rig(views: int = 2) -> tuple[Camera, ...]:
+    """Ideal telecentric cameras, the vertical shared."""
+    return tuple(
+        Camera.create(
+            f"camera{i}", (1280, 800), SCALE_PX_PER_MM,
+            camera_from_rig=Pose.from_rotvec([0, np.radians(angle), 0]),
+        )
+        for i, angle in enumerate(RIGS[views])
+    )  # fmt: skip
 
 
 PLACEMENTS = [
@@ -210,13 +220,13 @@ def _outline_residuals(
 
 
 def outlines(
-    body: Body, cameras: tuple[Camera, Camera], rng: np.random.Generator
+    body: Body, cameras: tuple[Camera, ...], rng: np.random.Generator
 ) -> list[dict[str, float]]:
-    """The rows of both cameras."""
+    """The rows of all cameras."""
     angle = 2 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
     circle = np.stack([np.cos(angle), np.sin(angle)], -1)
     outward = np.concatenate([circle @ camera.camera_from_rig.rotation[:2] for camera in cameras])
-    rims = np.split(rim_mm(body, outward), 2)
+    rims = np.split(rim_mm(body, outward), len(cameras))
     rows = []
     for camera, rim in zip(cameras, rims):
         pixels = camera.project(rim)
@@ -267,23 +277,46 @@ class Outcome:
         return np.asarray((error * np.linalg.solve(self.bodies.covariance_mm2, error)).sum((1, 2)))
 
 
-def run_case(case: Case, count: int, rng: np.random.Generator) -> Outcome:
+def fitted(
+    rows: list[list[dict[str, float]]],
+    cameras: tuple[Camera, ...],
+    shapes: Shapes | None = None,
+) -> Bodies:
+    """Fit the bodies whose outlines are given, as one run; rows: by body and camera."""
+    tables = [
+        pd.DataFrame([r[c] for r in rows]).reindex(columns=DETECTION_COLUMNS).assign(flags="")
+        for c in range(len(cameras))
+    ]
+    return fitted_tables(tables, cameras, shapes)
+
+
+def fitted_tables(
+    tables: list[pd.DataFrame], cameras: tuple[Camera, ...], shapes: Shapes | None = None
+) -> Bodies:
+    """Fit bodies; row i of each camera's table is body i."""
+    sightings = Sightings.concat(
+        [sightings_from_table(table, c, cameras) for c, table in enumerate(tables)]
+    )
+    count = len(tables[0])
+    seen = np.arange(count)[:, None] + count * np.arange(len(cameras))
+    if shapes is None:
+        shapes = learn_shapes(sightings, seen, cameras, UP)
+    return fit_bodies(sightings, seen, cameras, UP, shapes)
+
+
+def run_case(case: Case, count: int, rng: np.random.Generator, views: int = 2) -> Outcome:
     """Draw bodies, measure them, fit them as one run."""
-    cameras = rig()
+    cameras = rig(views)
     drawn = [case.draw(rng) for _ in range(count)]
     rows = [outlines(body, cameras, rng) for body in drawn]
-    first, second = (
-        pd.DataFrame([r[c] for r in rows]).reindex(columns=DETECTION_COLUMNS).assign(flags="")
-        for c in (0, 1)
-    )
     truth = np.array([body.volume_centre_mm() for body in drawn])
     diameter = np.array([body.diameter_mm() for body in drawn])
-    return Outcome(truth, diameter / 2, diameter, fit_bodies(first, second, cameras))
+    return Outcome(truth, diameter / 2, diameter, fitted(rows, cameras))
 
 
 HEADER = (
     "| mode | axis | ratio | mean of outlines, R | volume, R | mean of outlines, µm | volume, µm "
-    "| gain | in 68 % | in 95 % | zonal | d_eq, % |\n" + 12 * "|---" + "|"
+    "| gain | in 68 % | in 95 % | zonal | d_eq, % | its NEES |\n" + 13 * "|---" + "|"
 )
 
 
@@ -293,7 +326,8 @@ def row(case: Case, outcome: Outcome) -> str:
     plain, ours = (outcome.relative_rms(p) for p in points)
     distance2 = outcome.mahalanobis2()
     mode = "Gaussian 3+4" if case.mode is None else f"{case.mode[0]},{case.mode[1]}"
-    diameter = np.sqrt(((bodies.d_eq_mm / outcome.diameter_mm - 1) ** 2).mean())
+    off = bodies.d_eq_mm - outcome.diameter_mm
+    diameter = np.sqrt(((off / outcome.diameter_mm) ** 2).mean())
     worse = " (worse)" if ours > 1.05 * plain else ""
     cells = [
         mode, case.axis, "1" if case.largest_ratio == 1 else f"1-{case.largest_ratio}",
@@ -301,6 +335,7 @@ def row(case: Case, outcome: Outcome) -> str:
         f"{outcome.rms_um(points[1]):.1f}", f"{plain / ours:.2f}",
         f"{(distance2 < 3.527).mean():.2f}", f"{(distance2 < 7.815).mean():.2f}",
         f"{bodies.zonal_probability.mean():.2f}", f"{100 * diameter:.2f}",
+        f"{((off / bodies.sd_eq_mm) ** 2).mean():.2f}",
     ]  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 
@@ -313,7 +348,7 @@ def speed(rng: np.random.Generator) -> str:
     spent = []
     for _ in range(5):
         begin = time.process_time()
-        fit_bodies(tables[0], tables[1], cameras)
+        fitted_tables(tables, cameras)
         spent.append(time.process_time() - begin)
     return f"10,000 pairs: {min(spent):.2f} s of CPU time"
 
@@ -322,6 +357,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--bodies", type=int, default=200, help="per case")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--views", type=int, default=2, choices=sorted(RIGS))
     parser.add_argument("--out", type=Path, help="write the table there as Markdown")
     options = parser.parse_args()
     lines = [HEADER]
@@ -330,7 +366,7 @@ def main() -> None:
         for place, (axis, ratio) in enumerate(PLACEMENTS):
             rng = np.random.default_rng([options.seed, *(mode or (0, 0)), place])
             case = Case(mode, axis, ratio)
-            lines.append(row(case, run_case(case, options.bodies, rng)))
+            lines.append(row(case, run_case(case, options.bodies, rng, options.views)))
             print(lines[-1], flush=True)
     notes = [
         speed(np.random.default_rng(options.seed)),

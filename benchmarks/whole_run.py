@@ -39,6 +39,7 @@ from telerig.arrays import Array
 from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
+from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.rig_drift import PairCollector
 from telerig.estimator.tracking.detect_run import lab_shift_px
@@ -199,7 +200,7 @@ def linking(found: Study) -> None:
 
     def ours() -> None:
         tracker = Tracker(found.cameras, AXIS, TrackerSettings())
-        maker = RowMaker(found.cameras, model, tracker, None)
+        maker = RowMaker(found.cameras, model, tracker, Shapes(), np.array(AXIS))
         parts.clear()
         for f, (tables, sight) in enumerate(zip(pairs, maker.sights(pairs))):
             parts.append(maker.add(f, float(run.t_s[f]), float(run.position_mm[f]), tables, sight))

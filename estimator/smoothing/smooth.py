@@ -86,7 +86,6 @@ from telerig.progress import showing_progress
 if TYPE_CHECKING:
     import pandas as pd
 
-    from telerig.estimator.bubbles.shape.spheroid import Deviations
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.rig_drift import DriftPrior
     from telerig.factors.bubble_motion import LowPasses
@@ -232,10 +231,9 @@ def smooth(
         words = change_words(change, problem.cameras[0].name)
         summary["rig_change"] = {**change.as_dict(), "words": words}
     described = rig or getattr(stage, "rig", None)
-    if done.deviations is not None:
-        summary["bodies"] = asdict(done.deviations)
-        if not getattr(described, "bubbles", None):  # else part of the images counts
-            summary["swarm"] = done.swarm
+    summary["bodies"] = dict(getattr(tracks, "summary", {}).get("shapes", {}))
+    if done.swarm is not None and not getattr(described, "bubbles", None):  # else a part counts
+        summary["swarm"] = done.swarm
     fluid = getattr(described, "fluid", None)
     summary["fluid"] = {} if fluid is None else asdict(fluid)
     summary["learning"], summary["seconds"] = learned, phases.seconds
@@ -247,7 +245,6 @@ def smooth(
 class _Done(NamedTuple):
     """verdict, evidence : of the run.  All others: of it, or of the piece in its middle.
 
-    deviations : of the bubbles' shapes; None without tracks.
     swarm : what `swarm_numbers` returns.
     sensors : estimates of every sensor by its name, from all pieces.
     """
@@ -256,7 +253,6 @@ class _Done(NamedTuple):
     evidence: Evidence
     solution: Solution
     tables: Tables | StoredTables
-    deviations: Deviations | None
     swarm: dict[str, Any] | None
     sensors: dict[str, Any]
 
@@ -298,18 +294,18 @@ class _Run:
             tracks = self.tracks
             if hasattr(tracks, "between"):
                 tracks = tracks.between(0, len(problem.t_s))
-            bodies, deviations = self._bodies(tracks)
+            bodies = self._bodies(tracks)
             swarm = self._swarm(solution, paths, bodies, Span.whole(solution))
         tables = Tables(paths, offsets, states_of(solution), bodies)
-        return _Done(verdict, evidence, solution, tables, deviations, swarm, {})
+        return _Done(verdict, evidence, solution, tables, swarm, {})
 
-    def _bodies(self, tracks: Any) -> tuple[pd.DataFrame | None, Deviations | None]:
-        """Return the bubbles' bodies, and their deviations; None without tracks."""
+    def _bodies(self, tracks: Any) -> pd.DataFrame | None:
+        """Return the bubbles' bodies; None without tracks."""
         if self.tracked is None:
-            return None, None
+            return None
         from telerig.estimator.physics.bodies import bodies_table
 
-        return bodies_table(tracks, self.problem.cameras, self.problem.up)
+        return bodies_table(tracks)
 
     def _swarm(
         self, solution: Solution, paths: pd.DataFrame, bodies: pd.DataFrame | None, span: Span
@@ -349,7 +345,7 @@ class _Run:
 
         problem, model, parts = self.problem, self.model, list[Evidence]()
         sensors = dict[str, Any]()
-        deviations = swarm = low_passes = moved = None
+        swarm = low_passes = moved = None
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
             middle = piece_with_most(problem, pieces)
             if not self.given:
@@ -369,12 +365,10 @@ class _Run:
                     parts.append(Evidence.of(solution, drawn(solution), span))
                     sensors |= sensors_of(solution)
                     paths, offsets = self._tables(piece, window, solution, span)
-                    bodies, found = self._bodies(
-                        frames_between(self.tracks, piece.first, piece.end)
-                    )
+                    bodies = self._bodies(frames_between(self.tracks, piece.first, piece.end))
                     file.append(paths, offsets, states_of(solution, span), _beside(paths, bodies))
                     if piece == pieces[middle]:
-                        deviations, swarm = found, self._swarm(solution, paths, bodies, span)
+                        swarm = self._swarm(solution, paths, bodies, span)
                         moved = solution.accelerations
                     del window, solution, paths, offsets, bodies
                 with self.phases.phase("verdict", "judging the result"):
@@ -391,7 +385,7 @@ class _Run:
                 file.widen(inflation)
                 file.finish(inflation)
         solution = replace(solution, draws=None)
-        return _Done(verdict, evidence, solution, tables, deviations, swarm, sensors)
+        return _Done(verdict, evidence, solution, tables, swarm, sensors)
 
     def _tables(
         self, piece: Piece, window: Window, solution: Solution, span: Span

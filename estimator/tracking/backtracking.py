@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from telerig.arrays import Array, Bools, Ints
+from telerig.arrays import Array, Bools, Ints, Rows
 from telerig.estimator.bubbles.pairing.matching import Candidates, Prediction
+from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.tracking.association import (
     Projected,
     gate2,
@@ -109,15 +110,16 @@ CENTRE_PX = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 
 
 @dataclass(frozen=True)
-class Pairs:
+class Pairs(Rows):
     """M pairs of detections of one frame, each of which shows one bubble in both cameras.
 
     rows : (M, 2) row of the detection in the table of each camera.
     confidence : (M,) probability that the pair is right.
     ambiguous : (M,) whether another pair is nearly as probable.
     given : (M,) id that the user gave to the pair, -1 for none.
-    points_mm, covariance_mm2, d_eq_mm : (M, 3), (M, 3, 3), (M,) position, its covariance, and the
-        equivalent diameter (NaN if it is unknown).
+    points_mm, covariance_mm2 : (M, 3), (M, 3, 3) position of the outlines' centres with the
+        covariance of a bubble of unknown shape.
+    bodies : the M bodies, fitted to both outlines.
     particle : (M,) id of the track, -1 for none; it is known when the frame is final.
     """
 
@@ -127,18 +129,16 @@ class Pairs:
     given: Ints
     points_mm: Array
     covariance_mm2: Array
-    d_eq_mm: Array
+    bodies: Bodies
     particle: Ints
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def of(self, keep: Bools | Ints | slice) -> Pairs:
-        return Pairs(*(getattr(self, f.name)[keep] for f in fields(self)))
-
-    def and_also(self, other: Pairs) -> Pairs:
-        both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-        return Pairs(*(np.concatenate(columns) for columns in both))
+    @property
+    def d_eq_mm(self) -> Array:
+        """Equivalent diameters (M,), NaN where unknown."""
+        return self.bodies.d_eq_mm
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ class Frame:
         if same.all(1).any():
             self.particle[same.all(1)] = pair.particle
         else:
-            self.pairs = self.pairs.of(~same.any(1)).and_also(pair)
+            self.pairs = Pairs.concat([self.pairs.take(~same.any(1)), pair])
 
 
 def given_ids(table: pd.DataFrame) -> Ints:
@@ -510,7 +510,7 @@ def _claim_pair(
                 np.array([NO_PARTICLE]),
                 found.points_mm,
                 found.covariance_mm2,
-                predicted.d_eq_mm[k : k + 1],
+                Bodies.sized(predicted.d_eq_mm[k : k + 1], len(cameras)),
                 predicted.ids[k : k + 1],
             )
         )

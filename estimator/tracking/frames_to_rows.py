@@ -22,8 +22,9 @@ from telerig.estimator.bubbles.pairing.matching import (
     shared_axis,
     view_of,
 )
-from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
-from telerig.estimator.tracking.association import px_per_mm
+from telerig.estimator.bubbles.shape.body import Bodies, body_columns, fit_bodies
+from telerig.estimator.bubbles.shape.shapes import Shapes
+from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.estimator.tracking.backtracking import (
     CENTRE_PX,
     COVARIANCE_MM2,
@@ -73,7 +74,8 @@ class RowMaker:
     cameras: tuple[Camera, Camera]
     model: PairModel
     tracker: Tracker
-    shape_sigma: Array | None
+    shapes: Shapes
+    up: Array
     events: list[TrackEvent] = field(default_factory=list)
     _open: dict[int, Frame] = field(default_factory=dict)
     _closed: list[Frame] = field(default_factory=list)
@@ -84,14 +86,14 @@ class RowMaker:
         """Return the detections of several frames as arrays; all frames at once are quicker."""
         axis = shared_axis(self.cameras)
         counts = np.array([[len(table) for table in tables] for tables in frames], np.int64)
-        views, pixels, ids, sizes, of_cameras = [], [], [], [], []
+        views, pixels, ids, joined, of_cameras = [], [], [], [], []
         for c, (camera, tables) in enumerate(zip(self.cameras, zip(*frames))):
             table = pd.concat(tables, ignore_index=True)
             views.append(view_of(table, camera, axis))
             pixels.append(_pixels(table, self._wander))
             ids.append(given_ids(table))
             a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
-            sizes.append(d_eq)
+            joined.append(table)
             flags = ["|".join(words) for words in flag_words(table)]
             centre, (uv, covariance) = table[CENTRE_PX].to_numpy(float), pixels[c]
             ends = np.cumsum([0, *counts[:, c]]).tolist()
@@ -101,7 +103,7 @@ class RowMaker:
                     for p in (slice(low, high) for low, high in pairwise(ends))
                 ]
             )
-        possible = self._possible((views[0], views[1]), pixels, ids, sizes, counts)
+        possible = self._possible((views[0], views[1]), pixels, ids, joined, counts)
         every: list[tuple[Any, ...]] = [
             (*zip(*both), *pairs) for *both, pairs in zip(*of_cameras, possible)
         ]
@@ -112,7 +114,7 @@ class RowMaker:
         views: tuple[View, View],
         pixels: Sequence[Pixels],
         ids: Sequence[Ints],
-        d_eq_px: Sequence[Array],
+        tables: Sequence[pd.DataFrame],
         counts: Ints,
     ) -> list[tuple[Candidates, Pairs, Array]]:
         """Return the last three fields of `Sight` for each of F frames.
@@ -134,10 +136,7 @@ class RowMaker:
         (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))
         rays = [(view.origin_mm[i], view.direction[i]) for view, i in zip(views, rows.T)]
         points = triangulate(self.cameras, (uv_a, uv_b), (cov_a, cov_b), rays=rays)
-        expected, by_point = stacked_jacobian(self.cameras, points.points_mm)
-        d_eq_mm2 = np.ones(len(rows))
-        for c, view in enumerate(d_eq_px):
-            d_eq_mm2 *= view[rows[:, c]] / px_per_mm(by_point[:, 2 * c : 2 * c + 2])
+        expected, _ = stacked_jacobian(self.cameras, points.points_mm)
         frame = frames[0][rows[:, 0]]
         pairs = Pairs(
             rows - (np.cumsum(counts, axis=0) - counts)[frame],
@@ -146,12 +145,12 @@ class RowMaker:
             ids[0][rows[:, 0]],
             points.points_mm,
             points.covariance_mm2,
-            np.sqrt(d_eq_mm2),
+            self._bodies(tables, rows),
             np.full(len(rows), NO_PARTICLE),
         )
         off = np.hstack([uv_a, uv_b]) - expected
         cuts = [slice(*ends) for ends in pairwise(np.searchsorted(frame, range(len(counts) + 1)))]
-        return [(one, pairs.of(cut), off[cut]) for one, cut in zip(found, cuts)]
+        return [(one, pairs.take(cut), off[cut]) for one, cut in zip(found, cuts)]
 
     def add(
         self,
@@ -185,8 +184,7 @@ class RowMaker:
     @property
     def _wander(self) -> float:
         """Sd of the shift of an outline's centre by a bubble's shape, as a share of its radius."""
-        sigma = DEFAULT_SHAPE_SIGMA if self.shape_sigma is None else self.shape_sigma
-        return WANDER * float(sigma[0])
+        return WANDER * self.shapes.third
 
     def finish(self) -> Linked | None:
         """Return the remaining rows at the end of the run; None if there are none."""
@@ -221,20 +219,25 @@ class RowMaker:
             found = found.sort_values(["frame", "particle"], kind="stable", ignore_index=True)
         return Linked(found, _detections(done, joined))
 
+    def _bodies(self, tables: Sequence[pd.DataFrame], rows: Ints) -> Bodies:
+        """Fit M bodies to the detections ``rows`` (M, C) of the cameras' tables."""
+        seen = [table.take(mine) for table, mine in zip(tables, rows.T)]
+        sightings = [sightings_from_table(t, c, self.cameras) for c, t in enumerate(seen)]
+        order = np.arange(rows.size).reshape(rows.shape[::-1]).T
+        gap_px = float(np.hypot(self.model.frame_px, self.model.rms_px[0]))
+        return fit_bodies(
+            Sightings.concat(sightings), order, self.cameras, self.up, self.shapes,
+            gap_sigma_px=gap_px,
+        )  # fmt: skip
+
     def _tracks(self, frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
-        first, second = (
-            table.take(
-                np.concatenate([f.pairs.rows[:, c] + start for f, start in zip(frames, ends)])
-            ).reset_index(drop=True)
-            for c, (table, ends) in enumerate(zip(joined, _starts(frames)))
-        )
-        bodies = fit_bodies(
-            first,
-            second,
-            self.cameras,
-            shape_sigma=self.shape_sigma,
-            gap_sigma_px=float(np.hypot(self.model.frame_px, self.model.rms_px[0])),
-        )
+        pairs = Pairs.concat([f.pairs for f in frames])
+        starts = np.repeat(_starts(frames).T, [len(f.pairs) for f in frames], 0)
+        at = pairs.rows + starts
+        first, second = (t.take(at[:, c]).reset_index(drop=True) for c, t in enumerate(joined))
+        bodies, late = pairs.bodies, np.flatnonzero(pairs.bodies.used == "none")
+        if len(late):
+            bodies.put(late, self._bodies(joined, at[late]))
         many = [len(f.pairs) for f in frames]
         table: dict[str, Any] = {
             "frame": np.repeat([f.number for f in frames], many),
@@ -248,10 +251,10 @@ class RowMaker:
             values = rows[CENTRE_PX].to_numpy(float, copy=True)
             values[:, 2:] += shape[:, c][:, *np.triu_indices(2)]
             table |= {f"{camera.name}_{name}": v for name, v in zip(CENTRE_PX, values.T)}
-            table[f"{camera.name}_du_px"] = bodies.du_px[:, c]
-            table[f"{camera.name}_dv_px"] = bodies.dv_px[:, c]
+            for k, name in enumerate(("du_px", "dv_px")):
+                table[f"{camera.name}_{name}"] = bodies.shift_px[:, c, k]
         table["ray_miss_mm"] = bodies.ray_miss_mm
-        table["d_eq_mm"], table["sd_eq_mm"] = bodies.d_eq_mm, bodies.d_eq_sd_mm
+        table |= body_columns(bodies, self.up)
         table["confidence"] = np.concatenate([f.pairs.confidence for f in frames])
         table["centre"] = bodies.used
         table |= dict(zip((f"silhouettes_{x}_mm" for x in "xyz"), bodies.silhouette_points_mm.T))
@@ -300,7 +303,7 @@ def pair_frame(sight: Sight, model: PairModel, predicted: Prediction | None) -> 
     found = match_candidates(sight.candidates, model, predicted)
     given = np.arange(len(sight.possible) - len(sight.candidates))
     chosen = np.concatenate([given, len(given) + found.candidate])
-    pairs = sight.possible.of(chosen)
+    pairs = sight.possible.take(chosen)
     pairs.confidence[len(given) :] = found.confidence
     pairs.ambiguous[len(given) :] = found.ambiguous
     if len(chosen) < _LEAST_FOR_OFFSET:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,9 @@ from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_cr
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
-from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
+from telerig.estimator.bubbles.shape.learning import learn_shapes
+from telerig.estimator.bubbles.shape.shapes import Shapes
+from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.estimator.calibration.result.calibration import (
     NO_COVARIANCE,
     Calibration,
@@ -177,7 +179,7 @@ class TrackingStream:
             "frames_without_bubbles": self.frames_without,
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
             "pairs": with_change(model, change, self.calibration),
-            "shape_sigma": self.linker.shape_sigma,
+            "shapes": asdict(self.linker.shapes),
             "covariance": "Of the measurement."
             + known
             * " The calibration's share, common to all points, is in calibration_sx_mm, "
@@ -312,7 +314,8 @@ def tracking_stream(
     sample = _sample(cameras, batches)
     model = estimate_pair_model(sample, cameras)
     tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
-    linker = RowMaker(cameras, model, tracker, _shape_sigma(sample, cameras, model))
+    up = upwards(run, axis)
+    linker = RowMaker(cameras, model, tracker, _shapes(sample, cameras, model, up), up)
     rows = _linked(run, cameras, batches(), linker, without, stage)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
@@ -372,6 +375,13 @@ def stage_axis(run: RunData, calibration: Calibration) -> Array:
     elif run.rig is not None and run.rig.stage is not None:
         axis = run.rig.stage.axis
     return np.asarray(np.asarray(axis, float) / np.linalg.norm(axis))
+
+
+def upwards(run: RunData, axis: Array) -> Array:
+    """Return the unit vector (3,) against gravity in the rig frame: that of rig.toml, or the
+    travel axis."""
+    described = None if run.rig is None else run.rig.stage
+    return axis if described is None else np.asarray(described.up, float)
 
 
 def _complete(detections: pd.DataFrame) -> pd.DataFrame:
@@ -465,21 +475,25 @@ def _seen_by_both(batch: pd.DataFrame) -> Ints:
     return np.asarray(cameras.index[cameras == 2], np.int64)
 
 
-def _shape_sigma(
-    sample: list[Tables], cameras: tuple[Camera, Camera], model: PairModel
-) -> Array | None:
-    """Return how much outlines deviate from ellipses, by the run's reliable pairs."""
-    firsts, seconds = [], []
-    for first, second in sample:
-        found = match_pairs(first, second, cameras, model)
+def _shapes(
+    sample: list[Tables], cameras: tuple[Camera, Camera], model: PairModel, up: Array
+) -> Shapes:
+    """Return how the run's bubbles deviate from spheroids, by its reliable pairs."""
+    parts: tuple[list[pd.DataFrame], ...] = tuple([] for _ in cameras)
+    for tables in sample:
+        found = match_pairs(*tables, cameras, model)
         reliable = found.confidence > _RELIABLE
-        firsts.append(first.iloc[found.first[reliable]])
-        seconds.append(second.iloc[found.second[reliable]])
-    if not sum(map(len, firsts)):
-        return None
-    return estimate_shape_sigma(
-        pd.concat(firsts, ignore_index=True), pd.concat(seconds, ignore_index=True), cameras
-    )
+        for part, table, rows in zip(parts, tables, (found.first, found.second)):
+            part.append(table.iloc[rows[reliable]])
+    if not any(map(len, parts[0])):
+        return Shapes()
+    sightings = [
+        sightings_from_table(pd.concat(part, ignore_index=True), c, cameras)
+        for c, part in enumerate(parts)
+    ]
+    count = len(sightings[0])
+    seen = np.arange(count)[:, None] + count * np.arange(len(cameras))
+    return learn_shapes(Sightings.concat(sightings), seen, cameras, up)
 
 
 def _linked(

@@ -72,7 +72,7 @@ RUN_EXPORTS = {
     "hdf5": Format("HDF5", "export.tables:write_hdf5", "h5py, MATLAB", ".h5", ("cameras",)),
     "netcdf": Format("NetCDF", "export.netcdf:write_netcdf", "CF-1.8 trajectories", ".nc"),
     "mat": Format("MATLAB", "export.tables:write_mat", "MATLAB", ".mat", ("cameras",)),
-    "vtk": Format("ParaView", "export.vtk:write_vtk", "ParaView, VTK", "", ("cameras",)),
+    "vtk": Format("ParaView", "export.vtk:write_vtk", "ParaView, VTK"),
     "trackpy": Format("trackpy", "export.tables:write_trackpy", "CSV for trackpy", ".csv"),
 }
 CAMERA_IMPORTERS = {

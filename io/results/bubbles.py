@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from telerig.io.files.csv_table import Column
+from telerig.io.results.bodies import SHAPE_COLUMNS
 
 _VELOCITY = [f"{s}v{a}_mm_s" for s in ("", "s") for a in "xyz"]
 _ACCELERATION = [f"{s}a{a}_mm_s2" for s in ("", "s") for a in "xyz"]
@@ -12,11 +13,7 @@ NUMBERS = ("reynolds", "weber", "eotvos", "drag")
 
 _WITH_SD = [f"{s}{name}" for name in NUMBERS for s in ("", "s_")]
 
-BODY_COLUMNS = [
-    "frame", "particle", "d_eq_mm", "sd_eq_mm", "aspect", "s_aspect", "tilt_deg", "s_tilt_deg",
-    "equator_mm", "s_equator_mm", "polar_mm", "s_polar_mm", "pole_x", "pole_y", "pole_z",
-    "r_size_aspect", "spheroid_chi2",
-]  # fmt: skip
+BODY_COLUMNS = ["frame", "particle", "d_eq_mm", "sd_eq_mm", *SHAPE_COLUMNS]
 """What outlines alone tell of a bubble in a frame."""
 
 FRAME_COLUMNS = [

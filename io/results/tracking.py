@@ -9,6 +9,7 @@ from pydantic import Field
 
 from telerig.arrays import Array
 from telerig.io.files.csv_table import Column
+from telerig.io.results.bodies import SHAPE_COLUMNS
 from telerig.io.results.record import Name, Part, Record, Vector3
 
 POINT = ("x_mm", "y_mm", "z_mm")
@@ -99,7 +100,7 @@ class TrackingFile(Record):
     frames_without_bubbles: dict[Name, dict[str, int]] = Field(default_factory=dict)
     events: dict[str, int] = Field(default_factory=dict)
     pairs: Pairs | None = None
-    shape_sigma: Any = None
+    shapes: dict[str, float] = Field(default_factory=dict)
     covariance: str = ""
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -158,7 +159,7 @@ def tracks_columns(cameras: Sequence[str]) -> list[Column]:
         Column("particle", "whole"),
         Column("t_s"),
         *_numbers([*POINT, *COVARIANCE, *per_camera, "ray_miss_mm", "d_eq_mm", "confidence"]),
-        *_numbers(["sd_eq_mm", *SILHOUETTES], required=False),
+        *_numbers(["sd_eq_mm", *SHAPE_COLUMNS, *SILHOUETTES], required=False),
         *(Column(name, "text", required=False, blank=True) for name in ("centre", "flags")),
         *_numbers([*CALIBRATION_SHARE, EXTRAPOLATED], required=False),
     ]

@@ -57,6 +57,8 @@ def write_run(folder: Path, calibration: bool = True) -> Path:
         }))  # fmt: skip
     table["ray_miss_mm"], table["confidence"] = found.ray_miss_mm, 1.0
     table["d_eq_mm"] = 2 * np.prod(HALF_AXES_MM) ** (1 / 3)
+    table["equator_mm"], table["polar_mm"] = HALF_AXES_MM[:2]
+    table[["pole_x", "pole_y", "pole_z"]] = 0.0, -1.0, 0.0
     folder.mkdir(parents=True)
     table.to_csv(folder / "tracks.csv", index=False)
     pd.concat(detections).to_csv(folder / "detections.csv", index=False)

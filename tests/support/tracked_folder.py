@@ -128,7 +128,7 @@ def _content(tracks: pd.DataFrame, detections: pd.DataFrame, bias_px: float) -> 
                   "rms_px": [abs(bias_px) + 0.07, 0.07, 0.07, 0.072],
                   "calibration_problem": bool(bias_px), "words": words},
         "image_size_px": {"left": list(SIZE_PX), "right": list(SIZE_PX)},
-        "shape_sigma": [0.011, 0.004], "covariance": "of the measurement alone",
+        "shapes": {"third": 0.011, "fourth": 0.004}, "covariance": "of the measurement alone",
         "notes": ["frames.csv has <no> times"],
         "worst_frames": [{"frame": WORST[0], "score": 4.0, "why": "3 bubbles without a partner"},
                          {"frame": WORST[1], "score": 2.5, "why": "an ambiguous pair & a break"}],

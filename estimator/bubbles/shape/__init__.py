@@ -1,5 +1,5 @@
-"""Estimates the body of a bubble from its outlines in two views.
+"""Estimates the body of a bubble from its outlines in any number of views.
 
-In: both outlines of each bubble. Out: its centre of volume and its spheroid, with covariances.
-Read ``volume_centroid`` first, then ``spheroid``.
+In: sightings (outlines in images) and which of them show the same body. Out: its centre of volume,
+size, shape and pole, with covariances. Read ``body`` first, then ``spheroid``.
 """

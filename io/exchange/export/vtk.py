@@ -22,8 +22,7 @@ from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import RunResults, facts, numbered
 from telerig.io.files.atomic import atomic_folder
 from telerig.io.files.csv_table import Column, read_table
-from telerig.io.results.bodies import ellipsoids_of, spheres_of
-from telerig.rig.camera import Camera
+from telerig.io.results.bodies import SHAPE_COLUMNS, ellipsoids_of
 
 SERIES, PATHS = "bubbles.pvd", "paths.vtp"
 _FRAMES = "frames"
@@ -33,30 +32,27 @@ _POINT = ["x_mm", "y_mm", "z_mm"]
 _TRACKED = [
     Column("frame", "whole"),
     Column("particle", "name"),
-    *(Column(name, blank=True) for name in _POINT),
+    *(Column(name, required=False, blank=True) for name in SHAPE_COLUMNS),
 ]
 
 
-def write_vtk(
-    results: RunResults, out: str | PathLike[str], cameras: Sequence[Camera] = ()
-) -> None:
+def write_vtk(results: RunResults, out: str | PathLike[str]) -> None:
     """Write `bubbles.pvd`, `frames/*.vtp` and `paths.vtp` into the folder ``out``.
 
     Each frame has one point per bubble, in mm, with its particle, further numbers, the vectors
     velocity, acceleration and standard deviation as far as they are known, and the tensor
     ``diameters_mm``. Its eigenvalues are the diameters of the bubble and its eigenvectors their
     directions: VTK's tensor glyph of a sphere with the radius 0.5 is the bubble. It is an ellipsoid
-    from both outlines where the run has outlines, else a sphere of equal volume. The paths are one
+    where the bubble's shape is known, else a sphere of equal volume. The paths are one
     line per bubble. Files of an earlier export with other frames are removed.
 
-    cameras : the calibrated cameras, for the ellipsoids.
     Raises InputError for a folder ``out`` that holds other files, and when it cannot be written.
     """
     points, folder = results.points, Path(out)
     _check_ours(folder)
     frames, t_s = _times(results)
     numbers, _ = numbered(points)
-    arrays = _point_arrays(points, numbers, _diameters(results, cameras))
+    arrays = _point_arrays(points, numbers, _diameters(results))
     names = [f"{_FRAMES}/bubbles_{frame:06}.vtp" for frame in frames]
     comment = "\n".join(f"{key}: {value}" for key, value in facts(results).items())
     order = np.argsort(points["frame"].to_numpy(), kind="stable")
@@ -93,21 +89,18 @@ def _times(results: RunResults) -> tuple[list[int], Array]:
     return frames.tolist(), np.interp(frames, table["frame"], table["t_s"])
 
 
-def _diameters(results: RunResults, cameras: Sequence[Camera]) -> Array | None:
+def _diameters(results: RunResults) -> Array | None:
     """Return the tensors (N, 3, 3) in mm; None where the run does not tell the bubbles' sizes."""
     points = results.points
     if "d_eq_mm" not in points:
         return None
-    quadrics = spheres_of(points)
     file = None if results.folder is None else results.folder / "tracks.csv"
     if file is not None and file.is_file():
         tracks = read_table(file, _TRACKED, extra=True)
-        used = [camera for camera in cameras if f"{camera.name}_u_px" in tracks]
-        here = points[["frame"]].assign(particle=points["particle"].astype(str))
-        here = here.merge(tracks[["frame", "particle", *_POINT]], how="left")
-        found = ellipsoids_of(file.parent, here, (used[0], used[1])) if len(used) == 2 else None
-        if found is not None:
-            quadrics = np.where(np.isfinite(found).all((1, 2), keepdims=True), found, quadrics)
+        shape = [name for name in SHAPE_COLUMNS if name in tracks]
+        points = points[["frame", "d_eq_mm"]].assign(particle=points["particle"].astype(str))
+        points = points.merge(tracks[["frame", "particle", *shape]], "left")
+    quadrics, _ = ellipsoids_of(points)
     known = np.isfinite(quadrics).all((1, 2))
     out = np.zeros_like(quadrics)
     squares, axes = np.linalg.eigh(quadrics[known])

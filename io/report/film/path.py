@@ -16,11 +16,10 @@ from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Picture, Progress, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
-from telerig.io.report.run.tracking.results import TrackResults, read_track_results, run_cameras
+from telerig.io.report.run.tracking.results import TrackResults, read_track_results
 from telerig.io.report.run.tracking.scene import thinned, track_colour
-from telerig.io.results.bodies import ellipsoids_of, spheres_of
+from telerig.io.results.bodies import SHAPE_COLUMNS, ellipsoids_of
 from telerig.io.results.manifest import reading
-from telerig.rig.camera import Camera
 
 STEP_DEG = 2
 MOST_POINTS = 3_000
@@ -50,19 +49,18 @@ def write_path_film(
 ) -> tuple[str, ...]:
     """Film the path that a run's results folder holds, from 180 sides; return remarks in words.
 
-    Bubbles are ellipsoids from both outlines where the calibration is at hand (`results_cameras`),
-    else spheres; the band round a path is +-2 sd, widened where it would be thinner than a line, by
-    a factor that stands in the film. A long run's path is thinned. Raises InputError for results
-    that cannot be read or hold no path, and files that cannot be written.
+    Bubbles are ellipsoids where their shapes are known, else spheres; the band round a path is
+    +-2 sd, widened where it would be thinner than a line, by a factor that stands in the film. A
+    long run's path is thinned. Raises InputError for results that cannot be read or hold no path,
+    and files that cannot be written.
     """
     folder = Path(results_folder)
-    cameras, why = run_cameras(folder, read_track_results(folder))
-    path = read_film_path(folder, cameras)
+    path = read_film_path(folder)
     angles = [float(angle) for angle in range(0, 360, STEP_DEG)]
     draw = partial(draw_path, path, film_layout(path))
     pictures = ordered_map(draw, angles, quick_workers(len(angles)))
     write_film(pictures, len(angles), files, what="turning the path", stage=stage)
-    return (*path.notes, *([f"spheres, because {why}"] if why else []))
+    return path.notes
 
 
 @dataclass(frozen=True)
@@ -97,11 +95,10 @@ def film_axes(up: Array) -> Array:
     return np.array([right, np.cross(up, right), up])
 
 
-def read_film_path(folder: Path, cameras: tuple[Camera, Camera] | None) -> FilmPath:
+def read_film_path(folder: Path) -> FilmPath:
     """Return the path that a run's results folder holds: smoothed in the lab frame, or tracks.
 
-    cameras : for the bubbles' bodies; without them they are spheres. Raises InputError for a folder
-    that cannot be read, or holds no point.
+    Raises InputError for a folder that cannot be read, or holds no point.
     """
     with reading(folder, ()):
         results = read_track_results(folder)
@@ -116,7 +113,7 @@ def read_film_path(folder: Path, cameras: tuple[Camera, Camera] | None) -> FilmP
     kept = thinned(table, MOST_POINTS).reset_index(drop=True)
     notes = [f"{len(kept)} of {found} positions drawn"] if len(kept) < found else []
     axes = film_axes(results.up)
-    rows, quadrics, how = _bodies(folder, results, kept, cameras)
+    rows, quadrics, how = _bodies(results, kept)
     names = tuple(_axis_name(direction) for direction in axes[:2])
     return FilmPath(
         kept[_PLACE].to_numpy(float) @ axes.T,
@@ -146,27 +143,19 @@ def _axis_name(direction: Array) -> str:
     return ("" if direction[axis] > 0 else "-") + "xyz"[axis]
 
 
-def _bodies(
-    folder: Path,
-    results: TrackResults,
-    kept: pd.DataFrame,
-    cameras: tuple[Camera, Camera] | None,
-) -> tuple[Ints, Array, str]:
+def _bodies(results: TrackResults, kept: pd.DataFrame) -> tuple[Ints, Array, str]:
     """Return the rows of ``kept``, their quadrics in rig axes, and in words what is drawn."""
     here = kept[["frame", "particle"]].assign(row=np.arange(len(kept)))
-    sizes = results.tracks[["frame", "particle", "d_eq_mm", *_PLACE]].merge(
+    shape = [name for name in SHAPE_COLUMNS if name in results.tracks]
+    sizes = results.tracks[["frame", "particle", "d_eq_mm", *shape, *_PLACE]].merge(
         here, on=["frame", "particle"]
     )
     sizes = sizes[np.isfinite(sizes["d_eq_mm"].to_numpy(float))].sort_values("row")
     sizes = sizes.iloc[_apart(kept, sizes)].reset_index(drop=True)
-    quadrics = spheres_of(sizes)
+    quadrics, shaped = ellipsoids_of(sizes)
     rows = sizes["row"].to_numpy(np.int64)
-    ellipsoids = None if cameras is None else ellipsoids_of(folder, sizes, cameras)
-    if ellipsoids is None:
-        return rows, quadrics, "bubbles: spheres of equal volume"
-    seen = np.isfinite(ellipsoids).all((1, 2))
-    quadrics[seen] = ellipsoids[seen]
-    return rows, quadrics, "bubbles: ellipsoids from both outlines"
+    kind = "ellipsoids from their outlines" if shaped.any() else "spheres of equal volume"
+    return rows, quadrics, f"bubbles: {kind}"
 
 
 def _apart(kept: pd.DataFrame, sizes: pd.DataFrame) -> list[int]:

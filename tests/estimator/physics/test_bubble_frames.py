@@ -150,10 +150,9 @@ def test_errors_that_are_not_known_of_what_does_not_matter_add_nothing() -> None
 
 def test_bodies_of_a_table_without_outlines_are_diameters() -> None:
     tracks = pd.DataFrame({"frame": [0, 1], "particle": 7, "d_eq_mm": [3.0, np.nan]})
-    bodies, known = bodies_table(tracks, (), UP)
+    bodies = bodies_table(tracks)
     assert list(bodies) == BODY_COLUMNS and bodies["d_eq_mm"].tolist() == [3.0]
-    assert known.pairs == 0
-    assert not len(bodies_table(tracks.drop(columns="d_eq_mm").assign(d_eq_mm=np.nan), (), UP)[0])
+    assert not len(bodies_table(tracks.assign(d_eq_mm=np.nan)))
 
 
 def test_the_mean_of_a_body_averages_only_what_exceeds_its_stated_errors() -> None:

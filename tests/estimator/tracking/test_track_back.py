@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import telerig
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import default_model
+from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.tracking.frames_to_rows import RowMaker
 from telerig.estimator.tracking.tracker import Tracker
@@ -70,7 +71,8 @@ def linked(
     """
     rng = np.random.default_rng(seed)
     truth, shake = paths(rng), rng.normal(0, SHAKE_PX, (FRAMES, 2, 2))
-    linker = RowMaker(CAMERAS, MODEL, Tracker(CAMERAS), np.full(2, 1e-3))
+    shapes = Shapes(third=1e-3, fourth=1e-3)
+    linker = RowMaker(CAMERAS, MODEL, Tracker(CAMERAS), shapes, np.array([0.0, -1.0, 0.0]))
     for frame in range(FRAMES):
         tables = []
         for camera in (0, 1):

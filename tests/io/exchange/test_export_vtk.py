@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from filmed_run import HALF_AXES_MM, two_cameras, write_run
+from filmed_run import HALF_AXES_MM, write_run
 
 from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import LAB, RunResults, read_results
@@ -41,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_frame_has_its_bubbles_at_its_time(run: Path, tmp_path: Path) -> None:
     results = read_results(run)
-    write_vtk(results, tmp_path / "out", two_cameras())
+    write_vtk(results, tmp_path / "out")
     files = series(tmp_path / "out")
     assert len(files) == len(results.points) and all(file.is_file() for file in files.values())
     for (t_s, file), row in zip(files.items(), results.points.itertuples()):
@@ -87,7 +87,7 @@ def test_frames_without_bubbles_are_empty_and_old_frames_go(tmp_path: Path) -> N
 def test_times_since_1970_stay_apart(tmp_path: Path) -> None:
     results = swarm()
     late = replace(results, points=results.points.assign(t_s=results.points["t_s"] + 1.7e9))
-    write_vtk(late, tmp_path / "out", two_cameras())
+    write_vtk(late, tmp_path / "out")
     assert len(series(tmp_path / "out")) == 5
 
 
@@ -100,7 +100,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
 def test_a_moved_folder_is_read_by_pyvista_with_its_times(run: Path, tmp_path: Path) -> None:
     pyvista = pytest.importorskip("pyvista")
     results = read_results(run)
-    write_vtk(results, tmp_path / "out", two_cameras())
+    write_vtk(results, tmp_path / "out")
     (tmp_path / "elsewhere").mkdir()
     moved = (tmp_path / "out").rename(tmp_path / "elsewhere" / "moved")
     reader = pyvista.PVDReader(str(moved / SERIES))
@@ -116,7 +116,7 @@ def test_vtk_draws_the_ellipsoids(run: Path, tmp_path: Path) -> None:
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 
-    write_vtk(read_results(run), tmp_path / "out", two_cameras())
+    write_vtk(read_results(run), tmp_path / "out")
     file = next(iter(series(tmp_path / "out").values()))
     reader = vtk.vtkXMLPolyDataReader()
     reader.SetFileName(str(file))

@@ -93,7 +93,7 @@ def test_page_says_what_the_files_say(whole: Path, results: TrackResults) -> Non
         "seen in 3 of 4 frames", 'two continuations, 1.2 nats apart, "unsafe", <cut>', "1, 2",
         "birth: 12, death: 12, break: 1.", "Frame 7: 3 bubbles without a partner",
         "an ambiguous pair & a break", "frames.csv has <no> times", "packages.numpy",
-        "frames without: no image", "flag: border", "shape_sigma", "0.011, 0.004",
+        "frames without: no image", "flag: border", "0.011", "0.004",
         "RMS for pairs left out of it, px", "of the measurement alone", "volume",
     ):  # fmt: skip
         assert words in text, words

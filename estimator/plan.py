@@ -19,7 +19,6 @@ from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
 from telerig.estimator.calibration.result.calibration import (
-    NO_COVARIANCE,
     Calibration,
     load_calibration,
 )
@@ -43,6 +42,7 @@ from telerig.estimator.smoothing.problem.tables import calibration_share
 from telerig.estimator.smoothing.result import trajectories
 from telerig.estimator.smoothing.verdict.identifiability import expected_shake, verdicts
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.results.smoothing import AXES, AxisVerdict, Verdict, vertical_axis, worst_of
 from telerig.io.results.verdict_words import number_words
 from telerig.io.rig_file.description import RigDescription

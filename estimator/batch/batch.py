@@ -172,6 +172,7 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
     from telerig.estimator.calibration.calibrate import run_calibration
     from telerig.estimator.calibration.results_folder import sources, write_report, write_results
     from telerig.io.dataset.dataset import load_dataset
+    from telerig.io.results.findings import objections
     from telerig.io.results.inputs import fingerprints
 
     begun = time.perf_counter()
@@ -185,13 +186,16 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
         seconds={"calibrate": time.perf_counter() - begun},
         report=write_report if job.report else None, used=used, again=job.command,
     )  # fmt: skip
+    verdict, against = found.verdict, objections(found.findings or ())
     figures = {
-        "verdict": found.verdict["status"],
+        "verdict": verdict["status"],
+        "flags": list(dict.fromkeys(finding.code.name for finding in against)),
         **{k: found.statistics[k] for k in ("views", "dots_kept", "share_kept", "rms_px")},
         "lens_model": found.model.get("name"),
     }
-    status = REJECTED if found.verdict["status"] == "REJECTED" else DONE
-    return {"status": status, "words": found.report(), "figures": figures}
+    rejected = verdict["status"] == "REJECTED"
+    words = "\n".join(verdict["reasons"]) if rejected else found.report()
+    return {"status": REJECTED if rejected else DONE, "words": words, "figures": figures}
 
 
 def _track(job: Job, stage: Stage | None) -> dict[str, Any]:

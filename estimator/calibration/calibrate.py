@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.solver.problem import (
@@ -13,6 +13,7 @@ from telerig.estimator.calibration.solver.problem import (
     SOLVERS,
     checked_outlier_sd,
 )
+from telerig.io.results.findings import Code, Finding
 from telerig.progress import Progress, showing_progress
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import AUTO, Model, checked_model, models_by_camera
@@ -153,20 +154,19 @@ def run_calibration(
     if detected is None:
         detected = detect(dataset, stage=stage, pictures=pictures)
     table = dataset.dots() if detected is None else detected.dots
-    notes = [*dataset.notes, *(() if detected is None else detected.notes)]
-
+    read = [Finding(code=Code.NOTE, text=note) for note in dataset.notes]
+    read += () if detected is None else detected.findings
     calibration = solve_dots(
         dataset, table, model=model, solver=solver, medium=medium, dots_free=dots_free,
-        outlier_sd=outlier_sd, stage=stage, notes=notes,
+        outlier_sd=outlier_sd, stage=stage, findings=read,
     )  # fmt: skip
-    calibration = replace(calibration, stage=_stage(dataset, calibration, stage), medium=medium)
+    calibration = replace(_with_stage(dataset, calibration, stage), medium=medium)
     if dataset.rig.walls or medium == "water":
-        from telerig.estimator.calibration.refractive_windows import behind_windows, window_notes
+        from telerig.estimator.calibration.refractive_windows import behind_windows, window_findings
 
         if medium == "air":
             calibration = behind_windows(calibration, dataset.rig.windows)
-        words = window_notes(calibration, dataset.rig)
-        calibration = replace(calibration, notes=(*calibration.notes, *words))
+        calibration = _with_findings(calibration, window_findings(calibration, dataset.rig))
     return CalibrationRun(_with_measured(calibration, table, seed), detected)
 
 
@@ -180,13 +180,13 @@ def solve_dots(
     dots_free: str,
     outlier_sd: float = OUTLIER_SD,
     stage: Progress | None = None,
-    notes: Sequence[str] = (),
+    findings: Sequence[Finding] = (),
 ) -> Calibration:
     """Calibrate the rig from a table of dots, without measuring the stage's axis.
 
     table : the measured dots, with the columns of dots.csv. model, solver, medium, dots_free,
     outlier_sd, stage : as for `run_calibration`.
-    notes : further sentences for the user.
+    findings : what was found while the dots were read.
 
     The refractive windows of rig.toml are part of the model only if ``medium`` is "water". If it is
     "air", the caller adds them for the runs in water.
@@ -206,7 +206,7 @@ def solve_dots(
         solver=solver,
         outlier_sd=outlier_sd,
         progress=None if stage is None else lambda i, _: stage("solve", i, 0),
-        notes=notes,
+        findings=findings,
         name=rig.name,
     )
 
@@ -236,19 +236,25 @@ def _load_libraries() -> None:
     import gtsam  # noqa: F401
 
 
-def _stage(dataset: Dataset, calibration: Calibration, stage: Progress | None) -> dict[str, Any]:
-    """Return the travel axis and encoder scale that the folder `stage_axis/` gives.
+def _with_stage(dataset: Dataset, calibration: Calibration, stage: Progress | None) -> Calibration:
+    """Return the calibration with the travel axis and encoder scale of the folder `stage_axis/`.
 
-    The result is empty if there is no such folder or if the calibration was rejected.
+    It stays as it is if there is no such folder or if the calibration was rejected.
     """
     from telerig.estimator.calibration.stage_axis import stage_axis_from
 
     if calibration.verdict["status"] == "REJECTED":
-        return {}
+        return calibration
     if stage is not None:
         stage("stage axis", 0, 0)
     found = stage_axis_from(dataset, calibration)
-    return {} if found is None else found.as_dict()
+    if found is None:
+        return calibration
+    return _with_findings(replace(calibration, stage=found.as_dict()), found.findings)
+
+
+def _with_findings(calibration: Calibration, more: Sequence[Finding]) -> Calibration:
+    return replace(calibration, findings=(*(calibration.findings or ()), *more))
 
 
 def _with_measured(calibration: Calibration, table: pd.DataFrame, seed: int) -> Calibration:

@@ -1,7 +1,7 @@
 """Refractive windows: plane glass walls between the cameras and the water of a run.
 
 In: a calibration, and the windows that `[walls]` of rig.toml states. Out: the calibration behind
-them, and notes on what they do and what is not known of them.
+them, and findings on what they do and what is not known of them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from telerig.arrays import Array
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freedom
 from telerig.estimator.calibration.start.mirror_ambiguity import ENTOCENTRIC
+from telerig.io.results.findings import Code, Finding
 from telerig.io.rig_file.description import RigDescription
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX
@@ -25,7 +26,6 @@ from telerig.rig.windows import Wall
 
 _NOTABLE_UM = 0.1
 _STEP_MM = 10.0
-_LEANING_DEG = 30.0
 
 
 def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
@@ -115,102 +115,63 @@ def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
     return float(1e3 * np.linalg.norm(wrong, axis=-1).max())
 
 
-def window_notes(calibration: Calibration, rig: RigDescription) -> list[str]:
-    """Return notes for the user on the effect of the refractive windows and their uncertainty."""
+def window_findings(calibration: Calibration, rig: RigDescription) -> list[Finding]:
+    """Return findings on the effect of the refractive windows and their uncertainty."""
     cameras = [c for c in calibration.cameras if c.wall is not None]
     if not cameras:
-        return _without_windows(calibration)
-    words = [_in_words(calibration, [c.name for c in cameras])]
+        wet = calibration.medium == "water"
+        return [Finding(code=Code.NO_WINDOWS)] if wet else []
+    error = model_error_um(calibration.in_air().cameras, calibration.cameras)
+    code = Code.WINDOWS_IN_AIR if calibration.medium == "air" else Code.WINDOWS_IN_WATER
+    names = tuple(c.name for c in cameras)
+    found = [Finding(code=code, cameras=names, numbers={"error_um": error})]
     for camera in cameras:
-        words += _implausible(camera)
-        words += _uncertain(calibration, camera) + _tilt_sign_ambiguous(calibration, camera)
+        found += _implausible(camera)
+        found += _uncertain(calibration, camera) + _tilt_sign_ambiguous(calibration, camera)
         if rig.walls[camera.name].distance_mm is None:
-            words += _without_distance(camera)
-    return words
-
-
-def _in_words(calibration: Calibration, names: Sequence[str]) -> str:
-    where = f"behind the refractive windows of {', '.join(names)}"
-    error = _um(model_error_um(calibration.in_air().cameras, calibration.cameras))
-    if calibration.medium == "air":
-        return (
-            f"calibrated in air; points of runs lie in the water {where}. Without the windows in "
-            f"the model, points would be wrong by {error} over the working volume"
-        )
-    return (
-        f"calibrated in the water {where}. If this calibration is used for points in air, without "
-        f"windows, they are wrong by {error}"
-    )
+            found += _without_distance(camera)
+    return found
 
 
 def _um(error_um: float) -> str:
-    return f"up to {_rounded(error_um)} µm" if error_um >= _NOTABLE_UM else "less than 0.1 µm"
+    return f"up to {error_um:.1f} µm" if error_um >= _NOTABLE_UM else "less than 0.1 µm"
 
 
-def _rounded(value: float) -> str:
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
-
-
-def _without_windows(calibration: Calibration) -> list[str]:
-    """Return the note on a target in the water if `rig.toml` states no windows."""
-    if calibration.medium == "air":
-        return []
-    words = (
-        "calibrated in the water, and rig.toml states no windows ([walls]): scales and axes hold "
-        "for points in the water only"
-    )
-    if any(abs(c["kappa_per_mm"]) * c.rho_mm >= ENTOCENTRIC for c in calibration.cameras):
-        words += "; with a perspective lens, state its window in [walls.<camera>] of rig.toml"
-    return [words]
-
-
-def _implausible(camera: Camera) -> list[str]:
-    """Return notes on probable mistakes: the order of the media, the direction of the normal."""
-    wall, words = camera.wall, []
+def _implausible(camera: Camera) -> list[Finding]:
+    """Return findings on probable mistakes: the order of the media, the normal's direction."""
+    wall, found = camera.wall, list[Finding]()
     if wall is None:
         return []
-    if wall.indices[0] > wall.indices[-1]:
-        words.append(
-            f"[walls.{camera.name}] indices {list(wall.indices)} put this camera into the denser "
-            "medium; give the camera's side first, as in [1.0, 1.52, 1.333] for air, glass, water"
-        )
-    leaning = np.degrees(np.arccos(min(1.0, abs(wall.normal[2]))))
-    if leaning > _LEANING_DEG:
-        words.append(
-            f"the normal of the window of {camera.name} is {leaning:.0f} degrees off the camera's "
-            f"axis. Check normal in [walls.{camera.name}]: it is in the camera's frame, in which a "
-            "window that faces the camera has [0, 0, 1]"
-        )
-    return words
+    at = (camera.name,)
+    first, last = wall.indices[0], wall.indices[-1]
+    if first > last:
+        numbers = {"first": first, "last": last}
+        found.append(Finding(code=Code.MEDIA_ORDER, cameras=at, numbers=numbers))
+    leaning = float(np.degrees(np.arccos(min(1.0, abs(wall.normal[2])))))
+    if leaning > Code.WINDOW_LEANING.limit:
+        numbers = {"angle_deg": leaning}
+        found.append(Finding(code=Code.WINDOW_LEANING, cameras=at, numbers=numbers))
+    return found
 
 
-def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
-    """Return the note on the effect of one standard deviation of a window's orientation."""
+def _uncertain(calibration: Calibration, camera: Camera) -> list[Finding]:
+    """Return the finding on the effect of one standard deviation of a window's orientation."""
     sd = max((calibration.sd(f"{camera.name}.{n}") for n in wall_freedom(camera)), default=0.0)
-    if not sd > 0 or camera.wall is None:
+    if not sd > 0 or camera.wall is None or calibration.medium == "water":
         return []
     turned = camera.with_parameters(wall_x_rad=camera["wall_x_rad"] + sd)
     points = working_volume((camera,))
     moved = (turned.project(points) - camera.project(points)) / camera["scale_px_per_mm"]
-    moved = moved - moved.mean(0)
-    most = 1e3 * float(np.abs(moved).max())
-    words = (
-        f"the normal of the window of {camera.name} has a standard deviation of "
-        f"{np.degrees(sd):.2g} deg"
-    )
-    if calibration.medium == "water":
-        return [f"{words}, which the covariances contain"]
-    words += (
-        f", which shifts points by up to {_rounded(most)} µm over the working volume; the "
-        "covariances contain this"
-    )
-    if most > calibration.statistics.get("space_sd_um", np.inf) / 2:
-        words += ". Measure the normal better, or calibrate with the target in the water"
-    return [words]
+    most = 1e3 * float(np.abs(moved - moved.mean(0)).max())
+    numbers = {"sd_deg": float(np.degrees(sd)), "shift_um": most}
+    return [Finding(code=Code.WINDOW_NORMAL, cameras=(camera.name,), numbers=numbers)]
 
 
-def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[str]:
-    """Return the note on a window that may lean to the other side: only the tilt's square shows."""
+def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[Finding]:
+    """Return the finding on a window that may lean to the other side.
+
+    Only the tilt's square shows.
+    """
     free, wall = wall_freedom(camera), camera.wall
     weak = abs(camera["kappa_per_mm"]) * camera.rho_mm < ENTOCENTRIC
     if calibration.medium == "air" or not free or wall is None or not weak:
@@ -221,20 +182,16 @@ def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[str]:
     sd = max(calibration.sd(f"{camera.name}.{name}") for name in free)
     if apart < 3 * sd or from_stated > 3 * wall.normal_sigma_rad:
         return []
-    return [
-        f"the window of {camera.name} may just as well be tilted by {np.degrees(apart / 2):.2g} "
-        "deg to the other side: with a telecentric lens and the target in the water, images do "
-        "not show the sign of the tilt. Points are not affected. If you need the normal itself, "
-        "state it more precisely in rig.toml"
-    ]
+    numbers = {"tilt_deg": float(np.degrees(apart / 2))}
+    return [Finding(code=Code.WINDOW_TILT_SIGN, cameras=(camera.name,), numbers=numbers)]
 
 
 def _angle_rad(a: Array, b: Array) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
-def _without_distance(camera: Camera) -> list[str]:
-    """Return the note on the effect of 10 mm of a window's unknown distance."""
+def _without_distance(camera: Camera) -> list[Finding]:
+    """Return the finding on the effect of 10 mm of a window's unknown distance."""
     if camera.wall is None:
         return []
     farther = replace(camera.wall, distance_mm=camera.wall.distance_mm + _STEP_MM)
@@ -245,12 +202,8 @@ def _without_distance(camera: Camera) -> list[str]:
     shift, rest = float(np.linalg.norm(common)), float(np.abs(moved - common).max())
     if max(shift, rest) < _NOTABLE_UM:
         return []
-    return [
-        f"[walls.{camera.name}] has no distance_mm, so the window is taken to be at the camera's "
-        f"origin. If it is {_STEP_MM:.0f} mm away from there, all points of this camera are "
-        f"shifted by {_rounded(shift)} µm, and single points by {_um(rest)} more. Add distance_mm "
-        "if this matters"
-    ]
+    numbers = {"step_mm": _STEP_MM, "shift_um": shift, "rest_um": rest}
+    return [Finding(code=Code.NO_DISTANCE, cameras=(camera.name,), numbers=numbers)]
 
 
 def window_warnings(rig: RigDescription | None, calibration: Calibration) -> list[str]:

@@ -1,8 +1,8 @@
-"""From a finished fit to a `Calibration`: numbers, tables and a verdict in plain words."""
+"""From a finished fit to a `Calibration`: numbers and tables, and whether the model fits."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,6 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.estimator.calibration.lens.choice import Choice, Step
-from telerig.estimator.calibration.quality.checks import Note
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import (
@@ -29,6 +28,7 @@ from telerig.estimator.calibration.solver.robust_least_squares import (
 )
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
 from telerig.factors.calibration import State
+from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX, groups_of, joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_covariance, triangulate_any
@@ -43,14 +43,11 @@ GAUGE_OF_SCALES = (
     "camera's origin is where its scale is the stated one; target frame tied to the nominal dot "
     "positions by the dots' priors"
 )
-BAD_SCATTER_PX = 0.5
-BAD_KEPT = 0.9
 UNEXPLAINED = 0.3
 """If the ratio of noise floor to image noise exceeds this, errors of the lens model can change the
 angle between the axes as much as uncertain image centres do."""
-BAD_FLOOR = 5.0
-"""If the ratio of noise floor to image noise exceeds this, a warning says that the lens model is
-incomplete."""
+UNLIKELY_SD = 5.0
+"""Standard deviations by which chi-square must differ from 1 to be an objection."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,6 @@ class Fit:
     mirror : the solution of the mirror ambiguity that was kept.
     mirrored_cost : cost of the other.
     tilts_deg : by (view, camera) the angle between the target's normal and the optical axis.
-    notes : sentences for the user.
     """
 
     robust: RobustFit
@@ -76,7 +72,6 @@ class Fit:
     mirror: MirrorChoice | None = None
     mirrored_cost: float = np.nan
     tilts_deg: dict[tuple[int, int], float] = field(default_factory=dict)
-    notes: tuple[Note, ...] = ()
 
     @property
     def model(self) -> str:
@@ -88,7 +83,6 @@ def calibration_from_fit(
     fit: Fit,
     joint: JointCovariance,
     free: tuple[tuple[str, ...], ...],
-    weak: list[str],
     *,
     nominal_rotvec_deg: Nominal,
     name: str,
@@ -97,7 +91,6 @@ def calibration_from_fit(
 
     joint : covariance of all parameters.
     free : for each camera the names of the intrinsics that the covariance contains.
-    weak : the sentences of `checks.weak_parameters`.
     nominal_rotvec_deg : nominal rotation vectors by the camera's index.
     name : name of the rig.
     """
@@ -117,20 +110,17 @@ def calibration_from_fit(
         covariance_names=rig_names,
         free=free,
         name=name,
-        verdict=_verdict(fit, statistics),
         statistics=statistics,
         twin=_mirror(fit, nominal_rotvec_deg),
         model=_model(fit),
         diagnostics={
             "gauge": _gauge(problem),
             "dots_hull_px": _hulls(residuals),
-            "weak": weak,
             "tilts_deg": {
                 f"{problem.views[v]}/{problem.cameras[c].name}": t
                 for (v, c), t in fit.tilts_deg.items()
             },
         },
-        notes=tuple(note.words for note in fit.notes),
         joint_names=joint.names,
         joint_covariance=joint.matrix,
         dots=dot_table(problem),
@@ -201,15 +191,27 @@ def _reason(distance: float, lost_view: bool, limit: float) -> str:
     return f"{distance:.1f} standard deviations from the model (limit {limit:g})"
 
 
-def odd_views(problem: Problem) -> list[str]:
-    """Return a sentence for each view of which more than half of the dots were left out."""
-    measured = np.bincount(problem.view, minlength=len(problem.views))
-    kept = np.bincount(problem.view[problem.kept], minlength=len(problem.views))
-    return [
-        f"view {name!r}: only {k} of its {n} dots agree with the other views. Check whether its "
-        "dots are numbered wrongly, or whether the target moved between the cameras' images"
+def misfits(fit: Fit, statistics: Mapping[str, Any]) -> list[Finding]:
+    """Return findings on how far the model describes the images as a whole, and each view."""
+    found = []
+    scatter = {name: statistics[name] for name in ("scatter_px", "image_noise_px")}
+    floor, chi2 = statistics["noise_floor_px"], statistics["chi2_dof"]
+    if floor > Code.MODEL_FAILS.limit:
+        found.append(Finding(code=Code.MODEL_FAILS, numbers=scatter, text=fit.model))
+    elif floor > Code.SYSTEMATIC.limit * scatter["image_noise_px"]:
+        found.append(Finding(code=Code.SYSTEMATIC, numbers=scatter, text=fit.model))
+    if (share := statistics["share_kept"]) < Code.FEW_KEPT.limit:
+        found.append(Finding(code=Code.FEW_KEPT, numbers={"share": share}))
+    spread = UNLIKELY_SD * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
+    if abs(chi2 - 1) > max(Code.CHI_SQUARE.limit, spread):
+        found.append(Finding(code=Code.CHI_SQUARE, numbers={"chi2_dof": chi2}))
+    problem = fit.robust.problem
+    measured = np.bincount(problem.view, minlength=len(problem.views)).tolist()
+    kept = np.bincount(problem.view[problem.kept], minlength=len(problem.views)).tolist()
+    return found + [
+        Finding(code=Code.ODD_VIEW, views=(name,), numbers={"kept": k, "dots": n})
         for name, k, n in zip(problem.views, kept, measured)
-        if k < 0.5 * n
+        if k < Code.ODD_VIEW.limit * n
     ]
 
 
@@ -353,51 +355,6 @@ def _seen_in_space(problem: Problem, state: State) -> tuple[Array, Array]:
     poses = state.rig_from_target[view]
     points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[dot]) + poses[:, :3, 3]
     return pixels[:, several], points
-
-
-def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
-    reasons = []
-    if statistics["noise_floor_px"] > BAD_SCATTER_PX:
-        reasons.append(
-            f"the model {fit.model!r} does not describe these images: the dots deviate from it by "
-            f"{statistics['scatter_px']:.2g} px (standard deviation of u and of v), but the noise "
-            f"of the images explains only {statistics['image_noise_px']:.2g} px" + _kappa_hint(fit)
-        )
-    if statistics["share_kept"] < BAD_KEPT:
-        reasons.append(
-            f"only {statistics['share_kept']:.0%} of the dots agree with the model; see "
-            "residuals.csv for those that do not"
-        )
-    if reasons:
-        return {"status": "REJECTED", "reasons": reasons}
-    chi2 = statistics["chi2_dof"]
-    spread = 5 * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
-    if abs(chi2 - 1) > max(0.15, spread):
-        reasons.append(
-            f"chi-square per degree of freedom is {chi2:.2f} instead of 1, so the stated noise of "
-            "the dots is wrong or the model is incomplete; look for a pattern in residuals.csv"
-        )
-    if statistics["noise_floor_px"] > BAD_FLOOR * statistics["image_noise_px"]:
-        reasons.append(
-            f"the dots deviate from the model {fit.model!r} by {statistics['scatter_px']:.2g} px "
-            "(standard deviation of u and of v), but the noise of the images explains only "
-            f"{statistics['image_noise_px']:.2g} px: the rest is systematic, so errors in space "
-            "may exceed their stated standard deviations; look for a pattern in residuals.csv, "
-            "and try --model auto"
-        )
-    reasons += [note.words for note in fit.notes if note.affects_verdict]
-    reasons += odd_views(fit.robust.problem)
-    status = "USABLE, with warnings" if reasons else "GOOD"
-    return {"status": status, "reasons": reasons}
-
-
-def _kappa_hint(fit: Fit) -> str:
-    if any("kappa_per_mm" in names for names in fit.robust.problem.free):
-        return ""
-    return (
-        ". The lenses' residual perspective is held at its nominal value in this model; if the "
-        "scale changes with depth, kappa = 0 cannot fit: try --model auto"
-    )
 
 
 def _mirror(fit: Fit, nominal_rotvec_deg: Nominal) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,6 +27,7 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import (
     Fit,
     calibration_from_fit,
+    misfits,
     telecentricity,
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
@@ -56,6 +56,7 @@ from telerig.estimator.calibration.start import (
 )
 from telerig.estimator.calibration.start.unknown_target import dots_from_images
 from telerig.factors.calibration import State, whitened_error
+from telerig.io.results.findings import Code, Finding
 from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import (
@@ -85,7 +86,7 @@ def self_calibrate(
     solver: str = "auto",
     outlier_sd: float = OUTLIER_SD,
     progress: Progress | None = None,
-    notes: Sequence[str] = (),
+    findings: Sequence[Finding] = (),
     name: str = "",
 ) -> Calibration:
     """Calibrate one to four cameras from measured dots.
@@ -103,7 +104,7 @@ def self_calibrate(
         target) or "nominal" (not at all).
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     outlier_sd : number of standard deviations from the model beyond which a dot is left out.
-    notes : sentences for the user that are added to the result.
+    findings : what was found while the dots were read; it is added to the result.
     name : name of the rig.
 
     Raises CalibrationError if the views cannot determine a calibration; the error says what to do.
@@ -121,14 +122,14 @@ def self_calibrate(
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
-    found_notes = [*(checks.Note("input", words) for words in notes), *pre.notes]
+    known = [*findings, *pre.findings]
     if target.symmetry_order() > 1:
-        problem, words = symmetric_target.number_consistently(problem, nominal)
-        found_notes += [checks.Note("symmetric target", w) for w in words]
+        problem, turned = symmetric_target.number_consistently(problem, nominal)
+        known += turned
         start_dots = problem.nominal_mm
     problem = with_plate(problem, nominal)
     try:
-        found = _solved(problem, start_dots, nominal, models, pre, found_notes, name, progress)
+        found = _solved(problem, start_dots, nominal, models, pre, known, name, progress)
     except (CalibrationError, GeometryError) as error:
         _refuse_wrong_pairs(problem, start_dots, error)
         raise
@@ -143,11 +144,14 @@ def _solved(
     nominal: mirror_ambiguity.Nominal,
     models: tuple[str, ...],
     pre: checks.PreCheck,
-    notes: Sequence[checks.Note],
+    known: Sequence[Finding],
     name: str,
     progress: Progress | None,
 ) -> Calibration:
-    """Solve a problem whose views belong together: start, fit, covariance, checks, verdict."""
+    """Solve a problem whose views belong together: start, fit, covariance, checks.
+
+    known : the findings of before.
+    """
     cameras = problem.cameras
     start = best_start(problem, start_dots, nominal)
     mirror = mirror_ambiguity.choose_start(start, problem, nominal)
@@ -158,30 +162,40 @@ def _solved(
     if len(cameras) > 1 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
         fit, mirror = _on_the_right_side(fit, nominal)
     final, solution = fit.robust.problem, fit.robust.solution
-    notes = (
-        *notes,
-        *checks.position_notes(problem, start),
-        *checks.exchanged_notes(final, solution.state),
-        *checks.parallel_notes(solution.state),
-    )
     considered = considered_groups(fit.choice, len(cameras))
     added = considered_words(considered, [c.name for c in cameras])
     other_cost = mirror_ambiguity.mirrored_cost(final, solution.state, solution.cost)
     fit = replace(
         fit, mirror=mirror, mirrored_cost=other_cost, tilts_deg=pre.tilts_deg,
-        notes=notes, model_words=fit.model_words + added,
+        model_words=fit.model_words + added,
     )  # fmt: skip
     own = joint_covariance(final, solution)
     whitened = whitened_error(solution.state, final.observations(), final.rho_mm)
-    structure = residual_tests(final, whitened, own.leverage)
+    structure, unlike_noise = residual_tests(final, whitened, own.leverage)
     noisier, there, shared = _with_wider_noise(final, solution, own, structure["widening"])
     free, joint = considered_covariance(noisier, there, shared, fit.models, considered)
-    weak = checks.weak_parameters(final, own)
-    found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
-    checked = _trust(final, replace(noisier, free=free), solution.state, joint, structure)
+    found = calibration_from_fit(fit, joint, free, nominal_rotvec_deg=nominal, name=name)
+    halves, compared = split_half_check(final, solution.state, structure["widening"])
+    advice = next_view(replace(noisier, free=free), solution.state, joint)
+    findings = (
+        *known,
+        *misfits(fit, found.statistics),
+        *unlike_noise,
+        *compared,
+        *checks.loose_offsets(problem, start),
+        *checks.exchanged_cameras(final, solution.state),
+        *mirror_ambiguity.far_rotations(solution.state, final, nominal),
+        *checks.parallel_axes(solution.state),
+        *checks.weak_parameters(final, own),
+    )
+    checked = {
+        "halves": halves,
+        "structure": structure,
+        "next_view": {} if advice is None else advice.as_dict(),
+    }
     scale_change = telecentricity(noisier, there, fit.models)
     return replace(
-        found, diagnostics={**found.diagnostics, **checked},
+        found, findings=findings, diagnostics={**found.diagnostics, **checked},
         statistics={**found.statistics, "telecentricity": scale_change},
     )  # fmt: skip
 
@@ -211,7 +225,7 @@ def _with_origin(problem: Problem, start: State) -> Problem:
     problem = replace(problem, origin_camera=known_target.origin_camera(turns))
     if not mirror_ambiguity.perspective_sign(start, problem):
         return problem
-    if checks.axes_angle_deg(start) > checks.NEAR_PARALLEL_DEG:
+    if checks.axes_angle_deg(start) > Code.NEAR_PARALLEL.limit:
         return problem
     scale = INDEX["scale_px_per_mm"]
     cameras = []
@@ -249,25 +263,6 @@ def _nominal(
             f"{', '.join(names[1:]) or 'no camera, because there is only one'}",
         )
     return {names.index(n): np.asarray(r, float) for n, r in given.items()}
-
-
-def _trust(
-    problem: Problem,
-    noisier: Problem,
-    state: State,
-    joint: JointCovariance,
-    structure: dict[str, Any],
-) -> dict[str, Any]:
-    """Whether the covariance can be believed (split halves, residuals), and what would lower it.
-
-    noisier : the problem with the noise and the free parameters of ``joint``.
-    """
-    advice = next_view(noisier, state, joint)
-    return {
-        "halves": split_half_check(problem, state, structure["widening"]),
-        "structure": structure,
-        "next_view": {} if advice is None else advice.as_dict(),
-    }
 
 
 def dots_unknown(problem: Problem) -> bool:

@@ -23,6 +23,7 @@ from telerig.io.dataset.dataset import Dataset, View, files_by_view
 from telerig.io.dataset.tables import read_dots_csv
 from telerig.io.files.csv_table import Column, read_table
 from telerig.io.images.read import natural
+from telerig.io.results.findings import Code, Finding
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, across, hat, nearest_rotation, rotation_from_rotvec
 from telerig.rig.triangulation import rig_jacobian, triangulate_any
@@ -35,11 +36,8 @@ if TYPE_CHECKING:
 
 
 _COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
-_UNLIKELY = 1e-3
-_LEAST_WEIGHT = 0.5
 FOLDER = "stage_axis"
 _POSITIONS = "positions.csv"
-_CONTRADICTION_DEG = 10.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class StageAxis:
     chi2_dof : chi-square per degree of freedom of the dots; 1 is expected.
     position_sigma_mm, wander_sigma_mm : standard deviations of the carriage's position along and
         across the axis: the given ones, or the observed ones if these are significantly larger.
-    words : sentences for the user.
+    findings : what was found.
     """
 
     axis_rig: Array
@@ -69,7 +67,7 @@ class StageAxis:
     chi2_dof: float
     position_sigma_mm: float
     wander_sigma_mm: float
-    words: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the contents as plain numbers for calibration.json."""
@@ -87,14 +85,13 @@ class StageAxis:
             "chi2_dof": self.chi2_dof,
             "position_sigma_mm": self.position_sigma_mm,
             "wander_sigma_mm": self.wander_sigma_mm,
-            "notes": list(self.words),
         }
 
 
 def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | None:
     """Measure the stage's axis from the folder `stage_axis/` of a dataset; None if there is none.
 
-    If rig.toml states another direction of travel, ``words`` of the result say so. Raises
+    If rig.toml states another direction of travel, ``findings`` of the result say so. Raises
     InputError if the folder has no positions.csv, or both or neither of images and dots.csv, and
     the errors of `stage_axis_of`.
     """
@@ -102,16 +99,15 @@ def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | N
     if not folder.is_dir():
         return None
     positions = _positions(folder)
-    described, notes = dataset.rig.stage, list[str]()
+    described, read = dataset.rig.stage, list[Finding]()
     found = stage_axis_of(
         calibration,
-        _measured(dataset, folder, notes),
+        _measured(dataset, folder, read),
         positions,
         position_sigma_mm=0.001 if described is None else described.position_sigma_mm,
     )
-    if described is not None:
-        notes += _contradiction(found.axis_rig, described.axis)
-    return replace(found, words=(*found.words, *notes))
+    far = [] if described is None else _far_axis(found.axis_rig, described.axis)
+    return replace(found, findings=(*found.findings, *read, *far))
 
 
 def _positions(folder: Path) -> pd.DataFrame:
@@ -123,13 +119,14 @@ def _positions(folder: Path) -> pd.DataFrame:
     return read_table(file, [Column("view", "name"), Column("position_mm")])
 
 
-def _measured(dataset: Dataset, folder: Path, notes: list[str]) -> pd.DataFrame:
+def _measured(dataset: Dataset, folder: Path, read: list[Finding]) -> pd.DataFrame:
     """Return the table of measured dots, from dots.csv or from the images in the folder.
 
-    Sentences about what is not used are appended to ``notes``.
+    Findings about what is not used are appended to ``read``.
     """
-    table = folder / "dots.csv"
+    table, notes = folder / "dots.csv", list[str]()
     views = _image_views(dataset, folder, notes)
+    read += [Finding(code=Code.NOTE, text=note) for note in notes]
     if table.is_file() == bool(views):
         what = "both images and dots.csv" if views else "neither images nor dots.csv"
         raise InputError(
@@ -142,7 +139,11 @@ def _measured(dataset: Dataset, folder: Path, notes: list[str]) -> pd.DataFrame:
     from telerig.estimator.dots.dataset_dots import detect_dataset
 
     found = detect_dataset(replace(dataset, views=views, source="images", table=None))
-    notes += [f"{FOLDER}: {note}" for note in found.notes]
+    read += [
+        finding.model_copy(update={"views": tuple(f"{FOLDER}/{view}" for view in finding.views)})
+        for finding in found.findings
+        if finding.views
+    ]
     return found.dots
 
 
@@ -155,16 +156,13 @@ def _image_views(dataset: Dataset, folder: Path, notes: list[str]) -> tuple[View
     return tuple(View(name, paths[name]) for name in sorted(paths, key=natural))
 
 
-def _contradiction(axis: Array, stated: tuple[float, float, float]) -> list[str]:
-    """Return a note if rig.toml states a direction that differs from the measured one."""
+def _far_axis(axis: Array, stated: tuple[float, float, float]) -> list[Finding]:
+    """Return a finding if rig.toml states a direction that differs from the measured one."""
     angle = float(np.degrees(np.arccos(np.clip(axis @ np.asarray(stated), -1, 1))))
-    if angle < _CONTRADICTION_DEG:
+    if angle < Code.STAGE_AXIS_FAR.limit:
         return []
-    direction = ", ".join(f"{v:.3f}" for v in axis)
-    return [
-        f"[stage] axis in rig.toml is {angle:.0f} deg away from the measured direction of travel: "
-        + ("reverse its sign" if angle > 180 - _CONTRADICTION_DEG else f"write [{direction}]")
-    ]
+    numbers = {"angle_deg": angle, **dict(zip("xyz", axis.tolist()))}
+    return [Finding(code=Code.STAGE_AXIS_FAR, numbers=numbers)]
 
 
 def stage_axis_of(
@@ -188,24 +186,24 @@ def stage_axis_of(
     Raises InputError for views without a position and for unknown cameras, and CalibrationError for
     fewer than two positions, less than 1 mm between them, or a single camera.
     """
-    dots, words = _dots(calibration, table, positions_mm)
+    dots, findings = _dots(calibration, table, positions_mm)
     cameras = calibration.cameras
     state = start(cameras, dots)
     sigma = (position_sigma_mm, wander_sigma_mm)
     state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
     observed = _observed_sigma(state, weights, system, sigma)
     if observed != sigma:
-        words += _scatter_words(sigma, observed)
+        findings += _scatters(sigma, observed)
         sigma = observed
         state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
-    words += _suspect_notes(dots, weights, system)
-    return _result(calibration, dots, state, weights, system, sigma, words)
+    findings += _suspects(dots, weights, system)
+    return _result(calibration, dots, state, weights, system, sigma, findings)
 
 
 def _dots(
     calibration: Calibration, table: pd.DataFrame, positions_mm: Mapping[str, float] | pd.DataFrame
-) -> tuple[Dots, list[str]]:
-    """Return the dots that the calibration knows, and notes on those that it does not."""
+) -> tuple[Dots, list[Finding]]:
+    """Return the dots that the calibration knows, and findings on those that it does not."""
     readings = _readings(positions_mm)
     names = [c.name for c in calibration.cameras]
     _check_names(table, "view", list(readings), "has no position")
@@ -213,10 +211,7 @@ def _dots(
     index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
     known = table["dot"].isin(index).to_numpy()
     unknown = int((~known).sum())
-    words = (
-        [f"{unknown} dots have numbers that are not in the calibration, and are not used"]
-        if unknown else []
-    )  # fmt: skip
+    findings = [Finding(code=Code.UNKNOWN_DOTS, numbers={"count": unknown})] if unknown else []
     if unknown and not known.any():
         raise InputError(
             f"none of the {unknown} dots has a number that is in the calibration",
@@ -225,11 +220,8 @@ def _dots(
         )
     rows = table[known]
     views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
-    unseen = [v for v in readings if v not in views]
-    words += (
-        [f"positions.csv lists view {', '.join(unseen)}, which has no dots and is not used"]
-        if unseen else []
-    )  # fmt: skip
+    unseen = tuple(v for v in readings if v not in views)
+    findings += [Finding(code=Code.UNSEEN_POSITIONS, views=unseen)] if unseen else []
     reading = np.array([readings[v] for v in views])
     _check_enough(reading, set(rows["camera"]))
     number = {v: i for i, v in enumerate(views)}
@@ -243,7 +235,7 @@ def _dots(
         rows[["u_px", "v_px"]].to_numpy(float),
         np.asarray(np.linalg.inv(_covariance(rows, calibration)), np.float64),
     )
-    return found, words
+    return found, findings
 
 
 def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, float]:
@@ -315,51 +307,46 @@ def _observed_sigma(
     """
     from scipy.stats import chi2
 
-    kept = weights.views > _LEAST_WEIGHT
+    kept = weights.views > Code.WRONG_READING.limit
     spare = int(kept.sum()) - 2
     if spare < 1:
         return sigma_mm
     axis = state.slope / np.linalg.norm(state.slope)
     basis = across(axis)
-    out = []
+    out, limit = [], Code.READINGS_SCATTER.limit
     for directions, given in ((axis[:, None], sigma_mm[0]), (basis, sigma_mm[1])):
         shift = system.shift_mm[kept] @ directions
         own = np.einsum("ia,vij,ja->va", directions, system.shift_covariance[kept], directions)
         dof = spare * directions.shape[1]
         score = float((shift**2 / (own + given**2)).sum())
         excess = float((shift**2).sum() / dof - own.mean())
-        out.append(np.sqrt(excess) if score > chi2.isf(_UNLIKELY, dof) and excess > 0 else given)
+        out.append(np.sqrt(excess) if score > chi2.isf(limit, dof) and excess > 0 else given)
     return float(max(out[0], sigma_mm[0])), float(max(out[1], sigma_mm[1]))
 
 
-def _scatter_words(given: tuple[float, float], observed: tuple[float, float]) -> list[str]:
-    names = ("the encoder readings scatter", "the carriage deviates from a straight line")
+def _scatters(given: tuple[float, float], observed: tuple[float, float]) -> list[Finding]:
+    codes = (Code.READINGS_SCATTER, Code.CARRIAGE_WANDERS)
     return [
-        f"{name} by {1000 * new:.2g} µm, more than the {1000 * old:.2g} µm that were stated; the "
-        "larger value is used"
-        for name, old, new in zip(names, given, observed)
+        Finding(code=code, numbers={"found_um": 1000 * new, "stated_um": 1000 * old})
+        for code, old, new in zip(codes, given, observed)
         if new > old
     ]
 
 
-def _suspect_notes(dots: Dots, weights: Weights, system: StageEquations) -> list[str]:
-    """Return notes on readings and dots of almost no weight, and on only two positions."""
-    words = []
-    for v in np.flatnonzero(weights.views < _LEAST_WEIGHT):
-        words.append(
-            f"the encoder reading {dots.reading_mm[v]:.6g} mm of view {dots.views[v]} is wrong by "
-            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm and has almost no "
-            "influence; check positions.csv"
-        )
-    odd = int((weights.dots < _LEAST_WEIGHT).sum())
+def _suspects(dots: Dots, weights: Weights, system: StageEquations) -> list[Finding]:
+    """Return findings on readings and dots of almost no weight, and on only two positions."""
+    found = []
+    for v in np.flatnonzero(weights.views < Code.WRONG_READING.limit).tolist():
+        error = float(np.linalg.norm(system.shift_mm[v]))
+        numbers = {"reading_mm": float(dots.reading_mm[v]), "error_mm": error}
+        found.append(Finding(code=Code.WRONG_READING, views=(dots.views[v],), numbers=numbers))
+    odd = int((weights.dots < Code.STAGE_OUTLIERS.limit).sum())
     if odd:
-        words.append(
-            f"{odd} of {len(weights.dots)} dots lie far from their predicted pixels and have "
-            "almost no influence; check the images of stage_axis/ if there are many"
-        )
+        numbers = {"count": odd, "dots": len(weights.dots)}
+        found.append(Finding(code=Code.STAGE_OUTLIERS, numbers=numbers))
     if len(dots.views) == 2:
-        words.append("two positions cannot reveal a wrong encoder reading; take three or more")
-    return words
+        found.append(Finding(code=Code.TWO_POSITIONS))
+    return found
 
 
 def _result(
@@ -369,10 +356,10 @@ def _result(
     weights: Weights,
     system: StageEquations,
     sigma_mm: tuple[float, float],
-    words: list[str],
+    findings: list[Finding],
 ) -> StageAxis:
     """Return the stage with its covariance, which includes that of the cameras' calibration."""
-    kept = weights.dots > _LEAST_WEIGHT
+    kept = weights.dots > Code.STAGE_OUTLIERS.limit
     spare = 2 * int(kept.sum()) - 3 * len(dots.views) - 3
     chi2_dof = float(system.dot_score[kept].sum() / spare) if spare > 0 else 1.0
     inverse = np.linalg.inv(system.normal)
@@ -393,20 +380,19 @@ def _result(
         state.rig_from_target,
         chi2_dof,
         *sigma_mm,
-        (*_summary(dots, axis, travel_per_reading, joint), *words),
+        (_summary(dots, axis, travel_per_reading, joint), *findings),
     )
 
 
-def _summary(dots: Dots, axis: Array, travel_per_reading: float, joint: Array) -> list[str]:
-    angle = np.degrees(np.sqrt(np.linalg.eigvalsh(joint[:2, :2])[-1]))
-    direction = ", ".join(f"{v:.6f}" for v in axis)
-    scale_ppm = 1e6 * (1 / travel_per_reading - 1)
-    return [
-        f"travel along ({direction}) ± {angle:.2g} deg, from {len(dots.views)} positions over "
-        f"{np.ptp(dots.reading_mm):.4g} mm",
-        f"the encoder reads {scale_ppm:+.0f} ± {1e6 * np.sqrt(joint[2, 2]):.0f} ppm "
-        "more than the travel",
-    ]
+def _summary(dots: Dots, axis: Array, travel_per_reading: float, joint: Array) -> Finding:
+    numbers = dict(zip("xyz", axis.tolist())) | {
+        "sd_deg": float(np.degrees(np.sqrt(np.linalg.eigvalsh(joint[:2, :2])[-1]))),
+        "positions": len(dots.views),
+        "range_mm": float(np.ptp(dots.reading_mm)),
+        "scale_ppm": 1e6 * (1 / travel_per_reading - 1),
+        "scale_sd_ppm": float(1e6 * np.sqrt(joint[2, 2])),
+    }
+    return Finding(code=Code.STAGE, numbers=numbers)
 
 
 LEAST_TRAVEL_MM = 1.0

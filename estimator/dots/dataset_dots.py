@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,6 +25,7 @@ from telerig.estimator.dots.grid.seen_target import SeenTarget, contradiction, s
 from telerig.estimator.dots.locate import REJECTED, DotMeasurement, measure_dots
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
+from telerig.io.results.findings import Code, Finding
 from telerig.rig.target import Target
 
 MEASURED = [
@@ -227,7 +229,7 @@ class ImageDots:
     dots, rejected : ``table`` and ``rejected`` of `TargetDetection`.
     handedness : -1 if the image shows the target mirrored, +1 if not, 0 if no target was found.
     failure : why the image was left out, or "".
-    notes : sentences for the user.
+    numberings : how many numberings are equally good, because the target is symmetric.
     overlay : JPEG data of the image with the dots and rejected candidates drawn, or empty.
     """
 
@@ -237,7 +239,7 @@ class ImageDots:
     rejected: pd.DataFrame
     handedness: int
     failure: str = ""
-    notes: tuple[str, ...] = ()
+    numberings: int = 1
     overlay: bytes = b""
 
 
@@ -252,7 +254,7 @@ class DatasetDots:
     dots: pd.DataFrame
     rejected: pd.DataFrame
     images: tuple[ImageDots, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = ()
     example: Mapping[str, Array] = field(default_factory=dict)
 
 
@@ -333,24 +335,15 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
         )
     hands = {(i.view, i.camera): i.handedness for i in found if not i.failure}
     check_handedness(hands, dataset.target.two_sided)
-    notes = [f"view {i.view}, camera {i.camera} is left out: {i.failure}" for i in failures]
-    notes += _notes_once(found)
+    findings = [
+        Finding(code=Code.LEFT_OUT, cameras=(i.camera,), views=(i.view,), text=i.failure)
+        for i in failures
+    ]
+    for count, images in Counter(i.numberings for i in found if i.numberings > 1).items():
+        findings.append(Finding(code=Code.NUMBERINGS, numbers={"count": count, "images": images}))
     return DatasetDots(
-        _joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(notes)
+        _joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(findings)
     )
-
-
-def _notes_once(found: list[ImageDots]) -> list[str]:
-    """Return the notes of the images; one that several images share is said once."""
-    images: dict[str, list[ImageDots]] = {}
-    for image in found:
-        for note in image.notes:
-            images.setdefault(note, []).append(image)
-    return [
-        f"view {of[0].view}, camera {of[0].camera}: {note}" if len(of) == 1 else
-        f"{note} (in {len(of)} of {len(found)} images)"
-        for note, of in images.items()
-    ]  # fmt: skip
 
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
@@ -402,8 +395,7 @@ def _numbered_image(dataset: Dataset, image: NDArray[Any], view: View, camera: s
         rejected = rejected_table(measured, slice(None), error.what)
         return ImageDots(view.name, camera, NO_DOTS, rejected, 0, words)
     count, handedness = len(found.numbering.equivalents), found.numbering.handedness
-    notes = (f"the target is symmetric: {count} numberings are equally good",) if count > 1 else ()
-    return ImageDots(view.name, camera, found.table, found.rejected, handedness, notes=notes)
+    return ImageDots(view.name, camera, found.table, found.rejected, handedness, numberings=count)
 
 
 def _smallest_px(dataset: Dataset, camera: str) -> float:

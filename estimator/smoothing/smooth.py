@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import NO_COVARIANCE, pair_of_run
+from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
@@ -80,6 +80,7 @@ from telerig.estimator.smoothing.result import (
 from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.results_file import StoredTables, Tables, results_file
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
 

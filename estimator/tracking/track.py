@@ -25,7 +25,6 @@ from telerig.estimator.bubbles.shape.learning import learn_shapes
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.estimator.calibration.result.calibration import (
-    NO_COVARIANCE,
     Calibration,
     pair_of_run,
 )
@@ -49,6 +48,7 @@ from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, POINT
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress

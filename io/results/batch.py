@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
 from telerig.io.results.record import Part, Record
 
@@ -30,7 +30,8 @@ class JobRecord(Part):
     dataset, run : folder of the dataset, and name of the run; "" for a calibration.
     status : "done", "rejected", "failed", "crashed" or "left out".
     words : the result or the reason of a failure, in words.
-    figures : numbers of the result by name, and its "verdict" and "flags" where it has them.
+    figures : numbers of the result by name, and its "verdict" and "flags" where it has them: those
+        of a run, or the codes of the objections to a calibration.
     seconds : duration; None if it is not known.
     host : name of the computer; None if it is not known.
     """
@@ -46,8 +47,12 @@ class JobRecord(Part):
 
     @field_validator("figures")
     @classmethod
-    def _flags_apart(cls, figures: dict[str, Any] | None) -> dict[str, Any] | None:
-        """Versions before 0.2 wrote the flags behind the verdict, in one text."""
+    def _flags_apart(
+        cls, figures: dict[str, Any] | None, info: ValidationInfo
+    ) -> dict[str, Any] | None:
+        """Versions before 0.2 wrote the flags of a run behind the verdict, in one text."""
+        if info.data.get("kind") != "smooth":
+            return figures
         verdict, *flags = str((figures or {}).get("verdict") or "").split() or [""]
         return figures | {"verdict": verdict, "flags": flags} if figures and flags else figures
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -21,6 +20,15 @@ from pydantic import (
 from telerig.arrays import Array
 from telerig.errors import InputError, TelerigError
 from telerig.io.files.csv_table import Column
+from telerig.io.results.findings import (
+    Code,
+    Finding,
+    Status,
+    Verdict,
+    notes_of,
+    objections,
+    verdict_of,
+)
 from telerig.io.results.record import (
     Matrix2,
     Matrix3,
@@ -43,22 +51,6 @@ from telerig.rig.windows import Wall
 _ROUNDED = 1e-6
 """How far rounded digits may take a matrix from being a rotation or symmetric."""
 _AGAIN = "calibrate again (`telerig calibrate`), or name the right results folder"
-
-
-class Status(StrEnum):
-    """Name how far a calibration may be used."""
-
-    GOOD = "GOOD"
-    USABLE = "USABLE, with warnings"
-    REJECTED = "REJECTED"
-    IMPORTED = "IMPORTED"
-
-
-class Verdict(Part):
-    """Hold the verdict on a calibration: its status, and sentences that give the reasons."""
-
-    status: Status
-    reasons: tuple[str, ...] = ()
 
 
 _WIDEST = 10.0
@@ -251,6 +243,7 @@ class Stage(Part):
     chi2_dof : chi-square per degree of freedom of the fit; None where there is none.
     position_sigma_mm, wander_sigma_mm : standard deviation in mm of the carriage's position along
         the axis and perpendicular to it; None where the file does not state it.
+    notes : sentences of files without findings.
     """
 
     axis: Vector3
@@ -270,6 +263,7 @@ class SplitHalves(Part):
 
     views : number of views in each half.
     points_mm, shift_um, sd_um : (points, 3) each.
+    words, agree : in files without findings.
     """
 
     words: str = ""
@@ -281,7 +275,10 @@ class SplitHalves(Part):
 
 
 class Structure(Part):
-    """Check the keys of the tests of the residuals; each may be missing."""
+    """Check the keys of the tests of the residuals; each may be missing.
+
+    words, sound : in files without findings.
+    """
 
     words: tuple[str, ...] = ()
     sound: bool = True
@@ -329,7 +326,7 @@ class Diagnostics(Part):
     """Hold further findings of a calibration, which the report shows.
 
     gauge : how origin, axes and scale were chosen.
-    weak : names of badly determined quantities.
+    weak : sentences on badly determined quantities, in files without findings.
     dots_hull_px : by camera, the corners of the convex hull of the dots that were used, in px.
     tilts_deg : tilts in degrees by name; None where one is not known.
     halves : the split-half check.
@@ -349,7 +346,10 @@ class Diagnostics(Part):
 class CalibrationFile(Record):
     """Hold the content of calibration.json, the result of a calibration.
 
-    verdict : whether the calibration can be used.
+    findings : what the checks found; None in older files, which have sentences only. Read, it is
+        never None: those sentences become findings.
+    verdict, notes : made from the findings: whether the calibration can be used and the objections,
+        and what is no objection. A file whose status is not that of its findings is refused.
     cameras : the calibrated cameras by name; the first camera's frame is the rig frame.
     walls : the refractive window of each camera that has one, by camera name.
     target, views : the calibrated target, and its pose in each view.
@@ -370,6 +370,7 @@ class CalibrationFile(Record):
     units: dict[str, str] = Field(default_factory=dict)
     gauge: str = ""
     medium: str = "air"
+    findings: tuple[Finding, ...] | None = None
     verdict: Verdict
     cameras: dict[Name, CameraRecord] = Field(min_length=1)
     walls: dict[str, dict[str, Any]] = Field(default_factory=dict)
@@ -390,6 +391,37 @@ class CalibrationFile(Record):
         except (KeyError, TypeError, TelerigError) as error:
             raise ValueError(f"lacks or garbles {error}"[:200]) from error
         return self
+
+    @model_validator(mode="after")
+    def _says_what_was_found(self) -> Self:
+        findings = self._earlier_findings() if self.findings is None else self.findings
+        verdict = verdict_of(findings)
+        if self.findings is not None and verdict.status != self.verdict.status:
+            against = ", ".join(finding.code.name for finding in objections(findings))
+            raise ValueError(
+                f"the status is {self.verdict.status}, but the findings make it {verdict.status} "
+                f"({against or 'there is no objection'})"
+            )
+        said = {"findings": findings, "verdict": verdict, "notes": notes_of(findings)}
+        return self.model_copy(update=said)
+
+    def _earlier_findings(self) -> tuple[Finding, ...]:
+        """Return the sentences of a file without findings as findings.
+
+        What such a version printed as a warning is an objection, also where it said GOOD.
+        """
+        status, found = self.verdict.status, self.diagnostics
+        halves = SplitHalves.model_validate(found.halves)
+        structure = Structure.model_validate(found.structure)
+        against = [*self.verdict.reasons] or [status] * (status != Status.GOOD)
+        warned = [*[halves.words] * (not halves.agree), *structure.words * (not structure.sound)]
+        said = (*structure.words, halves.words, *found.weak, *self.notes)
+        said += () if self.stage is None else self.stage.notes
+        codes = {Status.REJECTED: Code.EARLIER_REJECTION, Status.IMPORTED: Code.NO_UNCERTAINTY}
+        code_of = dict.fromkeys(filter(None, said), Code.NOTE)
+        code_of |= dict.fromkeys(warned, Code.EARLIER_REASON)
+        code_of |= dict.fromkeys(against, codes.get(status, Code.EARLIER_REASON))
+        return tuple(Finding(code=code, text=words) for words, code in code_of.items())
 
     @field_validator("statistics")
     @classmethod

@@ -15,7 +15,6 @@ import telerig
 from telerig.errors import TelerigWarning
 from telerig.estimator.calibration.quality.comparison import compare_calibrations
 from telerig.estimator.calibration.result.calibration import (
-    NO_COVARIANCE,
     Calibration,
     calibration_from_cameras,
 )
@@ -25,6 +24,7 @@ from telerig.estimator.smoothing.problem.problem import SmoothingProblem
 from telerig.estimator.smoothing.problem.tables import calibration_share
 from telerig.estimator.smoothing.terminal_summary import smoothing_words
 from telerig.estimator.tracking.tracks import Tracks, load_tracks, tracking_words
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, tracks_columns
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.pose import Pose

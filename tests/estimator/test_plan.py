@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import NO_COVARIANCE, calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.plan import (
     Experiment,
     centre_sigma_px,
@@ -22,6 +22,7 @@ from telerig.estimator.plan import (
     planned_problem,
     variants,
 )
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset

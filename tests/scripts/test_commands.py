@@ -183,7 +183,7 @@ def test_image_without_dots_is_left_out_with_the_reason(small_copy):
     path = images(small_copy, "left")[2]
     spoil(path, lambda image: np.full_like(image, 40))
     text = run("calibrate", small_copy, "--quiet")
-    assert f"view {path.stem}, camera left is left out: no dots found" in text
+    assert f"note: view {path.stem!r}, camera 'left' is left out: no dots found" in text
 
 
 def test_dots_merged_by_glare_are_rejected_and_the_rest_used(small_copy):

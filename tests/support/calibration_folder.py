@@ -19,7 +19,7 @@ from telerig.rig.pose import Pose, rotation_from_rotvec
 SIGMA_PX, BUMP_MM = 0.01, 0.05
 SECTIONS = [
     *("verdict", "key", "parameters", "pose", "model", "residuals", "coverage", "worst", "target"),
-    *("overlays", "dot", "rig", "twin", "weak", "more", "origin"),
+    *("overlays", "dot", "rig", "twin", "notes", "more", "origin"),
 ]
 OPTIONAL = ("dots.csv", "covariance.npz", "run.json", "dot_example.npz", "overlays")
 

@@ -1,4 +1,4 @@
-"""Checks before and after a self-calibration: refuse, warn, and say what is poorly determined.
+"""Checks before and after a self-calibration: what is refused, weak or contradicts rig.toml.
 
 The last ones test that each view is one placement of the target, which all cameras saw at the same
 time.
@@ -29,42 +29,18 @@ from telerig.estimator.calibration.start.known_target import (
 )
 from telerig.estimator.dots.grid.numbering import check_handedness
 from telerig.factors.calibration import State
+from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
 
-RECOMMENDED_VIEWS = 6
-MINIMUM_DOTS = 4
+RECOMMENDED_VIEWS = int(Code.FEW_VIEWS.limit)
+MINIMUM_DOTS = int(Code.UNUSED_VIEWS.limit)
 PARALLEL_DEG = 3.0
-SMALL_TILT_DEG = 10.0
-TOLD_APART = 0.98
-"""Correlation beyond which two parameters can hardly be told apart."""
-NEAR_PARALLEL_DEG = 10.0
-"""Below this angle, where two optical axes come closest is too uncertain to be the origin of lenses
-with perspective: the solver would need hundreds of iterations."""
 PERSPECTIVE = 0.01
 """If kappa * rho (no unit) exceeds this, the image shows the depth of a view. Rho is half
 the diagonal of the field of view, in mm."""
-LOOSE = 0.03
-"""An offset is undetermined if the views determine it less well than the best one by this factor
-or more."""
-OTHER_SCALE = 0.05
-"""If the nominal scales of two cameras differ by less than this share, the scales do not show
-whether the cameras were exchanged."""
 CLEAR_MISFIT = 0.1
 """Largest accepted distance of an image's dots from the map of the target's plane, as a share of
 the dots' spread."""
-
-
-@dataclass(frozen=True)
-class Note:
-    """A sentence for the user.
-
-    code : short name of its subject.
-    affects_verdict : whether the verdict is not GOOD because of it.
-    """
-
-    code: str
-    words: str
-    affects_verdict: bool = False
 
 
 @dataclass(frozen=True)
@@ -73,11 +49,10 @@ class PreCheck:
 
     tilts_deg : by (index of the view, index of the camera) the angle between the target's normal
         and the optical axis.
-    notes : sentences for the user.
     """
 
     tilts_deg: dict[tuple[int, int], float]
-    notes: tuple[Note, ...]
+    findings: tuple[Finding, ...]
 
 
 def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreCheck:
@@ -85,7 +60,7 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
 
     dots_mm : (N, 3) positions of the target's N dots in its frame. unknown_dots : whether these are
     only estimates; then more views are needed.
-    Returns the target's tilt against each camera in degrees, by (view, camera), and notes about
+    Returns the target's tilt against each camera in degrees, by (view, camera), and findings on
     what will be poorly determined. Raises CalibrationError for too
     few views, too few dots or parallel views, and DetectionError for mirrored images of a target
     that is visible from one side only.
@@ -98,41 +73,27 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     _refuse_too_few(problem, usable, stereo=stereo, unknown_dots=unknown_dots)
     if stereo:
         _refuse_thin_links(problem, set(maps))
-    mirrored = _mirrored_note(problem, maps)
+    findings = _mirrored(problem, maps)
     tilts = {k: _tilt_deg(m.jacobian) for k, m in maps.items()}
     _refuse_parallel(problem, maps, usable)
-    notes = mirrored
-    if len(usable) < RECOMMENDED_VIEWS:
-        words = (
-            f"only {len(usable)} views can be used in "
-            f"{_those(problem)}: {RECOMMENDED_VIEWS} or more are "
-            "recommended. With fewer, above all the lens distortion and the dots' positions on "
-            "the target become uncertain (see their standard deviations). Add views"
-        )
-        notes.append(Note("few views", words, affects_verdict=True))
+    if len(usable) < Code.FEW_VIEWS.limit:
+        findings.append(Finding(code=Code.FEW_VIEWS, numbers={"count": len(usable)}))
     for c, camera in enumerate(problem.cameras):
-        mine = np.array([t for (_, k), t in tilts.items() if k == c])
-        if len(mine) and mine.max() < SMALL_TILT_DEG:
-            words = (
-                f"camera {camera.name!r}: no view is tilted by more than {mine.max():.0f} degrees, "
-                "so its scale along the depth is poorly determined; add views tilted by 20-60 "
-                "degrees"
-            )
-            notes.append(Note("small tilts", words, affects_verdict=True))
-        notes += _coverage_note(problem, c)
-    for v, name in enumerate(problem.views):
-        seen = [c for c in range(len(problem.cameras)) if (v, c) in maps]
-        if stereo and len(seen) == 1:
-            camera_name = problem.cameras[seen[0]].name
-            words = (
-                f"view {name!r} can be used in camera {camera_name!r} only, so it does not "
-                "connect the cameras"
-            )
-            notes.append(Note("one camera", words, affects_verdict=True))
-        if not seen:
-            words = f"view {name!r} has fewer than {MINIMUM_DOTS} dots in every camera"
-            notes.append(Note("no camera", words))
-    return PreCheck(tilts, tuple(notes))
+        largest = max((t for (_, k), t in tilts.items() if k == c), default=np.inf)
+        at = (camera.name,)
+        if largest < Code.SMALL_TILTS.limit:
+            numbers = {"tilt_deg": largest}
+            findings.append(Finding(code=Code.SMALL_TILTS, cameras=at, numbers=numbers))
+        cells = _cells_covered(problem, c)
+        if cells < Code.COVERAGE.limit:
+            findings.append(Finding(code=Code.COVERAGE, cameras=at, numbers={"cells": cells}))
+        alone = [n for v, n in enumerate(problem.views) if {k for w, k in maps if w == v} == {c}]
+        if stereo and alone:
+            findings.append(Finding(code=Code.ONE_CAMERA, cameras=at, views=tuple(alone)))
+    unused = [n for v, n in enumerate(problem.views) if v not in {w for w, _ in maps}]
+    if unused:
+        findings.append(Finding(code=Code.UNUSED_VIEWS, views=tuple(unused)))
+    return PreCheck(tilts, tuple(findings))
 
 
 def _refuse_too_few(
@@ -183,19 +144,19 @@ def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
             )
 
 
-def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
-    """Return a note for each camera whose offset relative to the others no view determines.
+def loose_offsets(problem: Problem, state: State) -> list[Finding]:
+    """Return a finding for each camera whose offset relative to the others no view determines.
 
     A view that two telecentric cameras see determines the offset of the two cameras only along the
     common perpendicular of their axes; a view that three cameras see determines the rest. To find
     the offsets that are not determined, the positions of the target are eliminated from the linear
     equations of all offsets; see docs/theory.md. With fewer than three cameras, or with clear
-    perspective in all lenses, there is no note.
+    perspective in all lenses, there is none.
     """
     count = len(problem.cameras)
     kappa_rho = state.intrinsics[:, INDEX["kappa_per_mm"]] * np.array(problem.rho_mm)
     if count < 3 or np.all(np.abs(kappa_rho) > PERSPECTIVE):
-        return ()
+        return []
     turns = np.swapaxes(state.rig_from_camera[:, :3, :3], -1, -2)
     free = offset_freedom(turns)
     normal = np.zeros((free.shape[-1],) * 2)
@@ -207,49 +168,34 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
             left = rows - place @ np.linalg.lstsq(place, rows, rcond=1e-9)[0]
             normal += left.T @ left
     values, vectors = np.linalg.eigh(normal)
-    loose = vectors[:, values < LOOSE**2 * values[-1]]
+    loose = vectors[:, values < Code.OFFSET.limit**2 * values[-1]]
     size = np.linalg.norm(np.einsum("cij,jk->cik", free, loose), axis=1)
     cameras = sorted({int(c) for c in size.argmax(0)}) if size.size else []
-    return tuple(
-        Note(
-            "offset",
-            f"camera {problem.cameras[c].name!r}: no view is seen by this and two other cameras "
-            "at once, so its offset across the common perpendiculars of the optical axes is not "
-            "determined. Points that it sees together with two others are wrong by this offset. "
-            "Add a view that three cameras see at once",
-            affects_verdict=True,
-        )
-        for c in cameras
-    )
+    return [Finding(code=Code.OFFSET, cameras=(problem.cameras[c].name,)) for c in cameras]
 
 
-def exchanged_notes(problem: Problem, state: State) -> tuple[Note, ...]:
-    """Return a note for each two cameras whose folders of images were probably exchanged.
+def exchanged_cameras(problem: Problem, state: State) -> list[Finding]:
+    """Return a finding for each two cameras whose folders of images were probably exchanged.
 
-    The estimated scale of each is near the nominal scale of the other. If the nominal scales differ
-    by less than `OTHER_SCALE`, nothing can be concluded, and there is no note.
+    The estimated scale of each is near the nominal scale of the other. If the nominal scales are
+    alike, nothing can be concluded, and there is none.
     """
     estimated = np.log(state.intrinsics[:, INDEX["scale_px_per_mm"]])
     nominal = np.log([camera["scale_px_per_mm"] for camera in problem.cameras])
-    notes = []
+    findings = []
     for a, b in combinations(range(len(problem.cameras)), 2):
         own = abs(estimated[a] - nominal[a]) + abs(estimated[b] - nominal[b])
         crossed = abs(estimated[a] - nominal[b]) + abs(estimated[b] - nominal[a])
-        if own > OTHER_SCALE and crossed < own / 4:
-            first, second = (problem.cameras[c] for c in (a, b))
+        if own > Code.EXCHANGED.limit and crossed < own / 4:
             scales = [np.exp(logarithm[c]) for logarithm in (estimated, nominal) for c in (a, b)]
-            words = (
-                f"cameras {first.name!r} and {second.name!r} seem to be exchanged: their scales "
-                f"are {scales[0]:.3f} and {scales[1]:.3f} px/mm, rig.toml says {scales[2]:g} and "
-                f"{scales[3]:g}. Check which folder holds the images of which camera: exchanged "
-                "cameras mirror every depth"
-            )
-            notes.append(Note("exchanged cameras", words, affects_verdict=True))
-    return tuple(notes)
+            numbers = dict(zip(("first", "second", "first_stated", "second_stated"), scales))
+            names = tuple(problem.cameras[c].name for c in (a, b))
+            findings.append(Finding(code=Code.EXCHANGED, cameras=names, numbers=numbers))
+    return findings
 
 
-def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[Note]:
-    """Return a note if all images are mirrored; raise DetectionError if only some of them are.
+def _mirrored(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[Finding]:
+    """Return a finding if all images are mirrored; raise DetectionError if only some of them are.
 
     Images that show the target nearly edge on, or whose dots do not fit it, are left out.
     """
@@ -262,12 +208,7 @@ def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> l
     check_handedness(hands, problem.target.two_sided)
     if problem.target.two_sided or not hands or max(hands.values()) > 0:
         return []
-    words = (
-        "every image shows the target as a mirror image of rig.toml: this is right if its rows "
-        "are numbered upwards; but if the cameras' images are flipped, the handedness of every "
-        "helix is wrong"
-    )
-    return [Note("mirrored images", words)]
+    return [Finding(code=Code.MIRRORED)]
 
 
 def _tilt_deg(jacobian: Array) -> float:
@@ -300,21 +241,11 @@ def _refuse_parallel(
         )
 
 
-def _coverage_note(problem: Problem, c: int) -> list[Note]:
-    camera = problem.cameras[c]
-    mine = problem.camera == c
-    if not np.any(mine):
-        words = f"camera {camera.name!r} has no dots at all; check its images and [target]"
-        return [Note("no dots", words)]
-    cells = np.floor(problem.uv_px[mine] / np.array(camera.image_size_px) * 4).astype(int)
-    filled = len({tuple(x) for x in np.clip(cells, 0, 3)})
-    if filled >= 8:
-        return []
-    words = (
-        f"camera {camera.name!r}: dots cover {filled} of 16 parts of the image; elsewhere the "
-        "distortion is extrapolated. Hold the target nearer to the edges in some views"
-    )
-    return [Note("coverage", words)]
+def _cells_covered(problem: Problem, c: int) -> int:
+    """Return in how many of the 4 x 4 parts of a camera's image dots were found."""
+    uv = problem.uv_px[problem.camera == c]
+    cells = np.floor(uv / np.array(problem.cameras[c].image_size_px) * 4).astype(int)
+    return len(np.unique(np.clip(cells, 0, 3), axis=0))
 
 
 def axes_angle_deg(state: State) -> float:
@@ -324,84 +255,43 @@ def axes_angle_deg(state: State) -> float:
     return float(np.degrees(np.arccos(min(abs(axes[0] @ other), 1.0))))
 
 
-def parallel_notes(state: State) -> list[Note]:
-    """Return a note if the optical axes are nearly parallel: `axes_angle_deg`."""
-    if len(state.rig_from_camera) < 2 or axes_angle_deg(state) > NEAR_PARALLEL_DEG:
+def parallel_axes(state: State) -> list[Finding]:
+    """Return a finding if the optical axes are nearly parallel: `axes_angle_deg`."""
+    if len(state.rig_from_camera) < 2 or axes_angle_deg(state) > Code.NEAR_PARALLEL.limit:
         return []
-    words = (
-        f"the optical axes are nearly parallel ({axes_angle_deg(state):.1f} degrees): depth is the "
-        "least precise coordinate of points in space, and two telecentric cameras would not see "
-        "it; 60-90 degrees between the cameras are best"
-    )
-    return [Note("near-parallel axes", words)]
+    return [Finding(code=Code.NEAR_PARALLEL, numbers={"angle_deg": axes_angle_deg(state)})]
 
 
-def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:
-    """Return sentences about parameters of the rig that the views determine poorly.
+def weak_parameters(problem: Problem, joint: JointCovariance) -> list[Finding]:
+    """Return findings on parameters of the rig that the views determine poorly.
 
-    Their standard deviation exceeds half of the prior's, or a correlation exceeds `TOLD_APART`.
+    Their standard deviation is a large share of the prior's, or they are strongly correlated.
     """
     names, covariance = joint.rig_block()
     sd = np.sqrt(np.diag(covariance))
-    out = []
+    found = []
     for camera, free in zip(problem.cameras, problem.free):
         prior = prior_sigma(camera)
-        for name in free:
-            i = names.index(f"{camera.name}.{name}")
-            share = sd[i] / prior[INDEX[name]]
-            if share > 0.5:
-                out.append(
-                    f"{_parameter_words(name)} of camera {camera.name!r} is hardly determined by "
-                    f"these views: its standard deviation is {share:.0%} of that before the fit"
-                )
-    return out + _correlated(names, covariance)
+        for name in (f"{camera.name}.{parameter}" for parameter in free):
+            share = sd[names.index(name)] / prior[INDEX[name.rpartition(".")[2]]]
+            if share > Code.WEAK.limit:
+                found.append(Finding(code=Code.WEAK, names=(name,), numbers={"share": share}))
+    return found + linked_parameters(names, covariance)
 
 
-def _correlated(names: tuple[str, ...], covariance: Array) -> list[str]:
-    """Return a sentence for each group of parameters that are linked by such correlations."""
+def linked_parameters(names: tuple[str, ...], covariance: Array) -> list[Finding]:
+    """Return a finding for each group of parameters that strong correlations link."""
     sd = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
-    correlation = covariance / np.outer(sd, sd)
-    linked = np.abs(correlation) > TOLD_APART
-    count, group = connected_components(linked, directed=False)
-    out = []
-    for k in range(count):
-        members = np.flatnonzero(group == k).tolist()
-        words = [_full_words(names[i]) for i in members]
-        if len(members) == 2:
-            size = correlation[members[0], members[1]]
-            together = "both" if size > 0 else "one and a fall of the other"
-            out.append(
-                f"{words[0]} and {words[1]} can hardly be told apart (correlation {size:+.3f}): "
-                f"a rise of {together} leaves the images almost the same"
-            )
-        elif len(members) > 2:
-            largest = np.max(np.abs(correlation[np.ix_(members, members)] - np.eye(len(members))))
-            out.append(
-                f"{', '.join(words[:-1])} and {words[-1]} can hardly be told apart (correlations "
-                f"up to {largest:.3f}): changed together, they leave the images almost the same"
-            )
-    return out
-
-
-def _full_words(name: str) -> str:
-    camera, _, parameter = name.partition(".")
-    return f"{_parameter_words(parameter)} of camera {camera!r}"
-
-
-_PARAMETER_WORDS = {
-    "scale_px_per_mm": "the scale", "aspect": "the aspect ratio", "skew": "the skew",
-    "centre_u_px": "the image centre (u)", "centre_v_px": "the image centre (v)",
-    "kappa_per_mm": "the residual perspective kappa", "tilt_x": "the sensor tilt (x)",
-    "tilt_y": "the sensor tilt (y)", "image_convergence_per_mm": "the image-side convergence",
-    "wall_x_rad": "the wall's tilt along x", "wall_y_rad": "the wall's tilt along y",
-    "rx_rad": "the inter-camera angle about its x", "ry_rad": "the inter-camera angle about its y",
-    "rz_rad": "the inter-camera angle about its axis", "tx_mm": "the offset along x",
-    "ty_mm": "the offset along y", "tz_mm": "the depth origin",
-}  # fmt: skip
-
-
-def _parameter_words(parameter: str) -> str:
-    return _PARAMETER_WORDS.get(parameter, f"the distortion coefficient {parameter}")
+    correlation = covariance / np.outer(sd, sd) - np.eye(len(sd))
+    count, group = connected_components(np.abs(correlation) > Code.LINKED.limit, directed=False)
+    found = []
+    for members in (np.flatnonzero(group == k) for k in range(count)):
+        if len(members) > 1:
+            among = correlation[np.ix_(members, members)].ravel()
+            numbers = {"correlation": among[np.abs(among).argmax()]}
+            linked = tuple(names[i] for i in members)
+            found.append(Finding(code=Code.LINKED, names=linked, numbers=numbers))
+    return found
 
 
 COPY_CHANCE = 1e-9

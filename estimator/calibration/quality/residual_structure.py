@@ -7,7 +7,7 @@ matrix). The correlations that the fit causes make the tests slightly conservati
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,8 @@ from scipy.special import chdtrc, ndtr
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.problem import Problem
+from telerig.io.results.findings import Code, Finding
 
-UNLIKELY = 1e-3
-"""Probability that any of the tests finds structure in residuals that have none."""
 CELLS = 4
 LEAST_IN_CELL = 5
 _LEAST_DOTS = 3
@@ -27,63 +26,69 @@ _LEAST_DOTS = 3
 class ResidualTest:
     """The result of one test of a camera's residuals.
 
-    name : "region", "direction", "neighbours" or "view".
-    size : size of the effect: for "region" the RMS of the mean residuals in parts of the image, in
-        standard deviations of a residual; for "direction" the relative difference of the variances;
-        for "neighbours" a correlation; for "view" the ratio to the other views.
+    code : of the finding if the test objects.
+    size : size of the effect: for PATTERN the RMS of the mean residuals in parts of the image, in
+        standard deviations of a residual; for DIRECTION the relative difference of the variances;
+        for NEIGHBOURS a correlation; for WORSE_VIEWS the ratio to the other views.
     p_value : probability that chance alone gives an effect at least as large.
-    words : the finding and its possible causes, for the user.
+    numbers : of the finding.
+    view : the tested view; "" for all views.
     """
 
-    name: str
+    code: Code
     camera: str
     size: float
     p_value: float
-    words: str
+    numbers: dict[str, float]
+    view: str = ""
 
 
-def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[str, Any]:
+def residual_tests(
+    problem: Problem, whitened: Array, leverage: Array
+) -> tuple[dict[str, Any], list[Finding]]:
     """Test whether the residuals of a calibration have any structure left.
 
     whitened : (M, 2) whitened residuals in the order of ``problem.observations()``. leverage : (M,
     2, 2) covariance of each whitened prediction, the share of the noise that the fit absorbs.
-    Returns the content of `Calibration.diagnostics`, entry "structure": "sound" (whether no test
-    found anything), "words" (sentences), "tests" (the fields of each `ResidualTest`) and "widening"
-    (of the standard deviations, see `_regions`; 1 without a pattern in the image).
+    Returns the content of `Calibration.diagnostics`, entry "structure", and the findings. The entry
+    has "tests" (`ResidualTest`) and "widening" (of the standard deviations, see `_regions`; 1
+    without a pattern in the image).
     """
     obs = problem.observations()
     standardised = standardised_residuals(whitened, leverage)
     share = 1 - float(np.trace(leverage, axis1=-2, axis2=-1).mean()) / 2
     tests: list[ResidualTest] = []
-    widening = {"": 1.0}
     for c, camera in enumerate(problem.cameras):
         mine = obs.camera == c
         if mine.sum() < 2 * LEAST_IN_CELL:
             continue
         values, uv = standardised[mine], obs.uv_px[mine]
-        region, power = _regions(
-            camera.name, values, uv, camera.image_size_px, len(problem.free[c])
-        )
-        tests.append(region)
-        if region.p_value < UNLIKELY / len(problem.cameras):
-            widening[camera.name] = power
+        free = len(problem.free[c])
+        tests.append(_regions(camera.name, values, uv, camera.image_size_px, free))
         tests.append(_direction(camera.name, values, share))
         tests.append(_neighbours(camera.name, values, uv, obs.view[mine]))
         tests += _views(camera.name, values, obs.view[mine], problem.views)
-    limit = UNLIKELY / max(len(tests), 1)
-    found = [t for t in tests if t.p_value < limit or (t.name == "region" and t.camera in widening)]
-    words = [t.words for t in found] or ["no structure is left in the residuals"]
-    widest = float(np.sqrt(max(widening.values())))
-    if widest > 1:
-        words.append(
-            f"because of this pattern every standard deviation has been multiplied by {widest:.2g}"
+    shared = {Code.PATTERN: len(problem.cameras)}
+    objecting = [t for t in tests if t.p_value < t.code.limit / shared.get(t.code, len(tests))]
+    widening = max((t.numbers.get("widening", 1.0) for t in objecting), default=1.0)
+    findings = [
+        Finding(code=t.code, cameras=(t.camera,), numbers=t.numbers | {"widening": widening})
+        for t in objecting if not t.view
+    ]  # fmt: skip
+    for name in dict.fromkeys(t.camera for t in objecting if t.view):
+        worse = {t.view: t.size for t in objecting if t.view and t.camera == name}
+        ratio = {"ratio": max(worse.values())}
+        findings.append(
+            Finding(code=Code.WORSE_VIEWS, cameras=(name,), views=tuple(worse), numbers=ratio)
         )
-    return {
-        "sound": not found,
-        "words": words,
-        "tests": [asdict(t) for t in tests],
-        "widening": widest,
-    }
+    rows = [
+        {
+            "code": t.code.name, "camera": t.camera, "view": t.view, "size": t.size,
+            "p_value": t.p_value,
+        }
+        for t in tests
+    ]  # fmt: skip
+    return {"tests": rows, "widening": widening}, findings or [Finding(code=Code.NO_STRUCTURE)]
 
 
 def standardised_residuals(whitened: Array, leverage: Array) -> Array:
@@ -102,13 +107,13 @@ def standardised_residuals(whitened: Array, leverage: Array) -> Array:
 
 def _regions(
     camera: str, values: Array, uv_px: Array, size_px: tuple[int, int], parameters: int
-) -> tuple[ResidualTest, float]:
+) -> ResidualTest:
     """Test whether residuals (M, 2) point the same way in a part of the image (lens model).
 
-    Also returns the design effect (Kish, Survey Sampling, 1965): the variance of the means over the
-    cells, over that of independent residuals. A smooth error of the lens model that has as much
-    power in the degrees of freedom that the lens ``parameters`` absorb shifts these by so much
-    more than independent errors of the dots would.
+    The square of "widening" is the design effect (Kish, Survey Sampling, 1965): the variance of the
+    means over the cells, over that of independent residuals. A smooth error of the lens model that
+    has as much power in the degrees of freedom that the lens ``parameters`` absorb shifts these by
+    so much more than independent errors of the dots would.
     """
     cell = np.clip((uv_px + 0.5) / np.array(size_px) * CELLS, 0, CELLS - 1).astype(int)
     index = cell[:, 1] * CELLS + cell[:, 0]
@@ -123,12 +128,11 @@ def _regions(
     worst = np.flatnonzero(full)[int(lengths.argmax())]
     row, column = divmod(int(worst), CELLS)
     size = float(np.sqrt((mean**2).mean()))
-    words = (
-        f"camera {camera}: residuals point the same way in parts of the image (most in row "
-        f"{row + 1}, column {column + 1} of {CELLS} x {CELLS}, {lengths.max():.1f} sd), so the "
-        "lens model lacks a term; try a richer --model"
-    )
-    return ResidualTest("region", camera, size, p, words), max(effect, 1.0)
+    numbers = {
+        "row": row + 1, "column": column + 1, "cells": CELLS, "largest_sd": float(lengths.max()),
+        "widening": max(float(np.sqrt(effect)), 1.0),
+    }  # fmt: skip
+    return ResidualTest(Code.PATTERN, camera, size, p, numbers)
 
 
 def _direction(camera: str, values: Array, share: float) -> ResidualTest:
@@ -138,13 +142,11 @@ def _direction(camera: str, values: Array, share: float) -> ResidualTest:
     half, cross = 0.5 * float((u**2 - v**2).mean()) / mean, float((u * v).mean()) / mean
     length = np.hypot(half, cross)
     p = float(chdtrc(2, share * len(values) * length**2))
-    angle = np.degrees(0.5 * np.arctan2(cross, half)) % 180
-    ratio = np.sqrt((1 + length) / max(1 - length, 1e-3))
-    words = (
-        f"camera {camera}: residuals are {ratio:.2f} times longer along {angle:.0f} degrees (from "
-        "u towards v). Possible causes: motion during the exposure, a sensor read line by line"
-    )
-    return ResidualTest("direction", camera, float(length), p, words)
+    numbers = {
+        "angle_deg": float(np.degrees(0.5 * np.arctan2(cross, half)) % 180),
+        "ratio": float(np.sqrt((1 + length) / max(1 - length, 1e-3))),
+    }
+    return ResidualTest(Code.DIRECTION, camera, float(length), p, numbers)
 
 
 def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> ResidualTest:
@@ -166,16 +168,11 @@ def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> Residua
         expected.append(((r.sum(0) ** 2).sum() - squares.sum()) / (n * (n - 1)))
         spread.append(2.0 * 1.5 / n)  # unit variances; mutual neighbours count twice
     if not near:
-        return ResidualTest("neighbours", camera, 0.0, 1.0, "")
+        return ResidualTest(Code.NEIGHBOURS, camera, 0.0, 1.0, {})
     excess = float(np.mean(np.subtract(near, expected)))
     sd = float(np.sqrt(np.sum(spread)) / len(spread))
     p = float(ndtr(-excess / sd))
-    words = (
-        f"camera {camera}: residuals of neighbouring dots correlate ({excess / 2:.2f}). Possible "
-        "causes: a plate that bends from view to view, refraction, a lens error finer than the "
-        "model"
-    )
-    return ResidualTest("neighbours", camera, excess / 2, p, words)
+    return ResidualTest(Code.NEIGHBOURS, camera, excess / 2, p, {"correlation": excess / 2})
 
 
 def _views(camera: str, values: Array, view: Ints, names: tuple[str, ...]) -> list[ResidualTest]:
@@ -189,9 +186,5 @@ def _views(camera: str, values: Array, view: Ints, names: tuple[str, ...]) -> li
             continue
         p = float(chdtrc(2 * len(mine), mine.sum()))
         size = float(np.sqrt(mine.mean() / 2))
-        words = (
-            f"view {names[v]!r}, camera {camera}: residuals are {size:.1f} times those of the "
-            "other views. Is the image blurred or badly lit, or did the target move?"
-        )
-        out.append(ResidualTest("view", camera, size, p, words))
+        out.append(ResidualTest(Code.WORSE_VIEWS, camera, size, p, {"ratio": size}, names[v]))
     return out

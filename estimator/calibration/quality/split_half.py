@@ -15,10 +15,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.quality.comparison import (
-    UNLIKELY,
-    FieldDifference,
     Rig,
-    chance_words,
     field_difference,
 )
 from telerig.estimator.calibration.solver.covariance import joint_covariance
@@ -26,54 +23,62 @@ from telerig.estimator.calibration.solver.problem import Problem, cameras_from_s
 from telerig.estimator.calibration.solver.robust_least_squares import LEAST_DOTS, solve
 from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.calibration import State
-from telerig.short_text import number
+from telerig.io.results.findings import Code, Finding
 
 LEAST_VIEWS = 4
 """Least number of views in each half; fewer do not determine a rig."""
 _SCALE = 1e-7
 
 
-def split_half_check(problem: Problem, state: State, widening: float = 1.0) -> dict[str, Any]:
+def split_half_check(
+    problem: Problem, state: State, widening: float = 1.0
+) -> tuple[dict[str, Any], list[Finding]]:
     """Calibrate from each half of the views and compare the two rigs.
 
     state : the solution with all views. widening : factor by which the stated standard deviations
     are larger than those of ``problem``, because of a pattern in the residuals.
-    Returns the content of `Calibration.diagnostics`, entry "halves": "words" and, if the check was
-    possible, the number of views of each half, the RMS difference of points and its prediction (µm
-    per axis), the p-value, "agree", and the differences at a grid of points.
+    Returns the content of `Calibration.diagnostics`, entry "halves", and the finding. The entry is
+    empty if the check was not possible; else it has the number of views of each half, the RMS
+    difference of points and its prediction (µm per axis), the p-value, and the differences at a
+    grid of points.
     Both halves use the same size of the target, so the check says nothing about this size: the
     known distance of two dots, or else the estimated distance of two dots far apart, is taken as
     exact in both.
     """
     if len(problem.cameras) < 2:
-        return {"words": "one camera: the split-half check compares points in space and needs two"}
+        return _not_compared("it compares points in space, which one camera does not see")
     used = _in_turn(problem)
     parts = [used[0::2], used[1::2]]
     if min(len(p) for p in parts) < LEAST_VIEWS:
-        return {
-            "words": f"{len(used)} views are too few for the split-half check: it needs "
-            f"{2 * LEAST_VIEWS} or more"
-        }
+        return _not_compared(f"{len(used)} views are too few, it needs {2 * LEAST_VIEWS} or more")
     problem = replace(problem, scale=problem.scale or _size(problem, state, parts))
     try:
         first, second = (_rig(problem, state, views) for views in parts)
     except CalibrationError as error:
-        return {
-            "words": "the split-half check was not possible, because one half of the views does "
-            f"not determine the rig: {error.what}"
-        }
+        return _not_compared(f"one half of the views does not determine the rig: {error.what}")
     field = field_difference(first, second)
-    return {
+    compared = {
+        "rms_um": field.rms_um, "predicted_um": field.predicted_um, "p_value": field.p_value
+    }  # fmt: skip
+    ratio = field.rms_um / max(field.predicted_um, 1e-12)
+    numbers = {
+        "first": len(parts[0]),
+        "second": len(parts[1]),
+        "ratio": ratio,
+        "widening": widening,
+    }
+    agree = field.p_value >= Code.HALVES_DISAGREE.limit
+    code = Code.HALVES_AGREE if agree else Code.HALVES_DISAGREE
+    return compared | {
         "views": [len(p) for p in parts],
-        "rms_um": field.rms_um,
-        "predicted_um": field.predicted_um,
-        "p_value": field.p_value,
-        "agree": bool(field.p_value >= UNLIKELY),
-        "words": _words(field, [len(p) for p in parts], widening),
         "points_mm": np.round(field.points_mm, 4).tolist(),
         "shift_um": np.round(1e3 * field.shift_mm, 4).tolist(),
         "sd_um": np.round(1e3 * field.sd_mm, 4).tolist(),
-    }
+    }, [Finding(code=code, numbers=compared | numbers)]
+
+
+def _not_compared(why: str) -> tuple[dict[str, Any], list[Finding]]:
+    return {}, [Finding(code=Code.HALVES_NOT_COMPARED, text=why)]
 
 
 def _size(
@@ -129,26 +134,3 @@ def _images(problem: Problem) -> set[tuple[int, int]]:
         np.stack([problem.view[kept], problem.camera[kept]], 1), axis=0, return_counts=True
     )
     return {(int(v), int(c)) for v, c in images[counts >= LEAST_DOTS]}
-
-
-def _words(field: FieldDifference, views: list[int], widening: float) -> str:
-    ratio = field.rms_um / max(field.predicted_um, 1e-12)
-    apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
-    words = (
-        f"of two calibrations, one from {views[0]} and one from the other {views[1]} views, points "
-        f"triangulated from the same pixels differ by {apart} µm RMS per axis; their covariances "
-        f"predict {expected} µm"
-    )
-    if field.p_value >= UNLIKELY:
-        return words + f" (ratio {ratio:.2f}), so the stated covariance can be believed"
-    stated = "every stated standard deviation is too small by about this ratio"
-    if widening > 1:
-        stated = (
-            f"every stated standard deviation is {widening:.2g} times larger than predicted here, "
-            "because of the pattern in the residuals"
-        )
-    return (
-        words + f" (ratio {ratio:.2f}; {chance_words(field.p_value)}): the two halves "
-        "disagree, so an effect that the model does not contain acts on the images; "
-        f"{stated}. Look for a pattern in residuals.csv, and try --model auto"
-    )

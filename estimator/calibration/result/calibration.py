@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import xarray
 
     from telerig.io.results.calibration import CalibrationFile, CameraRecord
+    from telerig.io.results.findings import Finding
 
 _AT_ONCE = 8192
 
@@ -53,10 +54,10 @@ class Calibration(ShortText):
         rotation (rad) and translation (mm) of the pose of each camera but the first.
         covariance_names : of these P parameters, with units.
     free : for each camera, the names of its free intrinsics.
-    verdict : "status" (a word) and "reasons" (sentences).
+    findings : what the checks found; None if nothing was checked. The verdict and the notes are
+        made from it.
     statistics, twin, model, diagnostics : the parts of `calibration.json` with these names
         (`docs/files.md`); "twin" is the mirror ambiguity.
-    notes : sentences for the user.
     stage : `StageAxis.as_dict`; empty if it is not known.
     medium : "air" or "water", in which the target was. With refractive windows, points that are
         projected or triangulated lie in the water behind them.
@@ -73,12 +74,11 @@ class Calibration(ShortText):
     covariance_names: tuple[str, ...]
     free: tuple[tuple[str, ...], ...]
     name: str = ""
-    verdict: Mapping[str, Any] = field(default_factory=dict)
+    findings: tuple[Finding, ...] | None = None
     statistics: Mapping[str, Any] = field(default_factory=dict)
     twin: Mapping[str, Any] = field(default_factory=dict)
     model: Mapping[str, Any] = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
     stage: Mapping[str, Any] = field(default_factory=dict)
     medium: str = "air"
     joint_names: tuple[str, ...] = ()
@@ -93,6 +93,23 @@ class Calibration(ShortText):
         Unknown ones stand as zeros in ``covariance``, and as NaN in `sd`.
         """
         return bool(np.any(self.covariance))
+
+    @property
+    def verdict(self) -> dict[str, Any]:
+        """Return "status" (a word) and "reasons" (the objections); empty if nothing was checked."""
+        from telerig.io.results.findings import verdict_of
+
+        if self.findings is None:
+            return {}
+        found = verdict_of(self.findings)
+        return {"status": str(found.status), "reasons": list(found.reasons)}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return the sentences on what was found and is no objection."""
+        from telerig.io.results.findings import notes_of
+
+        return notes_of(self.findings or ())
 
     def title(self) -> str:
         """Return the name of the rig and the verdict."""
@@ -477,7 +494,8 @@ class Calibration(ShortText):
             "units": {"length": "mm", "image": "px", "angle": "rad unless the name ends in _deg"},
             "gauge": self.diagnostics.get("gauge", ""),
             "medium": self.medium,
-            "verdict": plain(dict(self.verdict)),
+            "verdict": self.verdict,
+            "findings": self.findings,
             "cameras": {c.name: self._camera_record(c, f) for c, f in zip(self.cameras, self.free)},
             "walls": {c.name: c.wall.as_dict() for c in self.cameras if c.wall is not None},
             "target": {"dots": self.dot_ids, "points_mm": self.target_points_mm},
@@ -488,7 +506,6 @@ class Calibration(ShortText):
             "twin": plain(dict(self.twin)),
             "statistics": dict(self.statistics),
             "diagnostics": plain(dict(self.diagnostics)),
-            "notes": self.notes,
         }
         return CalibrationFile.model_validate(content)
 
@@ -578,12 +595,11 @@ def load_calibration(path: str | Path) -> Calibration:
         covariance_names=record.covariance.names,
         free=tuple(camera.free for camera in record.cameras.values()),
         name=record.name,
-        verdict=record.verdict.content(),
+        findings=record.findings,
         statistics=record.statistics,
         twin=record.twin.content(),
         model=record.model.content(),
         diagnostics=record.diagnostics.content(),
-        notes=record.notes,
         stage={} if record.stage is None else record.stage.content(),
         medium=record.medium,
         joint_names=names,
@@ -636,12 +652,6 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
     )
 
 
-NO_COVARIANCE = (
-    "the uncertainty of the imported calibration is unknown and taken as zero, so standard "
-    "deviations of points contain the noise of the pixels only"
-)
-
-
 def calibration_from_cameras(
     cameras: Sequence[Camera],
     *,
@@ -656,9 +666,11 @@ def calibration_from_cameras(
     notes : further sentences for the user, for example the names of the cameras' files.
 
     The result has no free intrinsics, and the covariance of its poses is zero and not known; its
-    first note says so. Raises CalibrationError if there is no camera, if two have the
-    same name, if the first frame is not the rig frame, or if sigma_px is not positive.
+    verdict, which is IMPORTED, says so. Raises CalibrationError if there is no camera, if two have
+    the same name, if the first frame is not the rig frame, or if sigma_px is not positive.
     """
+    from telerig.io.results.findings import Code, Finding
+
     names = [c.name for c in cameras]
     if not names or len(set(names)) != len(names):
         raise CalibrationError(
@@ -683,9 +695,11 @@ def calibration_from_cameras(
         covariance_names=pose_names,
         free=tuple(() for _ in cameras),
         name=name,
-        verdict={"status": "IMPORTED", "reasons": [NO_COVARIANCE]},
+        findings=(
+            Finding(code=Code.NO_UNCERTAINTY),
+            *(Finding(code=Code.NOTE, text=note) for note in notes),
+        ),
         model={"words": "imported and held fixed"},
-        diagnostics={"gauge": "as imported", "weak": []},
+        diagnostics={"gauge": "as imported"},
         statistics={"scatter_px": float(sigma_px)},
-        notes=(NO_COVARIANCE, *notes),
     )

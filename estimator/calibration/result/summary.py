@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from telerig.io.results.telecentricity_words import telecentricity_words
+from telerig.io.results.calibration_words import telecentricity_words
 
 if TYPE_CHECKING:
     from telerig.io.results.calibration import CalibrationFile
@@ -13,11 +13,16 @@ if TYPE_CHECKING:
 def summary(calibration: CalibrationFile) -> str:
     """Return the summary of a `calibration.json` as text: verdict, residuals, parameters, notes."""
     s = calibration.statistics
-    if "views" not in s:
-        return _imported(calibration)
     lines = [f"Calibration {calibration.name!r}: {calibration.verdict.status}"]
     lines += [f"  {words}" for words in telecentricity_words(s)]
     lines += [f"  ! {reason}" for reason in calibration.verdict.reasons]
+    lines += _numbers(calibration) if "views" in s else _imported(calibration)
+    return "\n".join(lines + [f"  note: {note}" for note in calibration.notes])
+
+
+def _numbers(calibration: CalibrationFile) -> list[str]:
+    """Return the lines on residuals, parameters, accuracy and the mirror ambiguity."""
+    s, lines = calibration.statistics, list[str]()
     lines.append(
         f"  {s['views']} views, {s['dots_kept']} of {s['dots_measured']} dots kept "
         f"({s['share_kept']:.1%}), residual {s['rms_px']:.4f} px RMS per coordinate, "
@@ -49,7 +54,6 @@ def summary(calibration: CalibrationFile) -> str:
             f"  in space: dots {s['space_rms_um']:.2f} µm RMS from the fit; a point triangulated "
             f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} µm per axis"
         )
-    lines += _trust(calibration)
     advice = calibration.diagnostics.next_view
     lines += [f"  {advice['words']}"] if advice else []
     t = calibration.twin
@@ -57,33 +61,17 @@ def summary(calibration: CalibrationFile) -> str:
         f"  mirror ambiguity: cost {_cost(t.cost)} of the kept solution, {_cost(t.other_cost)} of "
         f"its mirror image; decided by {t.decided_by}: {t.words}"
     )
-    if calibration.stage is not None:
-        lines += [f"  stage: {word}" for word in calibration.stage.notes]
-    said = calibration.verdict.reasons
-    notes = (*calibration.notes, *calibration.diagnostics.weak)
-    lines += [f"  note: {note}" for note in notes if note not in said]
-    return "\n".join(lines)
+    return lines
 
 
 def _cost(cost: float | None) -> str:
     return "unknown" if cost is None else f"{cost:.9g}"
 
 
-def _trust(calibration: CalibrationFile) -> list[str]:
-    """Return the lines about the split-half check and about the structure of the residuals."""
-    halves = calibration.diagnostics.halves
-    structure = calibration.diagnostics.structure
-    lines = [f"  {'' if halves.get('agree', True) else '! '}{halves['words']}"] if halves else []
-    mark = "" if structure.get("sound", True) else "! "
-    return lines + [f"  {mark}{words}" for words in structure.get("words", ())]
-
-
-def _imported(calibration: CalibrationFile) -> str:
-    """Return the summary of cameras that another program calibrated: scale, kappa and notes."""
-    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.status}"]
-    for name, camera in calibration.cameras.items():
-        lines.append(
-            f"  camera {name}: {camera.parameters['scale_px_per_mm']:.6g} px/mm, "
-            f"kappa {camera.parameters['kappa_per_mm']:.4g} per mm"
-        )
-    return "\n".join(lines + [f"  note: {note}" for note in calibration.notes])
+def _imported(calibration: CalibrationFile) -> list[str]:
+    """Return the lines on cameras that another program calibrated: scale and kappa."""
+    return [
+        f"  camera {name}: {camera.parameters['scale_px_per_mm']:.6g} px/mm, "
+        f"kappa {camera.parameters['kappa_per_mm']:.4g} per mm"
+        for name, camera in calibration.cameras.items()
+    ]

@@ -24,6 +24,7 @@ from telerig.estimator.calibration.lens.choice import pose_only
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
+from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
 
@@ -77,6 +78,19 @@ def angle_to_nominal_deg(state: State, nominal_rotvec_deg: Nominal) -> float:
         _angle_deg(state.rig_from_camera[c, :3, :3].T, rotvec_deg)
         for c, rotvec_deg in nominal_rotvec_deg.items()
     )
+
+
+def far_rotations(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> list[Finding]:
+    """Return a finding for each camera whose rotation is far from the nominal one."""
+    first, found = problem.cameras[0].name, []
+    for c, rotvec_deg in nominal_rotvec_deg.items():
+        angle, name = angle_to_nominal_deg(state, {c: rotvec_deg}), problem.cameras[c].name
+        if angle > Code.ROTATION_FAR.limit:
+            stated, numbers = f"{name}_from_{first}_rotvec_deg", {"angle_deg": angle}
+            found.append(
+                Finding(code=Code.ROTATION_FAR, cameras=(name,), names=(stated,), numbers=numbers)
+            )
+    return found
 
 
 def _angle_deg(rotation: Array, nominal_rotvec_deg: Array) -> float:

@@ -17,15 +17,18 @@ from telerig.estimator.calibration.solver.robust_least_squares import robust_sol
 from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.factors.calibration import State, whitened_residuals
+from telerig.io.results.findings import Code, Finding
 from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
 
 TIE_DEG = 15.0
 
 
-def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[Problem, list[str]]:
+def number_consistently(
+    problem: Problem, nominal_rotvec_deg: Nominal
+) -> tuple[Problem, list[Finding]]:
     """Renumber the dots of a symmetric target such that all cameras and views agree.
 
-    Returns the problem with the new numbers, and notes for the user on how they were decided.
+    Returns the problem with the new numbers, and findings on how they were decided.
     Raises CalibrationError if two numberings explain the images of two cameras equally well, and
     for an unbounded target: how its dots change places is not known, as its grid has no middle.
     """
@@ -43,25 +46,12 @@ def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[
     problem, contrast = _numbered_alike_in_views(problem, labels)
     problem = replace(problem, scale=known_scale(problem.target, problem.dot_ids))
     problem, about_scale = _scale_of_any_turn(problem, labels)
-    cameras = "both cameras" if len(problem.cameras) <= 2 else "all cameras"
-    many = f"{len(labels)}-fold symmetric target without marks"
-    if contrast > 3:
-        return problem, [
-            f"{many}: numbered so that {cameras} and all views agree. The dots' print errors show "
-            f"by which angle the target is turned in each view ({contrast:.0f} standard "
-            "deviations in the least certain view)",
-            *about_scale,
-        ]
-    return problem, [
-        f"{many}: {cameras} agree within each view. The dots' print errors are too small to show "
-        f"by which angle the target is turned between views ({contrast:.1f} standard deviations "
-        "in the least certain view), so each estimated position may be an average over several "
-        "dots. Marks on the target would avoid this",
-        *about_scale,
-    ]
+    numbers = {"turns": len(labels), "contrast_sd": contrast}
+    code = Code.TURNS_KNOWN if contrast > Code.TURNS_UNKNOWN.limit else Code.TURNS_UNKNOWN
+    return problem, [Finding(code=code, numbers=numbers), *about_scale]
 
 
-def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, list[str]]:
+def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, list[Finding]]:
     """Return the known distance, less certain where a turn puts other dots in place of its two."""
     if problem.scale is None:
         return problem, []
@@ -70,13 +60,9 @@ def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, l
     if all(set(label[ends]) == set(ends) for label in labels):
         return problem, []
     either = float(np.hypot(sigma, np.sqrt(2) * problem.target.print_sigma_mm))
-    words = (
-        f"the stated distance of dots {tuple(int(e) for e in ends)} may belong to two other dots, "
-        "because the symmetric target may be turned. The standard deviation of the distance is "
-        f"therefore taken as {1e3 * either:.0f} µm. State the distance of two dots that are "
-        "opposite each other, or put marks on the target"
-    )
-    return replace(problem, scale=(pair, distance, either)), [words]
+    numbers = {"first": int(ends[0]), "second": int(ends[1]), "sd_um": 1e3 * either}
+    finding = Finding(code=Code.TURNED_DISTANCE, numbers=numbers)
+    return replace(problem, scale=(pair, distance, either)), [finding]
 
 
 def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:

@@ -24,10 +24,10 @@ from telerig.io.report.calibration.target import target_pictures
 from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
 from telerig.io.report.page.figures import Picture
 from telerig.io.report.page.page import drawn_over_cores, render_page
-from telerig.io.results.calibration import Status
+from telerig.io.results.calibration_words import telecentricity_words
+from telerig.io.results.findings import TRUST, Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
-from telerig.io.results.telecentricity_words import telecentricity_words
 from telerig.short_text import ABSENT, flat_rows, sentence
 
 _COLOURS = {
@@ -37,9 +37,8 @@ _COLOURS = {
     Status.IMPORTED: "usable",
 }
 _SHOWN = {
-    "schema", "kind", "name", "pixel_origin", "units", "gauge", "verdict", "cameras", "target",
-    "views", "covariance", "model", "twin", "statistics", "diagnostics", "notes",
-    "stage",
+    "schema", "kind", "name", "pixel_origin", "units", "gauge", "findings", "verdict", "cameras",
+    "target", "views", "covariance", "model", "twin", "statistics", "diagnostics", "notes", "stage",
 }  # fmt: skip
 
 
@@ -80,11 +79,9 @@ def render(
 def _words(results: CalibrationResults) -> dict[str, Any]:
     file = results.file
     costs = (file.twin.cost, file.twin.other_cost)
-    # Folders of before have no split-half check and no residual tests.
-    halves, structure = results.file.diagnostics.halves, results.file.diagnostics.structure
-    found = [str(halves["words"])] if "words" in halves else []
-    found += [str(words) for words in structure.get("words") or []]
-    found.append(same_everywhere(results))
+    notes = [finding for finding in file.findings or () if finding.status == Status.GOOD]
+    trust = [finding.words for finding in notes if finding.code in TRUST]
+    trust.append(same_everywhere(results))
     return {
         "name": file.name or "calibration",
         "status": file.verdict.status,
@@ -96,10 +93,9 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "twin": file.twin.content(),
         "twin_costs": [ABSENT if c is None else f"{c:.10g}" for c in costs],
         "gauge": file.gauge or ABSENT,
-        "weak": file.diagnostics.weak,
-        "notes": file.notes,
+        "notes": [finding.words for finding in notes if finding.code not in TRUST],
         "absent": results.absent,
-        "trust_words": [sentence(words) for words in found if words],
+        "trust_words": [sentence(words) for words in trust if words],
         "comparison": results.comparison.content(),
         "advice": file.diagnostics.next_view,
         "dots_drawn": dots_are_drawn(results),
@@ -115,7 +111,6 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
         "parameters": tables.parameter_rows(results),
         "pose": tables.pose_rows(results),
         "stage": stage,
-        "stage_words": () if results.file.stage is None else results.file.stage.notes,
         "ladder": tables.ladder_rows(results),
         "worst": tables.worst_rows(results),
         "changes": tables.change_rows(results),

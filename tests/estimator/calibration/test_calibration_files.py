@@ -17,12 +17,14 @@ from telerig.estimator.calibration.result.calibration import (
     calibration_for,
     load_calibration,
 )
+from telerig.io.results.findings import Code, Finding
 
 
 @pytest.fixture(scope="module")
 def calibration(scene: Any) -> Calibration:
     made = scene("near_telecentric", 3, outlier_share=0.02)
-    return made.calibrate("kappa+radial", name="tank 2", notes=["a note"])
+    note = Finding(code=Code.NOTE, text="a note")
+    return made.calibrate("kappa+radial", name="tank 2", findings=[note])
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def assert_same(a: Calibration, b: Calibration) -> None:
     np.testing.assert_array_equal(a.target_points_mm, b.target_points_mm)
     np.testing.assert_array_equal(a.covariance, b.covariance)
     assert a.covariance_names == b.covariance_names
-    assert (a.free, a.name, a.notes) == (b.free, b.name, b.notes)
+    assert (a.free, a.name, a.findings) == (b.free, b.name, b.findings)
     assert list(a.target_poses) == list(b.target_poses)
     for x, y in zip(a.target_poses.values(), b.target_poses.values()):
         np.testing.assert_array_equal(x.rotation, y.rotation)

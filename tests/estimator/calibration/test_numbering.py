@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from finding_codes import codes
 from turned_images import settled, turned
 
 from telerig.errors import CalibrationError
@@ -55,7 +56,7 @@ def test_images_turned_at_random(seed: int, target: Target | None, scene: Any) -
     assert settled(calibration, made, right.dots["dot"]) != []
     assert calibration.statistics["noise_floor_px"] == 0
     assert calibration.statistics["share_kept"] > 0.995
-    assert any("numbered so that both cameras and all views agree" in n for n in calibration.notes)
+    assert "TURNS_KNOWN" in codes(calibration)
 
 
 @pytest.mark.parametrize("turn", [False, True], ids=["numbered alike", "turned at random"])
@@ -98,19 +99,19 @@ def test_a_perfect_print_leaves_the_turns_undecided_but_harmless(scene: Any) -> 
     made, _ = turned(scene("symmetric", 1, print_factor=0.0), 1)
     calibration = made.calibrate("radial")
     assert made.space_rms_um(calibration) < 1.0
-    assert any("too small to show" in n for n in calibration.notes)
+    assert "TURNS_UNKNOWN" in codes(calibration)
 
 
 def test_a_known_distance_that_a_turn_moves_is_trusted_less(scene: Any) -> None:
     """On a square target nobody knows which diagonal was measured."""
     made, _ = turned(scene("symmetric", 2, target=SQUARE), 2)
     calibration = made.calibrate("radial")
-    assert any("may belong to two other dots" in n for n in calibration.notes)
+    assert "TURNED_DISTANCE" in codes(calibration)
     scale_sd = calibration.sd("left.scale_px_per_mm") / calibration.cameras[0]["scale_px_per_mm"]
     error = calibration.cameras[0]["scale_px_per_mm"] / made.true_cameras["left"]["scale_px_per_mm"]
     assert abs(error - 1) < 3 * scale_sd
     oblong = scene("symmetric", 2).calibrate("radial")
-    assert not any("another pair" in n for n in oblong.notes)
+    assert "TURNED_DISTANCE" not in codes(oblong)
 
 
 @pytest.mark.parametrize("marks", [((0, 0),), ((0, 0), (0, 5))])

@@ -9,13 +9,15 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from finding_codes import codes
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.io.results.telecentricity_words import telecentricity_words
+from telerig.io.results.calibration_words import telecentricity_words
+from telerig.io.results.findings import Code
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.target import Target
@@ -88,7 +90,7 @@ def test_centres_and_angle_are_as_good_as_stated(
         assert lens["change_per_mm"] == pytest.approx(per_mm, rel=0.05)
     first = found.report().splitlines()[1]
     assert "ordinary lenses, not telecentric" in first
-    assert any("nearly parallel" in note for note in found.notes) == (angle_deg < 10)
+    assert ("NEAR_PARALLEL" in codes(found)) == (angle_deg < 10)
     assert ("nearly parallel" in found.diagnostics["gauge"]) == (angle_deg < 10)
 
 
@@ -100,7 +102,8 @@ def test_a_smooth_error_of_the_lens_model_widens_the_standard_deviations(seeds: 
         found = calibrated(3000.0, 45.0, 0.0, seed, wave_px=0.15)
         widening = found.diagnostics["structure"]["widening"]
         assert 3.0 < widening < 8.0
-        assert f"multiplied by {widening:.2g}" in found.report()
+        stated = {f.numbers["widening"] for f in found.findings if f.code is Code.PATTERN}
+        assert stated == {widening}
         for camera, centre in zip(found.cameras, CENTRES):
             for name, truth in zip(("centre_u_px", "centre_v_px"), centre):
                 error = camera.intrinsics[INDEX[name]] - truth
@@ -125,14 +128,14 @@ def test_words_of_lenses_that_are_telecentric_and_not_quite() -> None:
     assert telecentricity_words({}) == []
 
 
-def test_linked_parameters_make_one_sentence_a_group() -> None:
+def test_linked_parameters_make_one_finding_a_group() -> None:
     names = ("left.k1", "left.k2", "left.kappa_per_mm", "right.k1", "right.k2", "right.skew")
     direction = np.array([[1.0, -2.0, 0.5, 0, 0, 0], [0, 0, 0, 1.0, -1.0, 0], [0, 0, 0, 0, 0, 1.0]])
     covariance = direction.T @ direction + 1e-4 * np.eye(6)
-    words = checks._correlated(names, covariance)
-    assert len(words) == 2
-    assert words[0].startswith(
+    first, second = checks.linked_parameters(names, covariance)
+    assert (first.names, second.names) == (names[:3], names[3:5])
+    assert first.words.startswith(
         "the distortion coefficient k1 of camera 'left', the distortion coefficient k2 of camera "
         "'left' and the residual perspective kappa of camera 'left' can hardly be told apart"
     )
-    assert "a rise of one and a fall of the other" in words[1]
+    assert -1 < second.numbers["correlation"] < -0.98

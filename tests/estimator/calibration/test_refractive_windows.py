@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from finding_codes import only
 from numpy.typing import NDArray
 from ray_tracer import trace_pixels
 from typer.testing import CliRunner
@@ -27,7 +28,7 @@ from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.refractive_windows import (
     behind_windows,
     model_error_um,
-    window_notes,
+    window_findings,
     window_warnings,
     with_windows,
 )
@@ -39,6 +40,7 @@ from telerig.io.exchange.export.halcon import halcon_cameras
 from telerig.io.exchange.export.opencv import camera_matrices
 from telerig.io.report.calibration.results import read_results
 from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.findings import Code
 from telerig.io.rig_file.description import WallDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.rig.camera import Camera
@@ -135,11 +137,9 @@ def test_without_the_wall_depth_shears_as_predicted_and_with_it_does_not(
 
 
 def test_the_warnings_say_how_large_the_error_would_be(tank: Path, in_air: Calibration) -> None:
-    words = next(n for n in in_air.notes if "calibrated in air" in n)
     half = 0.5 * 0.6 * 512 / 10.0  # of the working volume
-    stated = float(words.split("up to ")[1].split(" µm")[0])
+    stated = only(in_air, Code.WINDOWS_IN_AIR).numbers["error_um"]
     assert stated == pytest.approx(SHEAR_UM / 30 * half, rel=0.05)
-    assert "up to" in in_air.report()
 
     run = telerig.load_run(tank / "runs" / "rise")
     found = telerig.track(run, in_air.in_air())
@@ -153,22 +153,23 @@ def test_the_warnings_say_how_large_the_error_would_be(tank: Path, in_air: Calib
     assert float(gone.split("up to ")[1].split(" µm")[0]) == pytest.approx(stated, rel=0.05)
 
 
-def test_words_on_walls_are_right(in_air: Calibration) -> None:
+def test_findings_on_walls_are_right(in_air: Calibration) -> None:
     dry = replace(in_air.in_air(), free=in_air.free)
 
-    def said(glass: Wall) -> str:
+    def said(glass: Wall) -> dict[str, dict[str, float]]:
         calibration = behind_windows(dry, {"left": glass})
         described = WallDescription("left", (0.0, 0.0, 1.0), INDICES, 10.0, -60.0)
-        return " ".join(window_notes(calibration, SimpleNamespace(walls={"left": described})))
+        found = window_findings(calibration, SimpleNamespace(walls={"left": described}))
+        return {finding.code.name: finding.numbers for finding in found}
 
-    assert "wrong by less than 0.1 µm" in said(wall(0.0))
-    assert "denser medium" not in said(wall(1.0)) and "off the camera" not in said(wall(1.0))
-    assert "denser medium" in said(replace(wall(1.0), indices=INDICES[::-1]))
-    assert "79 degrees off the camera's axis" in said(wall(79.0))
-    assert "calibrate with the target in the water" in said(wall(0.0, sigma_deg=0.5))
-    assert not window_notes(dry, SimpleNamespace(walls={}))
-    wet = window_notes(replace(dry, medium="water"), SimpleNamespace(walls={}))
-    assert len(wet) == 1 and "no windows ([walls])" in wet[0]
+    assert said(wall(0.0))["WINDOWS_IN_AIR"]["error_um"] < 0.1
+    assert list(said(wall(1.0))) == ["WINDOWS_IN_AIR"]
+    assert "MEDIA_ORDER" in said(replace(wall(1.0), indices=INDICES[::-1]))
+    assert said(wall(79.0))["WINDOW_LEANING"]["angle_deg"] == pytest.approx(79.0)
+    assert said(wall(0.0, sigma_deg=0.5))["WINDOW_NORMAL"]["sd_deg"] == pytest.approx(0.5)
+    assert not window_findings(dry, SimpleNamespace(walls={}))
+    (wet,) = window_findings(replace(dry, medium="water"), SimpleNamespace(walls={}))
+    assert wet.code is Code.NO_WINDOWS
 
 
 def test_the_errors_in_space_hold_the_walls_share(in_air: Calibration) -> None:
@@ -267,8 +268,8 @@ def test_a_sign_that_nothing_decides_is_said(scene: Callable[..., Any]) -> None:
             n: WallDescription(n, (0.0, 0.0, 1.0), INDICES, 10.0, -60.0) for n in stated
         }
         rig = SimpleNamespace(walls=descriptions)
-        words = window_notes(replace(found, medium="water"), rig)
-        assert any("to the other side" in line for line in words) == open_
+        findings = window_findings(replace(found, medium="water"), rig)
+        assert any(f.code is Code.WINDOW_TILT_SIGN for f in findings) == open_
 
 
 def in_water(
@@ -391,8 +392,8 @@ def test_the_command_records_the_medium(tank: Path, tmp_path: Path) -> None:
     command = ["calibrate", str(tank), "--medium", "water", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, [*command, "--model", "none", "--quiet"])
     assert result.exit_code == 0, result.output
-    assert "calibrated in the water behind the refractive windows of left, right" in result.output
     content = json.loads((tmp_path / "out" / "calibration.json").read_text(encoding="utf-8"))
+    assert "WINDOWS_IN_WATER" in [found["code"] for found in content["findings"]]
     assert content["medium"] == "water" and set(content["walls"]) == {"left", "right"}
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "(wall_x_rad)" in page
@@ -409,9 +410,8 @@ def test_a_wall_without_distance_says_what_that_costs(tank: Path, tmp_path: Path
     dots = (tank / "calibration" / "dots.csv").read_bytes()
     (bare / "calibration" / "dots.csv").write_bytes(dots)
     found = telerig.calibrate(load_dataset(bare), model="radial")
-    (words,) = (n for n in found.notes if "has no distance_mm" in n)
-    assert "[walls.left]" in words
-    shift = float(words.split("shifted by ")[1].split(" µm")[0])
-    assert shift == pytest.approx(SHEAR_UM / 3, rel=0.02)
+    without = only(found, Code.NO_DISTANCE)
+    assert without.cameras == ("left",)
+    assert without.numbers["shift_um"] == pytest.approx(SHEAR_UM / 3, rel=0.02)
     wrong = error_mm(found, tank)
     assert np.abs(wrong).max() < 3e-3

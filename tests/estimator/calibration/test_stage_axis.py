@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from finding_codes import codes, only
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import Calibration
@@ -18,6 +19,7 @@ from telerig.estimator.calibration.stage_axis import (
     derivatives,
     stage_axis_of,
 )
+from telerig.io.results.findings import Code
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
@@ -131,9 +133,9 @@ def test_outliers_and_a_wrong_reading() -> None:
     found = stage_axis_of(CALIBRATION, table, positions)
     assert found.scale == pytest.approx(0.01, abs=1.5e-4)
     assert abs(found.scale - clean.scale) < 4 * clean.scale_sd
-    words = " ".join(found.words)
-    assert "of view v5 is wrong by 0.49" in words
-    assert "10 of 330 dots" in words
+    wrong = only(found, Code.WRONG_READING)
+    assert wrong.views == ("v5",) and 0.49 < wrong.numbers["error_mm"] < 0.50
+    assert only(found, Code.STAGE_OUTLIERS).numbers == {"count": 10, "dots": 330}
 
 
 @pytest.mark.parametrize("draws", [10, pytest.param(40, marks=pytest.mark.slow)])
@@ -146,7 +148,7 @@ def test_a_stage_that_wanders_says_so(draws: int) -> None:
         found = stage_axis_of(CALIBRATION, table, positions)
         error = tangent_error(found)
         scores.append(error @ np.linalg.solve(found.joint_covariance, error))
-        told += any("deviates from a straight line" in w for w in found.words)
+        told += "CARRIAGE_WANDERS" in codes(found)
     assert told > 0.8 * draws
     assert np.median(scores) < 5.0
 
@@ -186,6 +188,5 @@ def test_what_cannot_be_used() -> None:
     with pytest.raises(InputError, match="not a finite number"):
         stage_axis_of(CALIBRATION, table, positions | {"v2": np.nan})
     extra = pd.concat([table, table.iloc[:4].assign(dot=77)])
-    assert "4 dots have numbers that are not in the calibration, and are not used" in (
-        stage_axis_of(CALIBRATION, extra, positions).words
-    )
+    found = stage_axis_of(CALIBRATION, extra, positions)
+    assert only(found, Code.UNKNOWN_DOTS).numbers == {"count": 4}

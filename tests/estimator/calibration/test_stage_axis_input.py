@@ -9,12 +9,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from finding_codes import codes, only
 
 import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.calibration.stage_axis import stage_axis_from
 from telerig.io.dataset.dataset import Dataset
+from telerig.io.results.findings import Code
 from telerig.io.rig_file.description import StageDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.io.simulation.calibration.scene import true_cameras, true_target
@@ -72,7 +74,7 @@ def test_dots_and_positions(folder: Path) -> None:
     assert found is not None
     np.testing.assert_allclose(found.axis_rig, AXIS, atol=1e-9)
     assert found.scale == pytest.approx(0.01, abs=1e-9)
-    assert not any("rig.toml" in w for w in found.words)
+    assert "STAGE_AXIS_FAR" not in codes(found)
 
 
 def test_images(folder: Path) -> None:
@@ -98,7 +100,8 @@ def test_images(folder: Path) -> None:
     tifffile.imwrite(dark, np.zeros_like(image))
     found = stage_axis_from(dataset, known)
     assert found is not None
-    assert any("view top, camera left is left out: no dots found" in w for w in found.words)
+    left_out = only(found, Code.LEFT_OUT)
+    assert (left_out.views, left_out.cameras) == (("stage_axis/top",), ("left",))
     tifffile.imwrite(dark.with_suffix(".tiff"), image)
     with pytest.raises(InputError, match=r"top\.tif and top\.tiff are the same view twice"):
         stage_axis_from(dataset, known)
@@ -112,7 +115,7 @@ def test_a_stage_that_runs_the_other_way(folder: Path) -> None:
     dots(dataset).to_csv(folder / "stage_axis" / "dots.csv", index=False)
     found = stage_axis_from(dataset, calibration(dataset))
     assert found is not None
-    assert any("reverse its sign" in w for w in found.words)
+    assert only(found, Code.STAGE_AXIS_FAR).numbers["angle_deg"] > 178
 
 
 def test_no_folder_no_stage_axis(folder: Path) -> None:

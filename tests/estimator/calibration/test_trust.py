@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from finding_codes import codes, only
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.quality.comparison import _chance, compare_calibrations
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
+from telerig.io.results.findings import Code, Finding
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -124,7 +126,7 @@ def test_halves_agree_when_the_model_is_right(at_rest: list[Any]) -> None:
     found = [c.diagnostics["halves"] for c in at_rest]
     ratio = [h["rms_um"] / h["predicted_um"] for h in found]
     assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.5
-    assert sum(h["agree"] for h in found) >= len(found) - 1
+    assert sum("HALVES_AGREE" in codes(c) for c in at_rest) >= len(found) - 1
     assert found[0]["views"] == [6, 6]
     assert np.shape(found[0]["points_mm"]) == np.shape(found[0]["shift_um"])
 
@@ -143,14 +145,10 @@ def test_halves_know_that_the_targets_size_is_common_to_both(scene: Any) -> None
 def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:
     """Distortion of half a pixel at the corner, calibrated without."""
     found = scene("dense", 3, sigma_px=0.02, views=8).calibrate("none")
-    assert not found.diagnostics["halves"]["agree"]
-    structure = found.diagnostics["structure"]
-    assert not structure["sound"]
-    assert any("the lens model lacks a term" in words for words in structure["words"])
+    widening = found.diagnostics["structure"]["widening"]
+    assert only(found, Code.HALVES_DISAGREE).numbers["widening"] == widening > 1
+    assert "PATTERN" in codes(found)
     assert "! of two calibrations" in found.report()
-    said = found.diagnostics["halves"]["words"]
-    assert f"standard deviation is {structure['widening']:.2g} times larger than predicted" in said
-    assert "too small" not in said
 
 
 def test_the_next_view_has_the_noise_of_the_covariance(scene: Any) -> None:
@@ -167,12 +165,17 @@ def test_the_next_view_has_the_noise_of_the_covariance(scene: Any) -> None:
 
 def test_halves_need_views(scene: Any) -> None:
     few = scene("paper", 1, views=7).calibrate()
-    assert "7 views are too few" in few.diagnostics["halves"]["words"]
+    assert "HALVES_NOT_COMPARED" in codes(few) and few.diagnostics["halves"] == {}
 
 
-def _structure(problem: Any, residuals: Any) -> dict[str, Any]:
-    leverage = np.full((len(residuals), 2, 2), 0.0)
-    return residual_tests(problem, residuals, leverage)
+class _Structure:
+    """What the tests of some residuals found: p-values of each test, findings, widening."""
+
+    def __init__(self, problem: Any, residuals: Any) -> None:
+        leverage = np.full((len(residuals), 2, 2), 0.0)
+        found, self.findings = residual_tests(problem, residuals, leverage)
+        self.tests, self.widening = found["tests"], found["widening"]
+        self.sound = codes(self) == ["NO_STRUCTURE"]
 
 
 class _Dots:
@@ -203,11 +206,11 @@ def test_noise_has_no_structure() -> None:
     found = []
     for _ in range(40):
         dots = _Dots(rng)
-        found.append(_structure(dots, rng.standard_normal((960, 2))))
-    assert sum(not f["sound"] for f in found) <= 1
-    assert np.median([f["widening"] for f in found]) == 1
-    assert max(f["widening"] for f in found) < 1.5
-    chances = np.array([t["p_value"] for f in found for t in f["tests"] if t["name"] != "view"])
+        found.append(_Structure(dots, rng.standard_normal((960, 2))))
+    assert sum(not f.sound for f in found) <= 1
+    assert np.median([f.widening for f in found]) == 1
+    assert max(f.widening for f in found) < 1.5
+    chances = np.array([t["p_value"] for f in found for t in f.tests if not t["view"]])
     assert 0.35 < np.mean(chances < 0.5) < 0.65
     assert np.mean(chances < 0.05) < 0.09
 
@@ -219,17 +222,17 @@ def test_each_structure_is_named() -> None:
     left = dots.camera == 0
 
     region = noise + 2.0 * ((dots.uv_px[:, :1] < 120) & left[:, None])
-    found = _structure(dots, region)
-    assert "row" in _only(found, "region", "left")
-    assert 5 < found["widening"] < 8
-    assert f"multiplied by {found['widening']:.2g}" in found["words"][-1]
+    found = _Structure(dots, region)
+    assert 5 < found.widening < 8
+    assert _of_left(found, Code.PATTERN).numbers["widening"] == found.widening
     direction = np.where(left[:, None], noise * [1.6, 1.0], noise)
-    assert "along" in _only(_structure(dots, direction), "direction", "left")
+    numbers = _of_left(_Structure(dots, direction), Code.DIRECTION).numbers
+    assert numbers["ratio"] == pytest.approx(1.6, rel=0.1)
     view = noise * np.where((dots.view == 4) & left, 2.0, 1.0)[:, None]
-    assert "'v4'" in _only(_structure(dots, view), "view", "left")
+    assert _of_left(_Structure(dots, view), Code.WORSE_VIEWS).views == ("v4",)
     wave = np.stack([np.sin(dots.uv_px[:, 0] / 30 + dots.view), np.cos(dots.uv_px[:, 1] / 30)], -1)
     together = noise + 1.5 * wave * left[:, None]
-    assert "neighbouring" in _only(_structure(dots, together), "neighbours", "left")
+    assert _of_left(_Structure(dots, together), Code.NEIGHBOURS).numbers["correlation"] > 0.1
 
 
 def test_a_pattern_that_widens_is_named() -> None:
@@ -239,21 +242,16 @@ def test_a_pattern_that_widens_is_named() -> None:
     at = (dots.uv_px[:, :1] < 120) & (dots.camera == 0)[:, None]
     chances = []
     for size in np.linspace(0.0, 1.0, 21):
-        found = _structure(dots, noise + size * at)
-        chances.append(found["tests"][0]["p_value"] * len(found["tests"]))
-        assert found["sound"] == (found["words"][0] == "no structure is left in the residuals")
-        assert found["sound"] == (found["widening"] == 1.0)
-    assert any(1e-3 < p < 1e-3 * len(found["tests"]) / 2 for p in chances)
+        found = _Structure(dots, noise + size * at)
+        chances.append(found.tests[0]["p_value"] * len(found.tests))
+        assert found.sound == (found.widening == 1.0)
+    assert any(1e-3 < p < 1e-3 * len(found.tests) / 2 for p in chances)
 
 
-def _only(found: dict[str, Any], name: str, camera: str) -> str:
-    """The words of that test, which objects; the other camera is sound."""
-    assert not found["sound"]
-    limit = 1e-3 / len(found["tests"])
-    objecting = [t for t in found["tests"] if t["p_value"] < limit]
-    assert {t["camera"] for t in objecting} == {camera}
-    (mine,) = [t for t in objecting if t["name"] == name]
-    return str(mine["words"])
+def _of_left(found: _Structure, code: Code) -> Finding:
+    """The finding of that test; the other camera is sound."""
+    assert {finding.cameras for finding in found.findings} == {("left",)}
+    return only(found, code)
 
 
 def test_the_map_is_the_scatter_of_triangulated_points(at_rest: list[Any]) -> None:

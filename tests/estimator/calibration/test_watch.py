@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from finding_codes import only
 from typer.testing import CliRunner
 
 import telerig
 from telerig.estimator.calibration.watch import WatchedFolder, standing, watch
 from telerig.io.dataset.dataset import load_dataset
+from telerig.io.results.findings import Code
 from telerig.scripts.main import app
 
 POLL_S = 0.05
@@ -202,9 +204,8 @@ def test_a_bad_image_is_named_and_the_rest_goes_on(paper_images: Path, empty: Pa
         bad.write_bytes(b"no image at all")
         until(lambda: "4 complete views" in it.lines[-1], "the view to be left out again")
     run = it.result[1]
-    assert any(
-        f"view {Path(names[3]).stem}, camera left is left out" in n for n in run.calibration.notes
-    )
+    left_out = only(run.calibration, Code.LEFT_OUT)
+    assert (left_out.views, left_out.cameras) == ((Path(names[3]).stem,), ("left",))
     assert run.calibration.statistics["views"] >= 4
 
 

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from finding_codes import codes, only
 from numpy.typing import NDArray
 from places import REAL
 from target_pictures import draw, pixel_from_mm
 
+import telerig
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.dataset_dots import (
     MEASURED,
     ImageDots,
     TargetDetection,
-    _notes_once,
     detect_target,
+    detected_together,
     numbered,
 )
 from telerig.estimator.dots.locate import measure_dots
+from telerig.io.results.findings import Code
 from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
@@ -165,19 +169,15 @@ def test_real_printed_grid_is_numbered_from_its_rings(camera: int) -> None:
         assert np.abs(bilinear @ fit - table[axis]).max() < 4
 
 
-def test_a_note_that_images_share_is_said_once() -> None:
-    empty = DESIGN.ids()[:0]
-    table = pd.DataFrame({"dot": empty})
-    symmetric, other = "the target is symmetric", "something else"
-    images = [
-        ImageDots(
-            f"{k}", "left", table, table, 1, notes=(symmetric, other) if k == 1 else (symmetric,)
-        )
-        for k in range(3)
-    ]
-    assert _notes_once(images) == [
-        "the target is symmetric (in 3 of 3 images)", "view 1, camera left: something else",
-    ]  # fmt: skip
+def test_what_images_share_is_found_once(paper_images: Path) -> None:
+    data = telerig.load_dataset(paper_images)
+    table = pd.DataFrame({"dot": DESIGN.ids()[:0]})
+    images = [ImageDots(f"{k}", "left", table, table, 1, numberings=2) for k in range(3)]
+    dark = ImageDots("3", "left", table, table, 0, "no dots found")
+    found = detected_together(data, [*images, dark])
+    assert codes(found) == ["LEFT_OUT", "NUMBERINGS"]
+    assert only(found, Code.LEFT_OUT).views == ("3",)
+    assert only(found, Code.NUMBERINGS).numbers == {"count": 2, "images": 3}
 
 
 def test_an_image_of_rejected_spots_says_why() -> None:

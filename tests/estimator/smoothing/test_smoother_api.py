@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.result.calibration import NO_COVARIANCE, Calibration
+from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.sensors.findings import SensorError
 from telerig.estimator.smoothing.graph.solve import Covariances, SampleRejection, _check_variances
 from telerig.estimator.smoothing.problem.problem import CarriageModel, RigMode, ShakeModel
@@ -31,6 +31,7 @@ from telerig.factors.state_space import (
     oscillator,
     ou_velocity,
 )
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.rig_file.description import StageDescription
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -14,7 +14,6 @@ import pytest
 import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import (
-    NO_COVARIANCE,
     Calibration,
     calibration_from_cameras,
 )
@@ -23,6 +22,7 @@ from telerig.estimator.sensors.findings import SensorError, settled
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.io.dataset.run import RunData
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.rig_file.description import StageDescription
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset

@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 import telerig
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import (
-    NO_COVARIANCE,
     Calibration,
     calibration_from_cameras,
 )
@@ -26,6 +25,7 @@ from telerig.estimator.tracking import track as track_module
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions, tracking_stream
 from telerig.estimator.tracking.tracks import Tracks
+from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.results.stale import stale
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.io.simulation.calibration.scene import true_cameras

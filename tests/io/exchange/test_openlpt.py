@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from finding_codes import codes
 from numpy.typing import NDArray
 from places import REAL
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import (
-    NO_COVARIANCE,
     calibration_from_cameras,
     load_calibration,
 )
@@ -204,7 +204,7 @@ def test_imported_cameras_triangulate_and_survive_a_file(tmp_path: Path) -> None
         np.testing.assert_allclose(found.points_mm, points, atol=1e-9)
         own = each.triangulate(*pixels, sigma_px=0.2, include_calibration=False)
         np.testing.assert_allclose(found.covariance_mm2, own.covariance_mm2, rtol=1e-12)
-        assert each.notes == (NO_COVARIANCE, "cam1.txt")
+        assert codes(each) == ["NO_UNCERTAINTY", "NOTE"] and each.notes == ("cam1.txt",)
         np.testing.assert_array_equal(each.project_covariance(1, points), 0)
 
 

@@ -29,7 +29,7 @@ from telerig.short_text import with_sd
 SIGMA_PX, BUMP_MM = 0.01, 0.05
 SECTIONS = [
     *("verdict", "key", "parameters", "pose", "model", "residuals", "coverage", "worst", "target"),
-    *("overlays", "dot", "rig", "twin", "weak", "more", "origin"),
+    *("overlays", "dot", "rig", "twin", "notes", "more", "origin"),
 ]
 OPTIONAL = ("dots.csv", "covariance.npz", "run.json", "dot_example.npz", "overlays")
 

@@ -1,9 +1,14 @@
-"""The sentences on how telecentric the lenses are."""
+"""Sentences on a calibration: how telecentric the lenses are, and that its errors are unknown."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+NO_COVARIANCE = (
+    "the uncertainty of the imported calibration is unknown and taken as zero, so standard "
+    "deviations of points contain the noise of the pixels only"
+)
 
 TELECENTRIC = 1e-3
 """Relative change of the scale over the depth of the views below which a lens is telecentric."""

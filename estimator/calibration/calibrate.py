@@ -264,4 +264,5 @@ def _with_measured(calibration: Calibration, table: pd.DataFrame, seed: int) -> 
     measured["view"] = measured["view"].astype(str)
     dots = calibration.dots.merge(measured, on=["view", "camera", "dot"], how="left")
     dots["chi2_dof"] = dots["chi2_dof"].astype(float)
-    return replace(calibration, dots=dots, statistics={**calibration.statistics, "seed": seed})
+    tables = {"dots.csv": dots, "residuals.csv": calibration.residuals}
+    return replace(calibration, tables=tables, statistics={**calibration.statistics, "seed": seed})

@@ -123,8 +123,7 @@ def calibration_from_fit(
         },
         joint_names=joint.names,
         joint_covariance=joint.matrix,
-        dots=dot_table(problem),
-        residuals=residuals,
+        tables={"dots.csv": dot_table(problem), "residuals.csv": residuals},
     )
     statistics |= _space(calibration, problem, state)
     return calibration

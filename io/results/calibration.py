@@ -487,6 +487,7 @@ DOT_COVARIANCE = ("suu_px2", "suv_px2", "svv_px2")
 DOTS = [
     *(Column(name, "name") for name in ("view", "camera")),
     Column("dot", "whole"),
+    *(Column(name, "whole", required=False) for name in ("row", "column")),
     *(Column(name, required=False) for name in DOT_COVARIANCE),
 ]
 _UNCERTAINTY = ("points_mm", "calibration_mm2", "measurement_mm2", "sigma_px")

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.arrays import Array
+from telerig.arrays import Array, as_points
 from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.result.summary import summary
 from telerig.io.files.atomic import atomic_path, plain
-from telerig.io.files.csv_table import write_table
+from telerig.io.files.csv_table import read_table, write_table
+from telerig.io.files.names import absent
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose
@@ -63,7 +65,8 @@ class Calibration(ShortText):
         projected or triangulated lie in the water behind them.
     joint_names, joint_covariance : of all parameters of the estimate, including the dots and the
         views' poses; empty if they were not loaded.
-    dots, residuals : the tables of `dots.csv` and `residuals.csv`; None after loading.
+    tables : `dots.csv` and `residuals.csv`, by these names; after loading, the `calibration.json`
+        beside which they lie.
     """
 
     cameras: tuple[Camera, ...]
@@ -83,8 +86,46 @@ class Calibration(ShortText):
     medium: str = "air"
     joint_names: tuple[str, ...] = ()
     joint_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    dots: Any = None
-    residuals: Any = None
+    tables: Mapping[str, pd.DataFrame] | Path = field(default_factory=dict)
+
+    @cached_property
+    def dots(self) -> pd.DataFrame:
+        """The table of `dots.csv`, with a row for each measured dot.
+
+        Of a loaded calibration it is read when it is first asked for. Raises InputError if it is
+        not there, as for an imported calibration.
+        """
+        return self._table("dots.csv")
+
+    @cached_property
+    def residuals(self) -> pd.DataFrame:
+        """The table of `residuals.csv`, with a row for each measured dot; otherwise like `dots`."""
+        return self._table("residuals.csv")
+
+    def _table(self, name: str) -> pd.DataFrame:
+        from telerig.io.results.calibration import DOTS, RESIDUALS, CalibrationFile
+        from telerig.io.results.manifest import reading
+
+        if not isinstance(self.tables, Path):
+            if name in self.tables:
+                return self.tables[name]
+            raise InputError(
+                f"this calibration has no {name}: it was not made from dots",
+                where=f"Calibration {self.name!r}",
+                todo="use a calibration of telerig.calibrate, or load one from its folder",
+            )
+        file = self.tables.parent / name
+        if not file.is_file():
+            raise InputError("does not exist", where=str(file), todo=CalibrationFile.AGAIN)
+        with reading(file.parent, (self.tables.name, name)):
+            if CalibrationFile.read(self.tables).statistics != self.statistics:
+                raise InputError(
+                    "this calibration has been replaced since it was loaded",
+                    where=str(self.tables),
+                    todo="load it again",
+                )
+            columns = DOTS if name == "dots.csv" else RESIDUALS
+            return read_table(file, columns, extra=True).reset_index(drop=True)
 
     @property
     def covariance_known(self) -> bool:
@@ -210,7 +251,8 @@ class Calibration(ShortText):
     def project(self, camera: str | int, points_mm: ArrayLike) -> Array:
         """Return the pixels (N, 2) at which a camera sees points (N, 3) of the rig frame, in mm.
 
-        With a refractive window, the points lie in the water behind it.
+        With a refractive window, the points lie in the water behind it. Raises InputError for
+        another shape.
         """
         return self.camera(camera).project(points_mm)
 
@@ -218,7 +260,7 @@ class Calibration(ShortText):
         """Return the rays of pixels (N, 2): origins (N, 3) in mm and unit directions (N, 3).
 
         They are in the rig frame. With a refractive window they are the rays in the water behind
-        it.
+        it. Raises InputError for another shape.
         """
         return self.camera(camera).unproject(uv_px)
 
@@ -259,7 +301,8 @@ class Calibration(ShortText):
     def project_covariance(self, camera: str | int, points_mm: ArrayLike) -> Array:
         """Return covariances (N, 2, 2) in px^2 of projections, due to the calibration's errors."""
         index = self.cameras.index(self.camera(camera))
-        jacobian = rig_jacobian(self.cameras, self.free, np.asarray(points_mm, float))
+        points = as_points(points_mm, "Calibration.project_covariance")
+        jacobian = rig_jacobian(self.cameras, self.free, points)
         rows = jacobian[..., 2 * index : 2 * index + 2, :]
         return rows @ self.covariance @ np.swapaxes(rows, -1, -2)
 
@@ -340,7 +383,7 @@ class Calibration(ShortText):
             in cameras that do not see a point; None for equal noise of all pixels.
         Returns (..., 3, 3) in mm^2. The errors that it describes are common to all points of a run.
         """
-        points = np.asarray(points_mm, float)
+        points = as_points(points_mm, "Calibration.common_covariance")
         size = 2 * len(self.cameras)
         given = np.eye(size) if information_px is None else np.asarray(information_px, float)
         flat = points.reshape(-1, 3)
@@ -378,7 +421,7 @@ class Calibration(ShortText):
         hulls = self.diagnostics.get("dots_hull_px", {})
         if not all(camera.name in hulls for camera in self.cameras):
             return None
-        points = np.asarray(points_mm, float)
+        points = as_points(points_mm, "Calibration.beyond_dots")
         out = np.zeros(points.shape[:-1], bool)
         for camera in self.cameras:
             hull = np.asarray(hulls[camera.name], float)
@@ -543,9 +586,12 @@ class Calibration(ShortText):
         """Write the files of `save` into an existing folder, one after the other."""
         self.record().write(folder / "calibration.json")
         self._write_covariance(folder)
-        for name, table in (("dots.csv", self.dots), ("residuals.csv", self.residuals)):
-            if table is not None:
-                write_table(table, folder / name)
+        for name in ("dots.csv", "residuals.csv"):
+            if not isinstance(self.tables, Path):
+                if name in self.tables:
+                    write_table(self.tables[name], folder / name)
+            elif (self.tables.parent / name).is_file():
+                write_table(self._table(name), folder / name)
 
     def _write_covariance(self, folder: Path) -> None:
         from telerig.io.results.calibration import write_joint_covariance
@@ -567,6 +613,8 @@ def load_calibration(path: str | Path) -> Calibration:
     from telerig.io.results.manifest import reading
 
     place = Path(path)
+    if not place.exists():
+        raise absent(place, "calibration", f"run `{CalibrationFile.MAKE}` first")
     file = place / "calibration.json" if place.is_dir() else place
     with reading(file.parent, (file.name, "covariance.npz")):
         record = CalibrationFile.read(file)
@@ -604,6 +652,7 @@ def load_calibration(path: str | Path) -> Calibration:
         medium=record.medium,
         joint_names=names,
         joint_covariance=joint,
+        tables=file,
     )
 
 

@@ -15,6 +15,7 @@ from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import (
     Calibration,
     calibration_for,
+    calibration_from_cameras,
     load_calibration,
 )
 from telerig.io.results.findings import Code, Finding
@@ -156,10 +157,45 @@ def test_a_covariance_of_another_calibration_is_refused(
         load_calibration(saved)
 
 
-def test_missing(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "none.json", tmp_path / "no" / "folder"):
-        with pytest.raises(InputError, match="no calibration here"):
-            load_calibration(path)
+def test_a_loaded_calibration_has_its_tables(calibration: Calibration, saved: Path) -> None:
+    loaded = load_calibration(saved)
+    for name in ("dots", "residuals"):
+        read, made = getattr(loaded, name), getattr(calibration, name)
+        columns = list(made.columns)
+        pd.testing.assert_frame_equal(read[columns].fillna(""), made.fillna(""), check_dtype=False)
+        assert getattr(loaded, name) is read
+    loaded.save(saved.parent / "again")
+    for name in ("dots.csv", "residuals.csv"):
+        assert (saved.parent / "again" / name).read_bytes() == (saved / name).read_bytes()
+
+
+def test_tables_that_are_not_there_or_of_another_calibration(
+    calibration: Calibration, saved: Path
+) -> None:
+    late, moved = load_calibration(saved), load_calibration(saved)
+    changed = {**calibration.statistics, "rms_px": 1.0}
+    replace(calibration, statistics=changed).save(saved)
+    with pytest.raises(InputError, match="replaced"):
+        _ = late.residuals
+    calibration.save(saved)
+    (saved / "residuals.csv").unlink()
+    with pytest.raises(InputError, match=r"residuals\.csv"):
+        _ = moved.residuals
+    moved.save(saved.parent / "again")
+    assert not (saved.parent / "again" / "residuals.csv").exists()
+    imported = calibration_from_cameras(list(calibration.cameras))
+    with pytest.raises(InputError, match=r"dots\.csv"):
+        _ = imported.dots
+
+
+def test_missing(saved: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no calibration here"):
+        load_calibration(tmp_path)
+    for name in ("calibratoin", "calibratoin/calibration.json"):
+        with pytest.raises(InputError) as error:
+            load_calibration(tmp_path / name)
+        assert "calibratoin" in error.value.where
+        assert error.value.todo == "did you mean calibration?"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array
+from telerig.arrays import Array, as_pixels, as_points
 from telerig.errors import GeometryError
 from telerig.rig import projection, windows
 from telerig.rig.lens_parameters import COEFFICIENTS, INDEX, PARAMETERS, Scales
@@ -90,9 +90,13 @@ class Camera:
         return self.with_parameters(**dict.fromkeys(COEFFICIENTS, 0.0))
 
     def distorted_pixel(self, uv_px: ArrayLike) -> Array:
-        """Return the pixels (..., 2) in this camera of pixels (..., 2) of `undistorted`."""
+        """Return the pixels (..., 2) in this camera of pixels (..., 2) of `undistorted`.
+
+        Raises InputError for another shape.
+        """
         intrinsics = self.undistorted().intrinsics
-        ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), intrinsics, self.rho_mm)
+        uv = as_pixels(uv_px, f"camera {self.name}, distorted_pixel")
+        ideal = projection.ideal_from_pixel(uv, intrinsics, self.rho_mm)
         at_depth_0 = np.concatenate([ideal, np.zeros_like(ideal[..., :1])], -1)
         return projection.pixel_from_camera(at_depth_0, self.intrinsics, self.rho_mm)
 
@@ -107,17 +111,19 @@ class Camera:
     def project(self, points_rig_mm: ArrayLike) -> Array:
         """Return the pixels (..., 2) at which the camera sees the points (..., 3) of the rig frame.
 
-        Raises GeometryError for points behind the perspective centre, or that no ray reaches.
+        Raises InputError for another shape, and GeometryError for points behind the perspective
+        centre, or that no ray reaches.
         """
-        points = self.camera_from_rig.apply(np.atleast_2d(points_rig_mm))
-        if self.wall is None and np.any(1 + self["kappa_per_mm"] * points[..., 2] <= 0):
+        given = as_points(points_rig_mm, f"camera {self.name}, project")
+        own = self.camera_from_rig.apply(np.atleast_2d(given))
+        if self.wall is None and np.any(1 + self["kappa_per_mm"] * own[..., 2] <= 0):
             raise GeometryError(
                 f"a point lies behind the perspective centre of camera {self.name!r} "
                 f"(z < {-1 / self['kappa_per_mm']:.1f} mm)",
                 todo="project only points in front of the camera",
             )
-        uv = projection.pixel_from_camera(points, self.intrinsics, self.rho_mm, self.wall)
-        return uv.reshape(*np.shape(points_rig_mm)[:-1], 2)
+        uv = projection.pixel_from_camera(own, self.intrinsics, self.rho_mm, self.wall)
+        return uv.reshape(*given.shape[:-1], 2)
 
     def pixel_jacobians(
         self, points_camera_mm: Array, free: Sequence[int] = range(len(PARAMETERS))
@@ -131,10 +137,11 @@ class Camera:
         """Return the rays at pixels (..., 2): origins (..., 3) in mm and unit directions (..., 3).
 
         They are in the rig frame. An origin lies in the camera's plane Z = 0; a ray in water is
-        extended backwards to it in a straight line. Raises GeometryError where the lens model has
-        no inverse.
+        extended backwards to it in a straight line. Raises InputError for another shape, and
+        GeometryError where the lens model has no inverse.
         """
-        ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), self.intrinsics, self.rho_mm)
+        uv = as_pixels(uv_px, f"camera {self.name}, unproject")
+        ideal = projection.ideal_from_pixel(uv, self.intrinsics, self.rho_mm)
         if self.wall is not None:
             wall = projection.turned_wall(self.intrinsics, self.wall)
             origin, direction = windows.water_from_ideal(ideal, self["kappa_per_mm"], wall)

@@ -193,8 +193,10 @@ def records(
 
 
 def _check_run(run: Path) -> None:
+    from telerig.io.files.names import absent
+
     if not run.is_dir():
-        raise InputError("there is no such run", where=str(run), todo="check the path")
+        raise absent(run, "run", "check the path")
 
 
 def _clock_of(run: Path, sensor: str, table: pd.DataFrame) -> str | None:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
+from telerig.io.files.names import absent
 from telerig.version import VERSION
 
 Kind = Literal["calibrate", "track", "smooth"]
@@ -250,11 +251,7 @@ def _checked(datasets: Iterable[Path]) -> list[Path]:
     places = [Path(place).resolve() for place in datasets]
     for place in places:
         if not place.is_dir():
-            raise InputError(
-                "there is no such folder",
-                where=str(place),
-                todo="give folders with a rig.toml",
-            )
+            raise absent(place, "folder", "give folders with a rig.toml")
         if places.count(place) > 1:
             raise InputError("the dataset is named twice", where=str(place), todo="name it once")
     return places
@@ -298,10 +295,8 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
     from telerig.rig.lens_parameters import checked_model
 
     if calibration is not None and not Path(calibration).exists():
-        raise InputError(
-            "there is no such calibration", where=str(calibration),
-            todo="give the calibration.json that `telerig calibrate` wrote",
-        )  # fmt: skip
+        todo = "give the calibration.json that `telerig calibrate` wrote"
+        raise absent(Path(calibration), "calibration", todo)
     try:
         checked_model(model)
     except CalibrationError as error:

@@ -463,11 +463,14 @@ def load_smoothing(folder: str | Path) -> Smoothing:
 
     from telerig.io.files.csv_table import read_table
     from telerig.io.files.hdf5 import read_arrays
+    from telerig.io.files.names import absent
     from telerig.io.results.bubbles import BODY_COLUMNS, BUBBLES
     from telerig.io.results.manifest import reading
     from telerig.io.results.smoothing import TRAJECTORIES, SmoothingFile, shake_columns
 
     place = Path(folder)
+    if not place.is_dir():
+        raise absent(place, "folder of results", f"run `{SmoothingFile.MAKE}` first")
     tables: Tables | StoredTables = StoredTables(place)
     names = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5", "bubbles.csv")
     with reading(place, names):

@@ -14,6 +14,7 @@ import pandas as pd
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_part, read_table
 from telerig.io.files.frame_table import FrameTable
+from telerig.io.files.names import absent
 from telerig.io.results.manifest import reading, replaced_results
 from telerig.io.results.tracking import (
     EVENTS,
@@ -140,6 +141,8 @@ def open_tracks(folder: str | Path) -> Tracks | StoredTracks:
     Raises InputError as `load_tracks` does.
     """
     place = Path(folder)
+    if not place.is_dir():
+        raise absent(place, "folder of results", f"run `{TrackingFile.MAKE}` first")
     files = _files(place)
     marks = place / "references.csv"
     with reading(place, [file.name for file in (*files, marks)]):
@@ -181,6 +184,8 @@ def load_tracks(folder: str | Path) -> Tracks:
     missing.
     """
     place = Path(folder)
+    if not place.is_dir():
+        raise absent(place, "folder of results", f"run `{TrackingFile.MAKE}` first")
     files = _files(place)
     marks = place / "references.csv"
     with reading(place, [file.name for file in (*files, marks)]):

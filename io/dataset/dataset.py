@@ -13,7 +13,7 @@ import pandas as pd
 
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import choose_source, read_dots_csv
-from telerig.io.files.names import check_name
+from telerig.io.files.names import absent, check_name
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
 from telerig.io.results.record import read_object
 from telerig.io.rig_file.description import RigDescription
@@ -56,6 +56,14 @@ class Run:
         from telerig.io.dataset.run import load_run
 
         return load_run(self.path, **options)
+
+
+class Runs(dict[str, Run]):
+    """The runs of a dataset by name; InputError with the most similar name for one that is none."""
+
+    def __missing__(self, name: object) -> Run:
+        todo = suggestion(str(name), list(self)) if self else "put recordings into runs/NAME"
+        raise InputError(f"there is no run {name!r:.60}", where="Dataset.runs", todo=todo)
 
 
 @dataclass(frozen=True, repr=False)
@@ -173,7 +181,7 @@ def load_dataset(
     folder = _dataset_folder(Path(path))
     rig = read_rig_toml(folder / "rig.toml")
     found = [p for p in _entries(folder / "runs") if p.is_dir()]
-    runs = {p.name: Run(p.name, p) for p in found}
+    runs = Runs({p.name: Run(p.name, p) for p in found})
     chosen = _choose_source(folder, rig, source, need_views)
     notes: list[str] = []
     views: tuple[View, ...] = ()
@@ -196,16 +204,8 @@ def _dataset_folder(path: Path) -> Path:
             "is a file, not a dataset folder", where=where, todo=f"give its folder, {path.parent}"
         )
     if not path.is_dir():
-        beside = (
-            [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
-        )
-        near = nearest(path.name, beside)
         otherwise = "check the path, or make one with `telerig init` or `telerig simulate`"
-        raise InputError(
-            "there is no such dataset folder",
-            where=where,
-            todo=f"did you mean {near}?" if near else otherwise,
-        )
+        raise absent(path, "dataset folder", otherwise)
     if not (path / "rig.toml").is_file():
         inner = [p.parent.name for p in sorted(path.glob("*/rig.toml"))]
         todo = f"the dataset may be {path / inner[0]}; if not, " if inner else ""

@@ -27,7 +27,7 @@ from telerig.io.dataset.tables import (
     read_stage_csv,
 )
 from telerig.io.files.frame_table import FrameTable
-from telerig.io.files.names import check_name
+from telerig.io.files.names import absent, check_name
 from telerig.io.images.frames import FILE_EXTENSIONS, FrameSource, open_frames
 from telerig.io.images.high_speed import HighSpeedFrames
 from telerig.io.images.read import Image, check_size, list_images
@@ -252,12 +252,7 @@ def _run_folder(path: Path) -> Path:
         raise InputError(
             "is a file, not a run's folder", where=str(path), todo=f"give its folder, {path.parent}"
         )
-    others = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
-    raise InputError(
-        "there is no such run",
-        where=str(path),
-        todo=suggestion(path.name, sorted(others)) if others else "check the path",
-    )
+    raise absent(path, "run", "check the path")
 
 
 def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSource:

@@ -6,9 +6,10 @@ harmless in each of them. Letters of any language, digits, spaces and most signs
 
 from __future__ import annotations
 
+from pathlib import Path
 from unicodedata import category
 
-from telerig.errors import InputError
+from telerig.errors import InputError, nearest
 
 LONGEST_BYTES = 120
 """File systems allow 255, and a name gets an ending."""
@@ -35,6 +36,21 @@ def fault_of_name(name: str) -> str:
     if name[0] in ".=@":
         return f"begins with {name[0]}"
     return ""
+
+
+def absent(path: Path, thing: str, otherwise: str) -> InputError:
+    """Return the error for a file or folder that does not exist.
+
+    thing : what it should have been. otherwise : what to do if there is no similar name.
+    """
+    first = next((p for p in [*path.parents[::-1], path] if not p.exists()), path)
+    beside = sorted(p.name for p in first.parent.iterdir()) if first.parent.is_dir() else []
+    near = nearest(first.name, beside)
+    return InputError(
+        f"there is no such {thing}",
+        where=str(path),
+        todo=f"did you mean {near}?" if near else otherwise,
+    )
 
 
 def check_name(name: str, where: str, thing: str = "name") -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from telerig.errors import InputError
+from telerig.io.files.names import absent
 from telerig.io.results.manifest import replaced_results
 
 Kind = Literal["calibration", "run", "validation", "batch"]
@@ -34,8 +35,10 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
     """
     place = Path(folder)
     if not place.is_dir():
-        what = "is a file, not a folder" if place.exists() else "there is no such folder"
-        raise InputError(what, where=str(place), todo="give a folder of results, or a dataset's")
+        todo = "give a folder of results, or a dataset's"
+        if not place.exists():
+            raise absent(place, "folder", todo)
+        raise InputError("is a file, not a folder", where=str(place), todo=todo)
     own = _of(place)
     if own:
         return (own,)

@@ -1,5 +1,5 @@
 """These types name arrays by what they hold. The docstring of each function that takes or returns
-an array states its shape."""
+an array states its shape; `as_points` and `as_pixels` check what a user gives."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from dataclasses import fields
 from typing import Any, Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -36,3 +38,24 @@ class Rows:
             type(c[0]).concat(c) if isinstance(c[0], Rows) else np.concatenate(c) for c in columns
         )
         return cast(Self, cast(Any, cls)(*joined))
+
+
+def as_points(points_mm: ArrayLike, where: str) -> Array:
+    """Return points as floats (..., 3). Raises InputError for another shape or no numbers."""
+    return _numbers(points_mm, 3, where, "points x, y, z in mm")
+
+
+def as_pixels(uv_px: ArrayLike, where: str) -> Array:
+    """Return pixels as floats (..., 2). Raises InputError for another shape or no numbers."""
+    return _numbers(uv_px, 2, where, "pixels u, v")
+
+
+def _numbers(values: ArrayLike, size: int, where: str, what: str) -> Array:
+    todo = f"give {what} with the shape (..., {size}), for example (N, {size})"
+    try:
+        found = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"there is no array of numbers: {error}", where=where, todo=todo) from None
+    if found.shape[-1:] != (size,):
+        raise InputError(f"an array has the shape {found.shape}", where=where, todo=todo)
+    return found

@@ -122,6 +122,9 @@ def test_a_smoothing_read_again_is_the_one_that_was_saved(chain: Chain, tmp_path
         telerig.load_smoothing(tmp_path / "again")
     with pytest.raises(InputError, match="not smoothed"):
         telerig.load_smoothing(tmp_path)
+    for load in (telerig.load_smoothing, telerig.load_tracks):
+        with pytest.raises(InputError, match=r"did you mean rise\?"):
+            load(tmp_path / "rize")
 
 
 def test_xarray_has_the_covariance_and_what_the_netcdf_file_has(

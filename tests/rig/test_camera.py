@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from telerig.errors import GeometryError
+from telerig.errors import GeometryError, InputError
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import (
@@ -51,6 +51,21 @@ def test_unproject_inverts_project(model, shape):
     gap = np.linalg.norm(np.cross(in_rig - origin, direction), axis=-1)
     assert np.max(gap) < 1e-11
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, rtol=1e-14)
+
+
+@pytest.mark.parametrize("given", [[1, 2], [[1, 2]], 5.0, [], "abc", [[1, 2, 3], [1, 2]]])
+def test_what_is_no_array_of_points(given):
+    with pytest.raises(InputError) as error:
+        camera("all").project(given)
+    assert "left" in error.value.where and "(..., 3)" in error.value.todo
+
+
+@pytest.mark.parametrize("given", [[1, 2, 3], [[1, 2, 3]], 5.0, [], "abc"])
+def test_what_is_no_array_of_pixels(given):
+    for function in (camera("all").unproject, camera("all").distorted_pixel):
+        with pytest.raises(InputError) as error:
+            function(given)
+        assert "left" in error.value.where and "(..., 2)" in error.value.todo
 
 
 @pytest.mark.parametrize("model", MODELS)

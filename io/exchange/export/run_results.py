@@ -15,6 +15,7 @@ import pandas as pd
 from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_table
+from telerig.io.files.names import absent
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import SmoothingFile
@@ -161,7 +162,7 @@ def results_root(source: Path) -> Path:
     Raises InputError when ``source`` does not exist, or is a folder of another kind.
     """
     if not source.exists():
-        raise InputError("there is no such dataset", where=str(source), todo="check the path")
+        raise absent(source, "dataset or folder of results", "check the path")
     place = source.resolve()
     if place.is_file():
         place = place.parent
@@ -203,6 +204,8 @@ def cameras_of(
 
     Raises InputError for a calibration that is stale or cannot be read.
     """
+    if calibration is not None and not calibration.exists():
+        raise absent(calibration, "calibration", "check the path")
     trials = [results_root(source) / "calibration" / "calibration.json"]
     if source.suffix == ".json":
         trials.insert(0, source)
@@ -240,6 +243,8 @@ def run_folder(source: Path, run: str | None) -> Path:
         return source
     root = results_root(source)
     if run is not None:
+        if not (root / run).is_dir():
+            raise absent(root / run, "folder of results", "run `telerig track` first")
         return root / run
     found = sorted(p for p in root.iterdir() if holds(p)) if root.is_dir() else []
     if len(found) == 1:

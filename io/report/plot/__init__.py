@@ -10,3 +10,7 @@ from telerig.io.report.plot.rig import coverage, residuals, shake, uncertainty
 __all__ = [
     "coverage", "drag", "path", "residuals", "shake", "sizes", "spectra", "uncertainty", "velocity",
 ]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

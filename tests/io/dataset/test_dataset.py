@@ -230,6 +230,13 @@ def test_truth_is_read_when_it_is_asked_for(folder: Path) -> None:
     assert load_dataset(folder).truth == {"kappa": 1e-3}
 
 
+def test_a_run_that_does_not_exist(folder: Path) -> None:
+    (folder / "runs" / "rise").mkdir(parents=True)
+    runs = load_dataset(folder, need_views=False).runs
+    assert "did you mean rise?" in error_of(lambda: runs["rize"])
+    assert "rize" not in runs and runs.get("rize") is None
+
+
 def test_a_path_that_is_no_dataset(folder: Path) -> None:
     parent = folder.parent
     message = load_error(parent / "tank_3x")

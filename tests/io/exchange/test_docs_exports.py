@@ -148,7 +148,9 @@ def test_default_run_is_the_only_one(place: Path, to: str) -> None:
     [
         ("telerig export data --to word", "use one of: halcon"),
         ("telerig export nowhere --to mat", "no such dataset"),
-        ("telerig export data --to mat --run fall", "has neither"),
+        ("telerig export data/results/rize --to mat", "did you mean rise?"),
+        ("telerig export data --to mat --run rize", "did you mean rise?"),
+        ("telerig export data --to halcon --calibration nowhere.json", "no such calibration"),
         ("telerig export data --to halcon --volume 1,2", "six numbers"),
         ("telerig export data --to halcon --volume 90,95,0,1,0,1", "inside the images"),
         ("telerig export data/runs/rise --to soloff", "neither a dataset nor a folder of results"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -159,6 +160,12 @@ def test_shake_has_one_sign() -> None:
     odd.figure.canvas.draw()
     with pytest.raises(InputError, match="left_z_mm"):
         telerig.plot.shake(table, "left", "z")
+
+
+def test_the_directory_names_functions_only() -> None:
+    names = dir(telerig.plot)
+    assert set(names) == set(telerig.plot.__all__) >= {"path", "residuals"}
+    assert all(inspect.isfunction(getattr(telerig.plot, name)) for name in names)
 
 
 def test_given_axes_are_drawn_on() -> None:

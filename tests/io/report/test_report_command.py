@@ -194,6 +194,7 @@ def test_bad_input_is_told_in_words(dataset: Path, tmp_path: Path) -> None:
         ([tmp_path / "empty"], "holds no results"),
         ([tmp_path / "file"], "is a file, not a folder"),
         ([tmp_path / "none"], "there is no such folder"),
+        ([dataset / "reslts" / "batch"], "did you mean results?"),
         ([dataset / "results" / "batch", "--film"], "films are made of runs"),
     ):
         said = command(*arguments, code=2)

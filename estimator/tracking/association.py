@@ -14,10 +14,9 @@ runner-up is far enough behind; else the tracks that differ are broken.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,13 +32,15 @@ from telerig.estimator.tracking.filter import (
     TrackerSettings,
     update_tracks,
 )
+from telerig.estimator.tracking.ranked_ways import alternatives
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 
 _LOG_2PI = float(np.log(2 * np.pi))
 _SIZE_SPAN_MM = 5.0
 _SHIFT_ROUNDS = 5
-_MAX_NODES = 4000
+_JOINTLY_SCORED = 10
+"""For each hypothesis that is kept, so many ways to continue are scored with the common shift."""
 
 
 @dataclass(frozen=True)
@@ -183,45 +184,23 @@ def unrivalled(
     return np.asarray(out)
 
 
-def joint_score(pairs: Pairs, edges: Ints, common: Common) -> float:
-    """Return the joint log-likelihood ratio of some pairings, marginal over the common shift."""
-    if not len(edges):
-        return 0.0
-    left = pairs.innovation_mm[edges] - common.shift_mm
-    pull = np.einsum("eij,ej->i", pairs.information[edges], left)
-    total = pairs.information[edges].sum(0)
-    mixed = np.eye(3) + common.covariance_mm2 @ total
-    gained = pull @ np.linalg.solve(mixed, common.covariance_mm2 @ pull) / 2
-    own = pairs.scores(common.shift_mm)[edges].sum()
-    return float(own + gained - np.log(np.linalg.det(mixed)) / 2)
+def joint_scores(pairs: Pairs, ways: Sequence[Sequence[int]], common: Common) -> Array:
+    """Return the joint log-likelihood ratio (W,) of the pairings of each way, marginal over the
+    common shift.
 
-
-def alternatives(
-    options: Sequence[Sequence[tuple[int, float]]], within_log_ratio: float
-) -> list[tuple[tuple[int, ...], float]]:
-    """Return every way to give each row one of its (column, score) options or none, near the best.
-
-    Depth-first branch and bound; the columns of each row (-1: none) and the total score.
+    ways : the indices of the pairings of each of the W ways.
     """
-    ordered = [sorted(o, key=lambda item: -item[1]) for o in options]
-    bound = np.cumsum([max([0.0, *(s for _, s in o)]) for o in ordered[::-1]])[::-1].tolist() + [0]
-    found: list[tuple[tuple[int, ...], float]] = []
-    best, nodes = -np.inf, 0
-    stack: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
-    while stack and nodes < _MAX_NODES:
-        taken, score = stack.pop()
-        nodes += 1
-        depth = len(taken)
-        if score + bound[depth] < best - within_log_ratio:
-            continue
-        if depth == len(ordered):
-            best = max(best, score)
-            found.append((taken, score))
-            continue
-        stack.append(((*taken, -1), score))
-        free = [(c, s) for c, s in ordered[depth] if c not in taken]
-        stack.extend(((*taken, c), score + s) for c, s in reversed(free))
-    return [(taken, score) for taken, score in found if score >= best - within_log_ratio]
+    used = np.unique(np.concatenate([np.array(way, int) for way in ways]))
+    chosen = np.array([np.isin(used, way) for way in ways], float)
+    information = pairs.information[used]
+    left = pairs.innovation_mm[used] - common.shift_mm
+    pull = chosen @ np.einsum("eij,ej->ei", information, left)
+    total = (chosen @ information.reshape(-1, 9)).reshape(-1, 3, 3)
+    mixed = np.eye(3) + common.covariance_mm2 @ total
+    moved = np.linalg.solve(mixed, (pull @ common.covariance_mm2)[..., None])[..., 0]
+    gained = (pull * moved).sum(-1) / 2
+    own = chosen @ pairs.scores(common.shift_mm)[used]
+    return np.asarray(own + gained - np.log(np.linalg.det(mixed)) / 2)
 
 
 @dataclass(frozen=True)
@@ -300,9 +279,14 @@ def update_pixels(
 
 _MERGE_FRAMES = 2
 
-History = dict[int, list[tuple[int, int]]]
-"""For each track, by its id, the measurements (frame, column) since the conflict began; the column
-is -1 in a frame without a measurement."""
+Entry = tuple[int, int]
+"""A frame, and the column of a track's measurement in it, -1 for none."""
+
+Recent = tuple[tuple[Entry, ...], ...]
+"""For each track of a conflict, its last entries."""
+
+History = dict[int, list[Entry]]
+"""For each track, by its id, the entries since the conflict began."""
 
 
 @dataclass
@@ -388,30 +372,38 @@ def recent(entries: Sequence[tuple[int, int]], depth: int) -> list[tuple[int, in
 
 
 def merged(
-    scored: Iterable[tuple[float, tuple[object, ...], int]], settings: TrackerSettings
+    scored: Iterable[tuple[float, Recent, int]], settings: TrackerSettings
 ) -> list[tuple[float, int]]:
     """Merge hypotheses with equal keys, and leave out improbable ones.
 
     scored : (log weight, key, index) of each hypothesis.
-    Returns (log weight, index of the most probable of the merged ones), best first, at most
-    ``max_hypotheses`` of them; the weight of the best one is 0.
+    Returns (log weight, index of the most probable of the merged ones), best first; the weight of
+    the best one is 0. There are ``max_hypotheses`` of them, and those that alone give a track one
+    of its measurements.
     """
-    groups: dict[tuple[object, ...], list[tuple[float, int]]] = {}
+    groups: dict[Recent, list[tuple[float, int]]] = {}
     for weight, key, index in scored:
         groups.setdefault(key, []).append((weight, index))
     out = []
-    for members in groups.values():
+    for key, members in groups.items():
         weights = np.array([w for w, _ in members])
         top = int(weights.argmax())
         total = weights[top] + np.log(np.exp(weights - weights[top]).sum())
-        out.append((float(total), members[top][1]))
+        out.append((float(total), members[top][1], key))
     out.sort(key=lambda item: -item[0])
     best = out[0][0]
-    kept = [(w - best, i) for w, i in out if w >= best - settings.prune_log_ratio]
-    return kept[: settings.max_hypotheses]
+    kept, seen = list[tuple[float, int]](), set[tuple[int, Entry]]()
+    for weight, index, key in out:
+        own = {(track, entry) for track, entries in enumerate(key) for entry in entries}
+        if weight < best - settings.prune_log_ratio:
+            break
+        if len(kept) < settings.max_hypotheses or not own <= seen:
+            kept.append((weight - best, index))
+            seen |= own
+    return kept
 
 
-def merge_key(histories: Iterable[Sequence[tuple[int, int]]]) -> tuple[object, ...]:
+def merge_key(histories: Iterable[Sequence[Entry]]) -> Recent:
     """Return the most recent measurements of all tracks of a hypothesis.
 
     Hypotheses with equal recent measurements are merged.
@@ -643,39 +635,63 @@ def children(
     """
     settings, pairs = found.scan.settings, found.pairs
     score = pairs.scores(outside.shift_mm)
-    by_row: dict[int, list[int]] = {}
+    options: dict[int, list[tuple[int, float]]] = {}
+    edge_of = {}
     for e in edges:
-        by_row.setdefault(int(pairs.row[e]), []).append(e)
-    raw: list[Child] = []
-    every = product(*(found.clusters[m].branches for m in members))
-    ranked = sorted(every, key=lambda branches: -sum(b.weight for b in branches))
-    for parents in ranked[: settings.max_hypotheses]:
-        rows = [found.row_of[id(t)] for b in parents for t in b.tracks]
-        options = [
-            [(int(pairs.column[e]), float(score[e])) for e in by_row.get(r, [])] for r in rows
-        ]
-        start = sum(b.weight for b in parents)
-        for taken, _ in alternatives(options, settings.prune_log_ratio + _SLACK_LOG_RATIO):
-            chosen = tuple(
-                next((e for e in by_row.get(r, []) if pairs.column[e] == c), -1)
-                for r, c in zip(rows, taken)
-            )
-            used = np.array([e for e in chosen if e >= 0], int)
-            raw.append(Child(start + joint_score(pairs, used, outside), parents, chosen))
-    histories = (_histories(c, pairs, found.scan.frame) for c in raw)
-    scored = ((c.score, merge_key(h.values()), i) for i, (c, h) in enumerate(zip(raw, histories)))
+        row, column = int(pairs.row[e]), int(pairs.column[e])
+        options.setdefault(row, []).append((column, float(score[e])))
+        edge_of[row, column] = e
+    every = _joint([found.clusters[m].branches for m in members], settings.max_hypotheses)
+    rows = [[found.row_of[id(t)] for b in parents for t in b.tracks] for parents in every]
+    start = [sum(b.weight for b in parents) for parents in every]
+    tables = [(own, [options.get(r, []) for r in of]) for own, of in zip(start, rows)]
+    within = settings.prune_log_ratio + _SLACK_LOG_RATIO
+    ways = alternatives(tables, within, _JOINTLY_SCORED * settings.max_hypotheses)
+    chosen = [tuple(edge_of.get(at, -1) for at in zip(rows[k], taken)) for k, taken, _ in ways]
+    joint = joint_scores(pairs, [[e for e in one if e >= 0] for one in chosen], outside).tolist()
+    raw = [
+        Child(start[k] + score, every[k], edges)
+        for (k, *_), score, edges in zip(ways, joint, chosen)
+    ]
+    scored = ((c.score, _recent(c, pairs, found.scan.frame), i) for i, c in enumerate(raw))
     return [Child(w, raw[i].parents, raw[i].edges) for w, i in merged(scored, settings)]
 
 
+def _joint(groups: Sequence[Sequence[Branch]], most: int) -> list[tuple[Branch, ...]]:
+    """Return the ``most`` likely joint hypotheses of groups of tracks, one of each group.
+
+    A hypothesis of a group that is in none of them follows with the best ones of the others.
+    """
+    every: list[tuple[Branch, ...]] = [()]
+    for group in groups:  # what is not among the first of some groups cannot be with further ones
+        joined = ((*branches, branch) for branches in every for branch in group)
+        every = sorted(joined, key=lambda branches: -sum(b.weight for b in branches))[:most]
+    used = {id(branch) for branches in every for branch in branches}
+    best = tuple(group[0] for group in groups)
+    return every + [
+        (*best[:g], branch, *best[g + 1 :])
+        for g, group in enumerate(groups)
+        for branch in group
+        if id(branch) not in used
+    ]
+
+
+def _new_entries(
+    child: Child, pairs: Pairs, frame: int
+) -> Iterator[tuple[int, list[Entry], Entry]]:
+    """Yield each track's id, its entries so far, and its entry of this frame."""
+    tracks = ((b.history, t.particle) for b in child.parents for t in b.tracks)
+    for (history, particle), e in zip(tracks, child.edges):
+        yield particle, history.get(particle, []), (frame, int(pairs.column[e]) if e >= 0 else -1)
+
+
 def _histories(child: Child, pairs: Pairs, frame: int) -> History:
-    tracks = [(b, t) for b in child.parents for t in b.tracks]
-    return {
-        t.particle: [
-            *b.history.get(t.particle, []),
-            (frame, int(pairs.column[e]) if e >= 0 else -1),
-        ]
-        for (b, t), e in zip(tracks, child.edges)
-    }
+    return {p: [*before, new] for p, before, new in _new_entries(child, pairs, frame)}
+
+
+def _recent(child: Child, pairs: Pairs, frame: int) -> Recent:
+    new = _new_entries(child, pairs, frame)
+    return merge_key([*before[-_MERGE_FRAMES:], entry] for _, before, entry in new)
 
 
 def grow(found: Association, outside: Common, child: Child, mean_gain: Array) -> Branch:

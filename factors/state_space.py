@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -335,20 +335,34 @@ class Steps:
     which : (N,) indices of the processes in the caller's list.
     transition, covariance : (N, U, n, n) of each step.
     input : (N, U, n, k) effect of the inputs.
-    whitener : (N, U, n, n) W with W covariance W^T = identity.
-    log_det : (N, U) logarithm of the determinant of W.
-    start : (N, n, n) whitening matrix of the first state.
-    start_log_det : (N,) logarithm of its determinant.
+    start_covariance : (N, n, n) of the first state.
     """
 
     which: Ints
     transition: Array
     input: Array
     covariance: Array
-    whitener: Array
-    log_det: Array
-    start: Array
-    start_log_det: Array
+    start_covariance: Array
+
+    @cached_property
+    def whitener(self) -> Array:
+        """(N, U, n, n) W with W covariance W^T = identity."""
+        return _inverse_root(self.covariance)
+
+    @cached_property
+    def log_det(self) -> Array:
+        """(N, U) logarithm of the determinant of W."""
+        return log_det_of(self.whitener)
+
+    @cached_property
+    def start(self) -> Array:
+        """(N, n, n) whitening matrix of the first state."""
+        return _inverse_root(self.start_covariance)
+
+    @cached_property
+    def start_log_det(self) -> Array:
+        """(N,) logarithm of its determinant."""
+        return log_det_of(self.start)
 
     def bases(self) -> Array:
         """Return well-conditioned bases T (N, U + 1, n, n) for the states x = T y of N processes.
@@ -436,12 +450,8 @@ def _steps(components: Sequence[Component], which: Sequence[int], lengths_s: Arr
         drift, noise = (np.repeat(a, shape[1], 0) for a in (drift, noise))
         whole = _exact_steps(drift, noise, np.tile(lengths_s, shape[0]), orders)
         transition, q = (a.reshape(*shape, n + k, n + k) for a in whole)
-    covariance = q[..., :n, :n]
-    whitener, first = _inverse_root(covariance), _inverse_root(begin)
-    return Steps(
-        np.array(which), transition[..., :n, :n], transition[..., :n, n:], covariance,
-        whitener, log_det_of(whitener), first, log_det_of(first),
-    )  # fmt: skip
+    phi, by_input = transition[..., :n, :n], transition[..., :n, n:]
+    return Steps(np.array(which), phi, by_input, q[..., :n, :n], begin)
 
 
 def exact_step(drift: Array, noise: Array, dt_s: float | Array) -> tuple[Array, Array]:

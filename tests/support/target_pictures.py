@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.spatial import cKDTree
 
 from telerig.rig.target import Target
 
@@ -25,24 +24,28 @@ def draw(
     """An 8-bit image of the target, and the true centre (N, 2) of each dot, by supersampling."""
     ids = target.ids()
     xy = target.nominal_mm(ids)[:, :2]
-    offset = (size_px - 1) / 2 - affine @ xy.mean(0)
-    step = (np.arange(size_px * 4) + 0.5) / 4 - 0.5
-    uv = np.stack(np.meshgrid(step, step), -1)
-    places = (uv - offset) @ np.linalg.inv(affine).T
-    if target.layout == "points":
-        nearest = cKDTree(xy).query(places)[1]
-    else:
-        column = np.clip(np.round(places[..., 0] / target.pitch_mm[0]), 0, target.columns - 1)
-        row = np.clip(np.round(places[..., 1] / target.pitch_mm[1]), 0, target.rows - 1)
-        nearest = (row * target.columns + column).astype(int)
-    away = np.linalg.norm(places - target.nominal_mm(nearest)[..., :2], axis=-1)
-    inside = away < target.diameter_mm(nearest) / 2
+    centres = xy @ affine.T + (size_px - 1) / 2 - affine @ xy.mean(0)
+    radius, hole = target.diameter_mm(ids) / 2, np.zeros(len(ids))
     if target.mark_style == "ring":
-        inside &= ~(target.is_mark(nearest) & (away < target.dot_diameter_mm / 5))
+        hole[target.is_mark(ids)] = target.dot_diameter_mm / 5
     if target.mark_style == "missing":
-        inside &= ~target.is_mark(nearest)
-    cover = gaussian_filter(inside.reshape(size_px, 4, size_px, 4).mean((1, 3)), 0.8)
+        radius[target.is_mark(ids)] = 0.0
+    cover = np.zeros((size_px, size_px))
+    for centre, large, small in zip(centres, radius, hole):
+        reach = large * np.linalg.norm(affine, axis=1) + 1.0
+        low = np.maximum(np.floor(centre - reach), 0).astype(int)
+        high = np.minimum(np.ceil(centre + reach) + 1, size_px).astype(int)
+        if (high <= low).any():  # outside the image
+            continue
+        steps = (low[k] + (np.arange(4 * (high[k] - low[k])) + 0.5) / 4 - 0.5 for k in (0, 1))
+        places = (np.stack(np.meshgrid(*steps), -1) - centre) @ np.linalg.inv(affine).T
+        away = np.linalg.norm(places, axis=-1)
+        inside = (away < large) & (away >= small)
+        rows, columns = high[1] - low[1], high[0] - low[0]
+        part = inside.reshape(rows, 4, columns, 4).mean((1, 3))
+        cover[low[1] : high[1], low[0] : high[0]] += part
+    cover = gaussian_filter(cover, 0.8)
     if target.polarity == "black_on_white":
         cover = 1 - cover
     noise = np.random.default_rng(seed).normal(0, 1.5, cover.shape)
-    return np.clip(30 + 180 * cover + noise, 0, 255).astype(np.uint8), xy @ affine.T + offset
+    return np.clip(30 + 180 * cover + noise, 0, 255).astype(np.uint8), centres

@@ -43,6 +43,8 @@ _LEAST_INFORMATION = 1e-6
 _SPECTRUM_HZ, _FREQUENCIES, _STILL_MM_S = (0.1, 3e4), 4000, 1e-9
 _EXCLUDED, _HALVINGS, _SHORTEST_S = 0.5, 6, 1e-5
 """A low-pass is excluded if its log-likelihood is so much less than that of the most probable."""
+_ENOUGH = 1e-6
+"""Relative gain of a log-likelihood, which is some 1e4, that is far below `_EXCLUDED`."""
 
 
 class Series(NamedTuple):
@@ -253,7 +255,9 @@ class _Paths:
         bounds = [
             np.log([p.low / x, p.high / x]) / p.step for p, x in zip(free, begin, strict=True)
         ]
-        best = minimize(score, np.zeros(len(free)), method="L-BFGS-B", bounds=bounds)
+        best = minimize(
+            score, np.zeros(len(free)), method="L-BFGS-B", bounds=bounds, options={"ftol": _ENOUGH}
+        )
         return values_at(best.x)
 
     def log_likelihood(self, values: Array) -> float:

@@ -145,16 +145,15 @@ def test_a_slope_of_light_does_not_move_the_dots() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ground", "dot", "offset", "noise"),
+    ("radius", "ground", "dot", "offset", "noise"),
     [
-        (0.0, 160.0, 0.0, 3.0),
-        (0.0, 160.0, -12.0, 3.0),
-        (270.0, 60.0, 0.0, 3.0),
-        (250.0, 60.0, 0.0, 4.0),
+        (3.0, 0.0, 160.0, 0.0, 3.0),
+        (7.0, 0.0, 160.0, -12.0, 3.0),
+        (7.0, 270.0, 60.0, 0.0, 3.0),
+        (3.0, 250.0, 60.0, 0.0, 4.0),
     ],
     ids=["black", "far below black", "white", "half white"],
 )
-@pytest.mark.parametrize("radius", [3.0, 7.0])
 def test_a_clipped_background_costs_no_dot(
     radius: float, ground: float, dot: float, offset: float, noise: float
 ) -> None:
@@ -299,7 +298,9 @@ def test_bad_input_is_refused_in_words(image: Any, options: Any, message: str) -
 
 
 @pytest.mark.skipif(not PLATE.is_dir(), reason="real images are not beside the repository")
-@pytest.mark.parametrize(("name", "complete"), [("0001_0", 80), ("0012_1", 84)])
+@pytest.mark.parametrize(
+    ("name", "complete"), [pytest.param("0001_0", 80, marks=pytest.mark.slow), ("0012_1", 84)]
+)
 def test_real_print(name: str, complete: int) -> None:
     image = cv2.imread(str(PLATE / f"CalB-sys2-{name}.jpeg"), cv2.IMREAD_GRAYSCALE)
     measured = measure_dots(np.asarray(image))

@@ -71,12 +71,6 @@ def test_densities_are_those_of_the_swarm_whatever_the_sizes() -> None:
     assert found[0]["volume_mm3"] == pytest.approx(39.7 * 39.7 * 24.7, rel=0.02)
 
 
-def test_large_bubbles_would_be_missed_without_the_correction() -> None:
-    parts = [swarm(np.random.default_rng(seed)) for seed in range(10)]
-    plain = np.mean([len(t) / 60 / (40 * 40 * 25) * 1e3 for t, _, _ in parts])
-    assert plain < 0.75 * PER_CM3
-
-
 def test_what_does_not_fit_or_has_no_shape_is_counted_apart() -> None:
     table, bodies, carriage = swarm(np.random.default_rng(1))
     assert swarm_numbers(table, bodies.assign(aspect=np.nan), carriage, UP, UP, cameras()) == {}

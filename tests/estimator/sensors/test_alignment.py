@@ -27,10 +27,10 @@ GRAVITY = 9806.65
 
 
 def motion(rng: Generator, seconds: float) -> tuple[Array, Array, Array]:
-    """(t, place, acceleration) every 0.5 ms: sums of 60 sines along three axes, mm and mm/s^2."""
+    """(t, place, acceleration) every 0.5 ms: sums of 20 sines along three axes, mm and mm/s^2."""
     t = np.arange(-round(seconds * 2000), round((2 + seconds) * 2000)) / 2000
-    w = 2 * np.pi * rng.uniform(3.0, 40.0, (60, 3))
-    a, phase = rng.normal(size=(60, 3)) * 100, rng.uniform(0, 2 * np.pi, (60, 3))
+    w = 2 * np.pi * rng.uniform(3.0, 40.0, (20, 3))
+    a, phase = rng.normal(size=(20, 3)) * 170, rng.uniform(0, 2 * np.pi, (20, 3))
     sines = a * np.sin(w * t[:, None, None] + phase)
     return t, (-sines / w**2).sum(1), sines.sum(1)
 
@@ -60,8 +60,8 @@ def aligned(
     rng: Generator, offset_s: float, *, around_s: float = 20.0, connected: bool = True
 ) -> Alignment:
     t, place, acceleration = motion(rng, around_s)
-    other = motion(rng, around_s)[2]
-    reading = (acceleration if connected else other) + 5.0 * rng.normal(size=acceleration.shape)
+    felt_mm_s2 = acceleration if connected else motion(rng, around_s)[2]
+    reading = felt_mm_s2 + 5.0 * rng.normal(size=acceleration.shape)
     seen = place[(t >= 0) & (t < 2)][::4]
     seen = seen + 0.02 * rng.normal(size=seen.shape)
     images = of_positions(GRID, GRID.t_s, seen)
@@ -72,19 +72,18 @@ def aligned(
     return found
 
 
-@pytest.mark.parametrize("offset_s", [0.0, -0.06, 0.3, 17.0])
-def test_an_offset_is_found_within_its_standard_deviation(offset_s: float) -> None:
+def test_an_offset_is_found_within_its_standard_deviation() -> None:
     errors = []
-    for seed in range(5):
+    for seed, offset_s in enumerate(3 * [0.0, -0.06, 0.3] + [17.0]):
         found = aligned(np.random.default_rng(seed), offset_s, around_s=abs(offset_s) + 3)
         assert found.unique and found.at_zero == (offset_s == 0)
         assert abs(found.offset_s - offset_s) < 5e-4
         errors.append((found.offset_s - offset_s) / found.sd_s)
-    assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 2.0
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
 def test_a_record_without_a_connection_is_not_taken() -> None:
-    for seed in range(10):
+    for seed in range(5):
         rng = np.random.default_rng(100 + seed)
         found = aligned(rng, 0.3, around_s=3.0, connected=False)
         assert not found.unique and not found.at_zero

@@ -103,7 +103,7 @@ def test_the_carriages_motion_is_felt_along_its_axis() -> None:
     assert abs(found[0]) < 0.4
 
 
-@pytest.mark.parametrize("name", ["S0", "S4", "S5", "S6", "rise"])
+@pytest.mark.parametrize("name", ["S0", "S4", "rise"])
 def test_good_runs_of_other_scenarios(name: str, tmp_path: Path) -> None:
     """Slow frames, hard shake, a start from rest: no false alarm."""
     config = run_preset(name, frames=60)

@@ -179,13 +179,27 @@ def test_the_rigs_posterior_is_nearly_that_of_the_joint_graph(
     assert (ratio > 0.99).all() and (ratio < wide).all()
 
 
-@pytest.mark.parametrize("stated", [1.0, 4.0])
-def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learned(
-    stated: float,
-) -> None:
+def check_along_paths(solution: Solution, truth: Array) -> dict[str, float]:
+    """Variances along the paths, over those of independent axes: as stated, and as they are."""
+    found = solution.accelerations
+    assert found is not None
+    velocity = truth[0].reshape(-1, 3)
+    path = velocity / np.linalg.norm(velocity, axis=-1, keepdims=True)
+    stated = _along_path(solution, found)
+    for name, value, true, variance in (
+        ("velocity", solution.velocities_mm_s, truth[0], solution.velocity_variances()),
+        ("acceleration", found.value_mm_s2, truth[1], found.sd_mm_s2**2),
+    ):
+        square = (((value - true.reshape(-1, 3)) * path).sum(-1) ** 2).mean()
+        share = square / (path**2 * variance).sum(-1).mean()
+        assert 0.7 < stated[name] / share < 1.5, (name, stated[name], share)
+    return stated
+
+
+def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learned() -> None:
     """Noise that is stated too large, as by what an unknown shape adds, does not widen them."""
     squares, ways, lengths = [], [], []
-    for seed, inertia_s in enumerate((0.004, 0.01, 0.02)):
+    for seed, (inertia_s, stated) in enumerate(((0.004, 4.0), (0.01, 1.0), (0.02, 4.0))):
         rng = np.random.default_rng(seed)
         problem, truth = drawn_bubbles(rng, inertia_s, 200, 3, 0.005, stated)
         solution = solved(problem, model_of(None))
@@ -206,39 +220,25 @@ def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learne
         faster = ((moved - truth[0].reshape(place.shape)) * along).sum(-1)
         length = np.trapezoid(faster, problem.t_s)
         lengths.append(length**2 / found.length_variance_mm2)
+        assert min(check_along_paths(solution, truth).values()) > 0.7
     mean = np.mean(squares, axis=(0, 2, 3))
     assert ((mean > 0.8) & (mean < 1.25)).all()
     assert 0.4 < np.mean(ways) < 1.8  # 27 of them
     assert 0.3 < np.mean(lengths) < 2.2  # 9 of them
 
 
-@pytest.mark.parametrize("steady", [False, True])
-def test_errors_along_the_paths(steady: bool) -> None:
-    """As independent axes make them, or smaller: with a constant speed, forces are across it."""
-    problem, truth = drawn_bubbles(np.random.default_rng(4), 0.01, 250, 4, 0.004, steady=steady)
-    solution = solved(problem, model_of(None))
-    found = solution.accelerations
-    assert found is not None
-    velocity = truth[0].reshape(-1, 3)
-    path = velocity / np.linalg.norm(velocity, axis=-1, keepdims=True)
-    stated = _along_path(solution, found)
-    for name, value, true, variance in (
-        ("velocity", solution.velocities_mm_s, truth[0], solution.velocity_variances()),
-        ("acceleration", found.value_mm_s2, truth[1], found.sd_mm_s2**2),
-    ):
-        square = (((value - true.reshape(-1, 3)) * path).sum(-1) ** 2).mean()
-        share = square / (path**2 * variance).sum(-1).mean()
-        assert 0.7 < stated[name] / share < 1.5, (name, stated[name], share)
-        assert (stated[name] < 0.7) == steady
+def test_errors_along_paths_of_a_steady_speed_are_smaller() -> None:
+    """Forces are across them there."""
+    problem, truth = drawn_bubbles(np.random.default_rng(4), 0.01, 250, 4, 0.004, steady=True)
+    assert max(check_along_paths(solved(problem, model_of(None)), truth).values()) < 0.7
 
 
-@pytest.mark.parametrize("stated", [1.0, 4.0])
-def test_no_velocity_is_stated_too_well_where_no_low_pass_can_be_seen(stated: float) -> None:
+def test_no_velocity_is_stated_too_well_where_no_low_pass_can_be_seen() -> None:
     """Bubbles that white noise drives, of which the images show no more than the zigzag."""
     squares = []
-    for seed in range(3):
+    for seed, stated in enumerate((1.0, 4.0)):
         rng = np.random.default_rng(seed)
-        problem, truth = drawn_bubbles(rng, 1e-5, 150, 4, 0.01, stated)
+        problem, truth = drawn_bubbles(rng, 1e-5, 150, 6, 0.01, stated)
         solution = solved(problem, model_of(None))
         error = solution.velocities_mm_s - truth[0].reshape(-1, 3)
         squares.append(error**2 / solution.velocity_variances())

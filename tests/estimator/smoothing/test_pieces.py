@@ -32,6 +32,8 @@ from telerig.estimator.smoothing.problem.problem import (
 from telerig.estimator.smoothing.results_file import StoredTables, results_file
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
 
+pytestmark = pytest.mark.usefixtures("known_low_passes")
+
 Array = NDArray[np.float64]
 PLAIN = Options(robust=False, draws=True)
 AXES = "xyz"
@@ -44,9 +46,9 @@ def with_calibration(problem: SmoothingProblem) -> SmoothingProblem:
     return replace(problem, calibration=CalibrationShare(root, free, root @ root.T))
 
 
-def crowded() -> tuple[SmoothingProblem, ShakeModel]:
-    problem, *_ = run(np.random.default_rng(3), bubbles=3, seconds=3.0)
-    cut = with_comings_and_goings(problem, np.random.default_rng(4), 200)
+def crowded(frames: int = 600) -> tuple[SmoothingProblem, ShakeModel]:
+    problem, *_ = run(np.random.default_rng(3), bubbles=3, seconds=frames / 200)
+    cut = with_comings_and_goings(problem, np.random.default_rng(4), frames // 3)
     return with_calibration(cut), true_model()
 
 
@@ -151,14 +153,14 @@ def tracks_of(problem: SmoothingProblem) -> pd.DataFrame:
 
 
 def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
-    problem, _ = crowded()
+    problem, _ = crowded(300)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
     whole, parts = (
         telerig.smooth(
             tracks_of(problem), calibration, model="default", t_s=problem.t_s,
             options=Options(frames=n),
         )
-        for n in (None, 300)
+        for n in (None, 150)
     )  # fmt: skip
     assert parts.verdict["verdict"] == whole.verdict["verdict"]
     assert parts.summary["bubbles"] == whole.summary["bubbles"]
@@ -168,8 +170,9 @@ def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
     assert list(one) == list(other)
     pd.testing.assert_frame_equal(one[[*key, "t_s"]], other[[*key, "t_s"]])
     for axis in AXES:
+        # how near pieces come is measured above, in longer ones
         off = (one[f"{axis}_mm"] - other[f"{axis}_mm"]) / one[f"s{axis}_mm"]
-        assert np.sqrt(np.mean(off**2)) < 0.05
+        assert np.sqrt(np.mean(off**2)) < 0.1
     assert list(whole.shake) == list(parts.shake)
     np.testing.assert_array_equal(whole.shake["frame"], parts.shake["frame"])
     assert parts.solution is None
@@ -191,26 +194,26 @@ def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
 
 
 def test_a_shake_without_bubbles_is_smoothed_in_pieces(tmp_path: Path) -> None:
-    problem, _ = crowded()
+    problem, _ = crowded(200)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
     stage = {"t_s": problem.t_s, "position_mm": 0 * problem.t_s}
     found = telerig.smooth(
         None, calibration, stage=stage, t_s=problem.t_s, model="default",
-        options=Options(frames=300),
+        options=Options(frames=100),
     )  # fmt: skip
-    assert len(found.shake) == 600
+    assert len(found.shake) == 200
     assert not len(found.trajectories)
     found.save(tmp_path)
-    assert len(telerig.load_smoothing(tmp_path).shake) == 600
+    assert len(telerig.load_smoothing(tmp_path).shake) == 200
 
 
 @pytest.mark.parametrize("frames", [None, 100], ids=["whole", "pieces"])
 def test_bubbles_that_come_late_are_judged(frames: int | None, tmp_path: Path) -> None:
-    problem, _ = crowded()
+    problem, _ = crowded(300)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
     table = tracks_of(problem)
     found = telerig.smooth(
-        table[table["frame"] >= 430].reset_index(drop=True), calibration, t_s=problem.t_s,
+        table[table["frame"] >= 215].reset_index(drop=True), calibration, t_s=problem.t_s,
         model="default", options=Options(frames=frames), folder=str(tmp_path),
     )  # fmt: skip
     assert found.verdict["verdict"] in ("RESOLVED", "PARTIAL", "UNRESOLVED")
@@ -220,9 +223,9 @@ def test_bubbles_that_come_late_are_judged(frames: int | None, tmp_path: Path) -
 
 def test_an_encoder_that_covers_a_part_of_the_run() -> None:
     """Where it does not, the carriage is unknown with and without shake, which is no separation."""
-    problem, _ = crowded()
+    problem, _ = crowded(200)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
-    t = problem.t_s[:150]
+    t = problem.t_s[:50]
     words = [
         telerig.smooth(
             tracks_of(problem), calibration, stage={"t_s": t, "position_mm": 0.2 * t},

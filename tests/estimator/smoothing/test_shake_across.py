@@ -18,15 +18,14 @@ from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
 NAME = "modes.3.rms_mm"
 
 
-@pytest.mark.parametrize("seed", [41, 42, 43])
-def test_an_rms_that_the_data_hardly_determine_is_the_root_of_its_mean_square(seed: int) -> None:
+def test_an_rms_that_the_data_hardly_determine_is_the_root_of_its_mean_square() -> None:
     """Against a fine integral over the same evidence and prior."""
-    problem, _, _ = run(np.random.default_rng(seed), bubbles=3, seconds=1.0)
+    problem, _, _ = run(np.random.default_rng(41), bubbles=3, seconds=1.0, rate_hz=100.0)
     group = groups_of(signals_of(problem), Learning(), problem.up)[1]
     hidden = RigMode(1.2 * SWING_HZ, 0.03, (0.1, 0.0, 0.1), CARRIAGE, None)
     model = replace(true_model(), modes=(*true_model().modes, hidden))
     found = posterior_rms(group.fast, model, NAME, 0.1)
-    fine = np.linspace(-3.25, 2.25, 221)
+    fine = np.linspace(-3.25, 2.25, 111)
     values = 0.1 * np.exp(fine)
     log = np.array([evidence(group.fast, with_values(model, [NAME], [v])) for v in values])
     weight = np.exp(log - log.max() - fine**2 / 2)
@@ -43,7 +42,9 @@ def test_where_nothing_tells_it_is_the_priors() -> None:
 
 def test_a_rig_that_bubbles_swings_hide_is_not_taken_for_still() -> None:
     """Modes that are found in the vertical may move across, too; held ones stay as they are."""
-    problem, _, _ = run(np.random.default_rng(46), bubbles=2, seconds=1.2, common_hz=8.0)
+    problem, _, _ = run(
+        np.random.default_rng(46), bubbles=2, seconds=1.2, rate_hz=100.0, common_hz=8.0
+    )
     found = learn(problem, default_model(problem), Learning(most_modes=1))
     upright = [m for m in found.modes if max(m.rms_mm) == m.rms_mm[1]]
     across = [m for m in found.modes if m not in upright and m.frequency_hz < 12]
@@ -51,6 +52,7 @@ def test_a_rig_that_bubbles_swings_hide_is_not_taken_for_still() -> None:
     hidden, seen = (next(m for m in modes if m.camera == CARRIAGE) for modes in (across, upright))
     assert max(hidden.rms_mm) > 0.4 * max(seen.rms_mm)
     start = replace(true_model(), name="mine")
+    problem, _, _ = run(np.random.default_rng(46), bubbles=2, seconds=0.4, rate_hz=100.0)
     held = learn(problem, start, Learning(hold=("modes.*",), most_modes=0))
     rms = [max(m.rms_mm) for m in held.modes if m.rms_mm[1] < max(m.rms_mm)]
     np.testing.assert_allclose(rms[:3], [0.5 * max(m.rms_mm) for m in start.modes])

@@ -177,7 +177,7 @@ def test_a_fixed_target_shows_every_mode_of_the_rig() -> None:
 
 
 def test_several_bubbles_tell_their_own_line_from_the_rigs() -> None:
-    problem, lab, _ = run(np.random.default_rng(7), bubbles=4, seconds=2.0, rate_hz=100.0)
+    problem, lab, _ = run(np.random.default_rng(7), bubbles=4, seconds=1.5, rate_hz=80.0)
     found = learn(problem, default_model(problem), Learning(most_modes=1))
     common = [m for m in found.modes if m.camera == CARRIAGE and m.rms_mm[1] > 0.08]
     lines = [z for z in found.bubble.zigzags if z.rms_mm[1] > 0.08]

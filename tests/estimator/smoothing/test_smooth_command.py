@@ -18,6 +18,8 @@ from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.scripts.main import app
 
+pytestmark = pytest.mark.usefixtures("known_low_passes")
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -66,7 +68,7 @@ def test_another_results_folder_and_tracks_from_a_file(data: Path, tmp_path: Pat
 
 
 def test_only_tracked_frames_count(tmp_path: Path) -> None:
-    config = run_preset("swarm", frames=40)
+    config = run_preset("swarm", frames=40, bubbles=3)
     telerig.simulate(config, rng=np.random.default_rng(2), out=tmp_path, images=False)
     rig = calibration_from_cameras(list(true_cameras(config.calibration).values()))
     run = telerig.load_run(tmp_path / "runs" / "swarm")

@@ -21,11 +21,13 @@ from telerig.io.files.frame_table import FrameTable
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 
+pytestmark = pytest.mark.usefixtures("known_low_passes")
+
 
 def test_a_run_is_tracked_and_smoothed_from_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = run_preset("swarm", frames=60, bubbles=3)
+    config = run_preset("swarm", frames=40, bubbles=3)
     telerig.simulate(config, rng=np.random.default_rng(1), out=tmp_path / "data", images=False)
     cameras = list(true_cameras(config.calibration).values())
     calibration = calibration_from_cameras(cameras, name="truth")

@@ -35,6 +35,8 @@ from telerig.scripts.main import app
 
 UP = np.array([0.0, -1.0, 0.0])
 
+pytestmark = pytest.mark.usefixtures("known_low_passes")
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
+from seeds import few_or_many
 
 import telerig
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
@@ -119,9 +120,10 @@ def units(row: pd.Series, truth: Array, shake: Array) -> tuple[float, float]:
     return float(error[0]), float(error[0] / sd)
 
 
-def test_a_bubble_that_passes_behind_another_keeps_its_points() -> None:
+@few_or_many(2, 6)
+def test_a_bubble_that_passes_behind_another_keeps_its_points(draws: int) -> None:
     hidden, every = set(range(14, 22)), []
-    for seed in range(6):
+    for seed in range(draws):
         found, truth, shake = linked(seed, hidden)
         back = rows_of_back(found, truth, shake)
         assert len(set(back["particle"])) == 1
@@ -143,9 +145,10 @@ def test_the_shared_pixel_follows_the_hiding_cameras_own_shake() -> None:
         assert back.loc[frame, f"{name}_v_px"] == pytest.approx(uv[1], abs=0.35)
 
 
-def test_a_bubble_born_behind_another_is_followed_back() -> None:
+@few_or_many(2, 4)
+def test_a_bubble_born_behind_another_is_followed_back(draws: int) -> None:
     every = []
-    for seed in range(4):
+    for seed in range(draws):
         found, truth, shake = linked(seed, set(range(8)))
         back = rows_of_back(found, truth, shake)
         assert len(set(back["particle"])) == 1

@@ -154,7 +154,7 @@ def run_calibration(
     if detected is None:
         detected = detect(dataset, stage=stage, pictures=pictures)
     table = dataset.dots() if detected is None else detected.dots
-    read = [Finding(code=Code.NOTE, text=note) for note in dataset.notes]
+    read = [Code.NOTE.found(text=note) for note in dataset.notes]
     read += () if detected is None else detected.findings
     calibration = solve_dots(
         dataset, table, model=model, solver=solver, medium=medium, dots_free=dots_free,

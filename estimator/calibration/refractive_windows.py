@@ -120,11 +120,10 @@ def window_findings(calibration: Calibration, rig: RigDescription) -> list[Findi
     cameras = [c for c in calibration.cameras if c.wall is not None]
     if not cameras:
         wet = calibration.medium == "water"
-        return [Finding(code=Code.NO_WINDOWS)] if wet else []
+        return [Code.NO_WINDOWS.found()] if wet else []
     error = model_error_um(calibration.in_air().cameras, calibration.cameras)
     code = Code.WINDOWS_IN_AIR if calibration.medium == "air" else Code.WINDOWS_IN_WATER
-    names = tuple(c.name for c in cameras)
-    found = [Finding(code=code, cameras=names, numbers={"error_um": error})]
+    found = [code.found(cameras=[c.name for c in cameras], error_um=error)]
     for camera in cameras:
         found += _implausible(camera)
         found += _uncertain(calibration, camera) + _tilt_sign_ambiguous(calibration, camera)
@@ -142,15 +141,12 @@ def _implausible(camera: Camera) -> list[Finding]:
     wall, found = camera.wall, list[Finding]()
     if wall is None:
         return []
-    at = (camera.name,)
     first, last = wall.indices[0], wall.indices[-1]
     if first > last:
-        numbers = {"first": first, "last": last}
-        found.append(Finding(code=Code.MEDIA_ORDER, cameras=at, numbers=numbers))
+        found.append(Code.MEDIA_ORDER.found(cameras=camera.name, first=first, last=last))
     leaning = float(np.degrees(np.arccos(min(1.0, abs(wall.normal[2])))))
     if leaning > Code.WINDOW_LEANING.limit:
-        numbers = {"angle_deg": leaning}
-        found.append(Finding(code=Code.WINDOW_LEANING, cameras=at, numbers=numbers))
+        found.append(Code.WINDOW_LEANING.found(cameras=camera.name, angle_deg=leaning))
     return found
 
 
@@ -163,8 +159,8 @@ def _uncertain(calibration: Calibration, camera: Camera) -> list[Finding]:
     points = working_volume((camera,))
     moved = (turned.project(points) - camera.project(points)) / camera["scale_px_per_mm"]
     most = 1e3 * float(np.abs(moved - moved.mean(0)).max())
-    numbers = {"sd_deg": float(np.degrees(sd)), "shift_um": most}
-    return [Finding(code=Code.WINDOW_NORMAL, cameras=(camera.name,), numbers=numbers)]
+    sd_deg = float(np.degrees(sd))
+    return [Code.WINDOW_NORMAL.found(cameras=camera.name, sd_deg=sd_deg, shift_um=most)]
 
 
 def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[Finding]:
@@ -182,8 +178,8 @@ def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[Findi
     sd = max(calibration.sd(f"{camera.name}.{name}") for name in free)
     if apart < 3 * sd or from_stated > 3 * wall.normal_sigma_rad:
         return []
-    numbers = {"tilt_deg": float(np.degrees(apart / 2))}
-    return [Finding(code=Code.WINDOW_TILT_SIGN, cameras=(camera.name,), numbers=numbers)]
+    tilt_deg = float(np.degrees(apart / 2))
+    return [Code.WINDOW_TILT_SIGN.found(cameras=camera.name, tilt_deg=tilt_deg)]
 
 
 def _angle_rad(a: Array, b: Array) -> float:
@@ -203,7 +199,7 @@ def _without_distance(camera: Camera) -> list[Finding]:
     if max(shift, rest) < _NOTABLE_UM:
         return []
     numbers = {"step_mm": _STEP_MM, "shift_um": shift, "rest_um": rest}
-    return [Finding(code=Code.NO_DISTANCE, cameras=(camera.name,), numbers=numbers)]
+    return [Code.NO_DISTANCE.found(numbers, cameras=camera.name)]
 
 
 def window_warnings(rig: RigDescription | None, calibration: Calibration) -> list[str]:

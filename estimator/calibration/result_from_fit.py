@@ -196,19 +196,19 @@ def misfits(fit: Fit, statistics: Mapping[str, Any]) -> list[Finding]:
     scatter = {name: statistics[name] for name in ("scatter_px", "image_noise_px")}
     floor, chi2 = statistics["noise_floor_px"], statistics["chi2_dof"]
     if floor > Code.MODEL_FAILS.limit:
-        found.append(Finding(code=Code.MODEL_FAILS, numbers=scatter, text=fit.model))
+        found.append(Code.MODEL_FAILS.found(text=fit.model, **scatter))
     elif floor > Code.SYSTEMATIC.limit * scatter["image_noise_px"]:
-        found.append(Finding(code=Code.SYSTEMATIC, numbers=scatter, text=fit.model))
+        found.append(Code.SYSTEMATIC.found(text=fit.model, **scatter))
     if (share := statistics["share_kept"]) < Code.FEW_KEPT.limit:
-        found.append(Finding(code=Code.FEW_KEPT, numbers={"share": share}))
+        found.append(Code.FEW_KEPT.found(share=share))
     spread = UNLIKELY_SD * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
     if abs(chi2 - 1) > max(Code.CHI_SQUARE.limit, spread):
-        found.append(Finding(code=Code.CHI_SQUARE, numbers={"chi2_dof": chi2}))
+        found.append(Code.CHI_SQUARE.found(chi2_dof=chi2))
     problem = fit.robust.problem
     measured = np.bincount(problem.view, minlength=len(problem.views)).tolist()
     kept = np.bincount(problem.view[problem.kept], minlength=len(problem.views)).tolist()
     return found + [
-        Finding(code=Code.ODD_VIEW, views=(name,), numbers={"kept": k, "dots": n})
+        Code.ODD_VIEW.found(views=name, kept=k, dots=n)
         for name, k, n in zip(problem.views, kept, measured)
         if k < Code.ODD_VIEW.limit * n
     ]

@@ -126,7 +126,7 @@ def _measured(dataset: Dataset, folder: Path, read: list[Finding]) -> pd.DataFra
     """
     table, notes = folder / "dots.csv", list[str]()
     views = _image_views(dataset, folder, notes)
-    read += [Finding(code=Code.NOTE, text=note) for note in notes]
+    read += [Code.NOTE.found(text=note) for note in notes]
     if table.is_file() == bool(views):
         what = "both images and dots.csv" if views else "neither images nor dots.csv"
         raise InputError(
@@ -142,7 +142,6 @@ def _measured(dataset: Dataset, folder: Path, read: list[Finding]) -> pd.DataFra
     read += [
         finding.model_copy(update={"views": tuple(f"{FOLDER}/{view}" for view in finding.views)})
         for finding in found.findings
-        if finding.views
     ]
     return found.dots
 
@@ -161,8 +160,7 @@ def _far_axis(axis: Array, stated: tuple[float, float, float]) -> list[Finding]:
     angle = float(np.degrees(np.arccos(np.clip(axis @ np.asarray(stated), -1, 1))))
     if angle < Code.STAGE_AXIS_FAR.limit:
         return []
-    numbers = {"angle_deg": angle, **dict(zip("xyz", axis.tolist()))}
-    return [Finding(code=Code.STAGE_AXIS_FAR, numbers=numbers)]
+    return [Code.STAGE_AXIS_FAR.found(angle_deg=angle, **dict(zip("xyz", axis.tolist())))]
 
 
 def stage_axis_of(
@@ -211,7 +209,7 @@ def _dots(
     index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
     known = table["dot"].isin(index).to_numpy()
     unknown = int((~known).sum())
-    findings = [Finding(code=Code.UNKNOWN_DOTS, numbers={"count": unknown})] if unknown else []
+    findings = [Code.UNKNOWN_DOTS.found(count=unknown)] if unknown else []
     if unknown and not known.any():
         raise InputError(
             f"none of the {unknown} dots has a number that is in the calibration",
@@ -220,8 +218,8 @@ def _dots(
         )
     rows = table[known]
     views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
-    unseen = tuple(v for v in readings if v not in views)
-    findings += [Finding(code=Code.UNSEEN_POSITIONS, views=unseen)] if unseen else []
+    unseen = [v for v in readings if v not in views]
+    findings += [Code.UNSEEN_POSITIONS.found(views=unseen)] if unseen else []
     reading = np.array([readings[v] for v in views])
     _check_enough(reading, set(rows["camera"]))
     number = {v: i for i, v in enumerate(views)}
@@ -327,7 +325,7 @@ def _observed_sigma(
 def _scatters(given: tuple[float, float], observed: tuple[float, float]) -> list[Finding]:
     codes = (Code.READINGS_SCATTER, Code.CARRIAGE_WANDERS)
     return [
-        Finding(code=code, numbers={"found_um": 1000 * new, "stated_um": 1000 * old})
+        code.found(found_um=1000 * new, stated_um=1000 * old)
         for code, old, new in zip(codes, given, observed)
         if new > old
     ]
@@ -338,14 +336,14 @@ def _suspects(dots: Dots, weights: Weights, system: StageEquations) -> list[Find
     found = []
     for v in np.flatnonzero(weights.views < Code.WRONG_READING.limit).tolist():
         error = float(np.linalg.norm(system.shift_mm[v]))
-        numbers = {"reading_mm": float(dots.reading_mm[v]), "error_mm": error}
-        found.append(Finding(code=Code.WRONG_READING, views=(dots.views[v],), numbers=numbers))
+        reading = float(dots.reading_mm[v])
+        wrong = Code.WRONG_READING.found(views=dots.views[v], reading_mm=reading, error_mm=error)
+        found.append(wrong)
     odd = int((weights.dots < Code.STAGE_OUTLIERS.limit).sum())
     if odd:
-        numbers = {"count": odd, "dots": len(weights.dots)}
-        found.append(Finding(code=Code.STAGE_OUTLIERS, numbers=numbers))
+        found.append(Code.STAGE_OUTLIERS.found(count=odd, dots=len(weights.dots)))
     if len(dots.views) == 2:
-        found.append(Finding(code=Code.TWO_POSITIONS))
+        found.append(Code.TWO_POSITIONS.found())
     return found
 
 
@@ -385,14 +383,14 @@ def _result(
 
 
 def _summary(dots: Dots, axis: Array, travel_per_reading: float, joint: Array) -> Finding:
-    numbers = dict(zip("xyz", axis.tolist())) | {
-        "sd_deg": float(np.degrees(np.sqrt(np.linalg.eigvalsh(joint[:2, :2])[-1]))),
-        "positions": len(dots.views),
-        "range_mm": float(np.ptp(dots.reading_mm)),
-        "scale_ppm": 1e6 * (1 / travel_per_reading - 1),
-        "scale_sd_ppm": float(1e6 * np.sqrt(joint[2, 2])),
-    }
-    return Finding(code=Code.STAGE, numbers=numbers)
+    return Code.STAGE.found(
+        **dict(zip("xyz", axis.tolist())),
+        sd_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(joint[:2, :2])[-1]))),
+        positions=len(dots.views),
+        range_mm=float(np.ptp(dots.reading_mm)),
+        scale_ppm=1e6 * (1 / travel_per_reading - 1),
+        scale_sd_ppm=float(1e6 * np.sqrt(joint[2, 2])),
+    )
 
 
 LEAST_TRAVEL_MM = 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -229,7 +228,6 @@ class ImageDots:
     dots, rejected : ``table`` and ``rejected`` of `TargetDetection`.
     handedness : -1 if the image shows the target mirrored, +1 if not, 0 if no target was found.
     failure : why the image was left out, or "".
-    numberings : how many numberings are equally good, because the target is symmetric.
     overlay : JPEG data of the image with the dots and rejected candidates drawn, or empty.
     """
 
@@ -239,7 +237,6 @@ class ImageDots:
     rejected: pd.DataFrame
     handedness: int
     failure: str = ""
-    numberings: int = 1
     overlay: bytes = b""
 
 
@@ -335,15 +332,10 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
         )
     hands = {(i.view, i.camera): i.handedness for i in found if not i.failure}
     check_handedness(hands, dataset.target.two_sided)
-    findings = [
-        Finding(code=Code.LEFT_OUT, cameras=(i.camera,), views=(i.view,), text=i.failure)
-        for i in failures
-    ]
-    for count, images in Counter(i.numberings for i in found if i.numberings > 1).items():
-        findings.append(Finding(code=Code.NUMBERINGS, numbers={"count": count, "images": images}))
-    return DatasetDots(
-        _joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(findings)
+    left_out = tuple(
+        Code.LEFT_OUT.found(cameras=i.camera, views=i.view, text=i.failure) for i in failures
     )
+    return DatasetDots(_joined(found, "dots"), _joined(found, "rejected"), tuple(found), left_out)
 
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
@@ -394,8 +386,7 @@ def _numbered_image(dataset: Dataset, image: NDArray[Any], view: View, camera: s
         words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
         rejected = rejected_table(measured, slice(None), error.what)
         return ImageDots(view.name, camera, NO_DOTS, rejected, 0, words)
-    count, handedness = len(found.numbering.equivalents), found.numbering.handedness
-    return ImageDots(view.name, camera, found.table, found.rejected, handedness, numberings=count)
+    return ImageDots(view.name, camera, found.table, found.rejected, found.numbering.handedness)
 
 
 def _smallest_px(dataset: Dataset, camera: str) -> float:

@@ -421,7 +421,7 @@ class CalibrationFile(Record):
         code_of = dict.fromkeys(filter(None, said), Code.NOTE)
         code_of |= dict.fromkeys(warned, Code.EARLIER_REASON)
         code_of |= dict.fromkeys(against, codes.get(status, Code.EARLIER_REASON))
-        return tuple(Finding(code=code, text=words) for words, code in code_of.items())
+        return tuple(code.found(text=words) for words, code in code_of.items())
 
     @field_validator("statistics")
     @classmethod

@@ -8,7 +8,7 @@ notes, on the terminal, in calibration.json and on the pages, are made from the 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, StrEnum, unique
 from typing import Annotated, Any, Self
@@ -275,10 +275,6 @@ class Code(Enum):
     )
     # What was read.
     LEFT_OUT = Kind(_NOTE, "{views}, {cameras} is left out: {text}")
-    NUMBERINGS = Kind(
-        _NOTE,
-        "the target is symmetric: {count:.0f} numberings are equally good (in {images:.0f} images)",
-    )
     TURNS_KNOWN = Kind(
         _NOTE,
         "{turns:.0f}-fold symmetric target without marks: numbered so that all cameras and all "
@@ -395,6 +391,26 @@ class Code(Enum):
         """Return the value from which on the check finds it."""
         assert self.value.limit is not None
         return self.value.limit
+
+    def found(
+        self,
+        numbers: Mapping[str, float] | None = None,
+        /,
+        *,
+        cameras: str | Sequence[str] = (),
+        views: str | Sequence[str] = (),
+        names: str | Sequence[str] = (),
+        text: str = "",
+        **more: float,
+    ) -> Finding:
+        """Return a finding of this kind.
+
+        numbers, more : the numbers.
+        cameras, views, names, text : as in `Finding`; one name stands for itself.
+        """
+        where = {"cameras": cameras, "views": views, "names": names}
+        places = {key: (of,) if isinstance(of, str) else tuple(of) for key, of in where.items()}
+        return Finding(code=self, numbers={**(numbers or {}), **more}, text=text, **places)
 
 
 TRUST = {Code.NO_STRUCTURE, Code.HALVES_AGREE, Code.HALVES_NOT_COMPARED}

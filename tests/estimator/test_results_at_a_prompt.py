@@ -18,7 +18,7 @@ from telerig.estimator.calibration.result.calibration import calibration_from_ca
 from telerig.io.exchange.export.netcdf import write_netcdf
 from telerig.io.exchange.export.opencv import camera_matrices
 from telerig.io.exchange.export.run_results import read_results
-from telerig.io.results.findings import Code, Finding
+from telerig.io.results.findings import Code
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
@@ -97,7 +97,7 @@ def test_texts_of_results_without_rows(chain: Chain) -> None:
 
 def test_long_reasons_are_cut(chain: Chain) -> None:
     faults = ("a fault " * 100, "another")
-    findings = tuple(Finding(code=Code.EARLIER_REJECTION, text=text) for text in faults)
+    findings = tuple(Code.EARLIER_REJECTION.found(text=text) for text in faults)
     text = repr(replace(chain.calibration, findings=findings))
     assert max(map(len, text.splitlines())) < LONGEST + 20 and "and 1 more" in text
 

@@ -77,22 +77,20 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     tilts = {k: _tilt_deg(m.jacobian) for k, m in maps.items()}
     _refuse_parallel(problem, maps, usable)
     if len(usable) < Code.FEW_VIEWS.limit:
-        findings.append(Finding(code=Code.FEW_VIEWS, numbers={"count": len(usable)}))
+        findings.append(Code.FEW_VIEWS.found(count=len(usable)))
     for c, camera in enumerate(problem.cameras):
         largest = max((t for (_, k), t in tilts.items() if k == c), default=np.inf)
-        at = (camera.name,)
         if largest < Code.SMALL_TILTS.limit:
-            numbers = {"tilt_deg": largest}
-            findings.append(Finding(code=Code.SMALL_TILTS, cameras=at, numbers=numbers))
+            findings.append(Code.SMALL_TILTS.found(cameras=camera.name, tilt_deg=largest))
         cells = _cells_covered(problem, c)
         if cells < Code.COVERAGE.limit:
-            findings.append(Finding(code=Code.COVERAGE, cameras=at, numbers={"cells": cells}))
+            findings.append(Code.COVERAGE.found(cameras=camera.name, cells=cells))
         alone = [n for v, n in enumerate(problem.views) if {k for w, k in maps if w == v} == {c}]
         if stereo and alone:
-            findings.append(Finding(code=Code.ONE_CAMERA, cameras=at, views=tuple(alone)))
+            findings.append(Code.ONE_CAMERA.found(cameras=camera.name, views=alone))
     unused = [n for v, n in enumerate(problem.views) if v not in {w for w, _ in maps}]
     if unused:
-        findings.append(Finding(code=Code.UNUSED_VIEWS, views=tuple(unused)))
+        findings.append(Code.UNUSED_VIEWS.found(views=unused))
     return PreCheck(tilts, tuple(findings))
 
 
@@ -171,7 +169,7 @@ def loose_offsets(problem: Problem, state: State) -> list[Finding]:
     loose = vectors[:, values < Code.OFFSET.limit**2 * values[-1]]
     size = np.linalg.norm(np.einsum("cij,jk->cik", free, loose), axis=1)
     cameras = sorted({int(c) for c in size.argmax(0)}) if size.size else []
-    return [Finding(code=Code.OFFSET, cameras=(problem.cameras[c].name,)) for c in cameras]
+    return [Code.OFFSET.found(cameras=problem.cameras[c].name) for c in cameras]
 
 
 def exchanged_cameras(problem: Problem, state: State) -> list[Finding]:
@@ -189,8 +187,8 @@ def exchanged_cameras(problem: Problem, state: State) -> list[Finding]:
         if own > Code.EXCHANGED.limit and crossed < own / 4:
             scales = [np.exp(logarithm[c]) for logarithm in (estimated, nominal) for c in (a, b)]
             numbers = dict(zip(("first", "second", "first_stated", "second_stated"), scales))
-            names = tuple(problem.cameras[c].name for c in (a, b))
-            findings.append(Finding(code=Code.EXCHANGED, cameras=names, numbers=numbers))
+            names = [problem.cameras[c].name for c in (a, b)]
+            findings.append(Code.EXCHANGED.found(cameras=names, **numbers))
     return findings
 
 
@@ -208,7 +206,7 @@ def _mirrored(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[F
     check_handedness(hands, problem.target.two_sided)
     if problem.target.two_sided or not hands or max(hands.values()) > 0:
         return []
-    return [Finding(code=Code.MIRRORED)]
+    return [Code.MIRRORED.found()]
 
 
 def _tilt_deg(jacobian: Array) -> float:
@@ -259,7 +257,7 @@ def parallel_axes(state: State) -> list[Finding]:
     """Return a finding if the optical axes are nearly parallel: `axes_angle_deg`."""
     if len(state.rig_from_camera) < 2 or axes_angle_deg(state) > Code.NEAR_PARALLEL.limit:
         return []
-    return [Finding(code=Code.NEAR_PARALLEL, numbers={"angle_deg": axes_angle_deg(state)})]
+    return [Code.NEAR_PARALLEL.found(angle_deg=axes_angle_deg(state))]
 
 
 def weak_parameters(problem: Problem, joint: JointCovariance) -> list[Finding]:
@@ -275,7 +273,7 @@ def weak_parameters(problem: Problem, joint: JointCovariance) -> list[Finding]:
         for name in (f"{camera.name}.{parameter}" for parameter in free):
             share = sd[names.index(name)] / prior[INDEX[name.rpartition(".")[2]]]
             if share > Code.WEAK.limit:
-                found.append(Finding(code=Code.WEAK, names=(name,), numbers={"share": share}))
+                found.append(Code.WEAK.found(names=name, share=share))
     return found + linked_parameters(names, covariance)
 
 
@@ -288,9 +286,8 @@ def linked_parameters(names: tuple[str, ...], covariance: Array) -> list[Finding
     for members in (np.flatnonzero(group == k) for k in range(count)):
         if len(members) > 1:
             among = correlation[np.ix_(members, members)].ravel()
-            numbers = {"correlation": among[np.abs(among).argmax()]}
-            linked = tuple(names[i] for i in members)
-            found.append(Finding(code=Code.LINKED, names=linked, numbers=numbers))
+            largest = among[np.abs(among).argmax()]
+            found.append(Code.LINKED.found(names=[names[i] for i in members], correlation=largest))
     return found
 
 

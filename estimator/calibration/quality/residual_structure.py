@@ -72,15 +72,13 @@ def residual_tests(
     objecting = [t for t in tests if t.p_value < t.code.limit / shared.get(t.code, len(tests))]
     widening = max((t.numbers.get("widening", 1.0) for t in objecting), default=1.0)
     findings = [
-        Finding(code=t.code, cameras=(t.camera,), numbers=t.numbers | {"widening": widening})
+        t.code.found(t.numbers | {"widening": widening}, cameras=t.camera)
         for t in objecting if not t.view
     ]  # fmt: skip
     for name in dict.fromkeys(t.camera for t in objecting if t.view):
         worse = {t.view: t.size for t in objecting if t.view and t.camera == name}
-        ratio = {"ratio": max(worse.values())}
-        findings.append(
-            Finding(code=Code.WORSE_VIEWS, cameras=(name,), views=tuple(worse), numbers=ratio)
-        )
+        ratio = max(worse.values())
+        findings.append(Code.WORSE_VIEWS.found(cameras=name, views=[*worse], ratio=ratio))
     rows = [
         {
             "code": t.code.name, "camera": t.camera, "view": t.view, "size": t.size,
@@ -88,7 +86,7 @@ def residual_tests(
         }
         for t in tests
     ]  # fmt: skip
-    return {"tests": rows, "widening": widening}, findings or [Finding(code=Code.NO_STRUCTURE)]
+    return {"tests": rows, "widening": widening}, findings or [Code.NO_STRUCTURE.found()]
 
 
 def standardised_residuals(whitened: Array, leverage: Array) -> Array:

@@ -74,11 +74,11 @@ def split_half_check(
         "points_mm": np.round(field.points_mm, 4).tolist(),
         "shift_um": np.round(1e3 * field.shift_mm, 4).tolist(),
         "sd_um": np.round(1e3 * field.sd_mm, 4).tolist(),
-    }, [Finding(code=code, numbers=compared | numbers)]
+    }, [code.found(compared | numbers)]
 
 
 def _not_compared(why: str) -> tuple[dict[str, Any], list[Finding]]:
-    return {}, [Finding(code=Code.HALVES_NOT_COMPARED, text=why)]
+    return {}, [Code.HALVES_NOT_COMPARED.found(text=why)]
 
 
 def _size(

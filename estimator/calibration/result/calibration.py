@@ -718,7 +718,7 @@ def calibration_from_cameras(
     verdict, which is IMPORTED, says so. Raises CalibrationError if there is no camera, if two have
     the same name, if the first frame is not the rig frame, or if sigma_px is not positive.
     """
-    from telerig.io.results.findings import Code, Finding
+    from telerig.io.results.findings import Code
 
     names = [c.name for c in cameras]
     if not names or len(set(names)) != len(names):
@@ -745,8 +745,8 @@ def calibration_from_cameras(
         free=tuple(() for _ in cameras),
         name=name,
         findings=(
-            Finding(code=Code.NO_UNCERTAINTY),
-            *(Finding(code=Code.NOTE, text=note) for note in notes),
+            Code.NO_UNCERTAINTY.found(),
+            *(Code.NOTE.found(text=note) for note in notes),
         ),
         model={"words": "imported and held fixed"},
         diagnostics={"gauge": "as imported"},

@@ -86,10 +86,8 @@ def far_rotations(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -
     for c, rotvec_deg in nominal_rotvec_deg.items():
         angle, name = angle_to_nominal_deg(state, {c: rotvec_deg}), problem.cameras[c].name
         if angle > Code.ROTATION_FAR.limit:
-            stated, numbers = f"{name}_from_{first}_rotvec_deg", {"angle_deg": angle}
-            found.append(
-                Finding(code=Code.ROTATION_FAR, cameras=(name,), names=(stated,), numbers=numbers)
-            )
+            key = f"{name}_from_{first}_rotvec_deg"
+            found.append(Code.ROTATION_FAR.found(cameras=name, names=key, angle_deg=angle))
     return found
 
 

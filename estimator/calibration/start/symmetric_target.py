@@ -46,9 +46,8 @@ def number_consistently(
     problem, contrast = _numbered_alike_in_views(problem, labels)
     problem = replace(problem, scale=known_scale(problem.target, problem.dot_ids))
     problem, about_scale = _scale_of_any_turn(problem, labels)
-    numbers = {"turns": len(labels), "contrast_sd": contrast}
     code = Code.TURNS_KNOWN if contrast > Code.TURNS_UNKNOWN.limit else Code.TURNS_UNKNOWN
-    return problem, [Finding(code=code, numbers=numbers), *about_scale]
+    return problem, [code.found(turns=len(labels), contrast_sd=contrast), *about_scale]
 
 
 def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, list[Finding]]:
@@ -60,8 +59,8 @@ def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, l
     if all(set(label[ends]) == set(ends) for label in labels):
         return problem, []
     either = float(np.hypot(sigma, np.sqrt(2) * problem.target.print_sigma_mm))
-    numbers = {"first": int(ends[0]), "second": int(ends[1]), "sd_um": 1e3 * either}
-    finding = Finding(code=Code.TURNED_DISTANCE, numbers=numbers)
+    first, second = (int(end) for end in ends)
+    finding = Code.TURNED_DISTANCE.found(first=first, second=second, sd_um=1e3 * either)
     return replace(problem, scale=(pair, distance, either)), [finding]
 
 

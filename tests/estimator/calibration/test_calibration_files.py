@@ -18,13 +18,13 @@ from telerig.estimator.calibration.result.calibration import (
     calibration_from_cameras,
     load_calibration,
 )
-from telerig.io.results.findings import Code, Finding
+from telerig.io.results.findings import Code
 
 
 @pytest.fixture(scope="module")
 def calibration(scene: Any) -> Calibration:
     made = scene("near_telecentric", 3, outlier_share=0.02)
-    note = Finding(code=Code.NOTE, text="a note")
+    note = Code.NOTE.found(text="a note")
     return made.calibrate("kappa+radial", name="tank 2", findings=[note])
 
 

@@ -169,15 +169,14 @@ def test_real_printed_grid_is_numbered_from_its_rings(camera: int) -> None:
         assert np.abs(bilinear @ fit - table[axis]).max() < 4
 
 
-def test_what_images_share_is_found_once(paper_images: Path) -> None:
+def test_an_image_that_is_left_out_is_found(paper_images: Path) -> None:
     data = telerig.load_dataset(paper_images)
     table = pd.DataFrame({"dot": DESIGN.ids()[:0]})
-    images = [ImageDots(f"{k}", "left", table, table, 1, numberings=2) for k in range(3)]
+    images = [ImageDots(f"{k}", "left", table, table, 1) for k in range(3)]
     dark = ImageDots("3", "left", table, table, 0, "no dots found")
     found = detected_together(data, [*images, dark])
-    assert codes(found) == ["LEFT_OUT", "NUMBERINGS"]
+    assert codes(found) == ["LEFT_OUT"]
     assert only(found, Code.LEFT_OUT).views == ("3",)
-    assert only(found, Code.NUMBERINGS).numbers == {"count": 2, "images": 3}
 
 
 def test_an_image_of_rejected_spots_says_why() -> None:

@@ -30,10 +30,7 @@ def one(code: Code) -> Finding:
     """A finding of that kind, at some place with some numbers."""
     names = set(re.findall(r"\{(\w+)", code.value.says))
     numbers = dict.fromkeys(names - {"cameras", "views", "names", "parameters", "text"}, 2.0)
-    return Finding(
-        code=code, cameras=("left",), views=("v1", "v2"), names=("left.k1",), numbers=numbers,
-        text="why",
-    )  # fmt: skip
+    return code.found(numbers, cameras="left", views=("v1", "v2"), names="left.k1", text="why")
 
 
 @pytest.mark.parametrize("code", Code, ids=lambda code: code.name)

@@ -69,12 +69,17 @@ def _of_tracks(change: Callable[[pd.DataFrame], pd.DataFrame]) -> Callable[[Any]
     return lambda tracks: replace(tracks, table=change(tracks.table))
 
 
+def _pixels_of(table: pd.DataFrame) -> tuple[str, ...]:
+    """The columns of the pixels' covariances in tracks.csv."""
+    return tuple(c for c in table if str(c).endswith(PIXELS))
+
+
 def sd15() -> None:
     """All stated standard deviations are 15 % too small."""
     for name in ("locate_dots", "detect_bubbles"):
         _after(name, lambda table: _scaled(table, PIXELS, SD**2))
     _after("calibrate", lambda found: replace(found, covariance=SD**2 * found.covariance))
-    _after("track", _of_tracks(lambda table: _scaled(table, SPACE, SD**2)))
+    _after("track", _of_tracks(lambda t: _scaled(t, (*SPACE, *_pixels_of(t)), SD**2)))
     sds = ("sx_mm", "sy_mm", "sz_mm")
     _after("smooth", _of_paths(lambda table: _scaled(table, sds, SD)))
 
@@ -109,7 +114,13 @@ def error10() -> None:
     for name in ("locate_dots", "detect_bubbles"):
         _after(name, lambda table: _noisy(table, pixels, True))
     space = tuple((f"{a}_mm", f"s{a}{a}_mm2") for a in "xyz")
-    _after("track", _of_tracks(lambda table: _noisy(table, space, True)))
+
+    def worse(table: pd.DataFrame) -> pd.DataFrame:
+        spreads = [c for c in _pixels_of(table) if c[-5:] in ("u_px2", "v_px2") and "suv" not in c]
+        views = tuple((f"{c.rsplit('_', 2)[0]}_{c[-5]}_px", c) for c in spreads)
+        return _noisy(table, (*space, *views), True)
+
+    _after("track", _of_tracks(worse))
     paths = tuple((f"{a}_mm", f"s{a}_mm") for a in "xyz")
     _after("smooth", _of_paths(lambda table: _noisy(table, paths, False)))
     original = telerig.calibrate

@@ -213,13 +213,19 @@ def comparison(moved: Sequence[Moved], *, whole: bool = False) -> list[str]:
 
 def as_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:
     return {
-        key: {k: _number(v) for k, v in asdict(metric).items() if k != "name" and v != ""}
+        key: {
+            k: _number(v)
+            for k, v in asdict(metric).items()
+            if k == "value" or (k != "name" and v != "")
+        }
         for key, metric in metrics.items()
     }
 
 
 def from_json(data: Mapping[str, Any]) -> dict[str, Metric]:
-    return {key: Metric(key.rsplit("/", 1)[1], **entry) for key, entry in data.items()}
+    return {
+        key: Metric(key.rsplit("/", 1)[1], **({"value": ""} | entry)) for key, entry in data.items()
+    }
 
 
 def _number(value: Any) -> Any:

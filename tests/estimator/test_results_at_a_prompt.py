@@ -142,7 +142,7 @@ def test_xarray_has_the_covariance_and_what_the_netcdf_file_has(
     assert smoothed["vx_mm_s"].attrs["units"] == "mm s-1"
     chain.smoothing.save(tmp_path / "rise")
     write_netcdf(read_results(tmp_path / "rise"), tmp_path / "rise.nc")
-    with xarray.open_dataset(tmp_path / "rise.nc", engine="scipy", decode_times=False) as file:
+    with xarray.open_dataset(tmp_path / "rise.nc", engine="scipy") as file:
         for name in file.variables:
             np.testing.assert_array_equal(file[name], smoothed[name], err_msg=str(name))
             assert {k: v for k, v in file[name].attrs.items() if k != "coordinates"} == {

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _LARGEST = np.iinfo(np.int32).max
 _NAMES = {"t_s": "time", "x_mm": "x", "y_mm": "y", "z_mm": "z"}
 _WORDS = {
-    "t_s": "time of mid-exposure",
+    "t_s": "time of mid-exposure by the clock of the record, which has no date",
     "x_mm": "position along x, right in the first camera's image",
     "y_mm": "position along y, down in the first camera's image",
     "z_mm": "position along z, away from the first camera",
@@ -139,9 +139,8 @@ def _attributes(column: str) -> dict[str, Any]:
         return {
             "standard_name": "time",
             "long_name": _WORDS[column],
-            "units": "seconds since 1970-01-01 00:00:00",
-            "calendar": "standard",
-            "comment": "the recording's own clock: differences count, the date is a placeholder",
+            "units": "s",  # "seconds" would become time differences in xarray, "since" dates
+            "axis": "T",
         }
     out = {"units": unit_of(column), "long_name": _WORDS.get(column, column.replace("_", " "))}
     return out if column in _NAMES else out | {"coordinates": "time x y z"}

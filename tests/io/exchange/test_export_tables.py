@@ -169,7 +169,9 @@ def test_netcdf_by_xarray_and_named_particles(folder: Path, tmp_path: Path) -> N
     xarray = pytest.importorskip("xarray")
     results = named(read_results(folder))
     write_netcdf(results, tmp_path / "out.nc")
-    with xarray.open_dataset(tmp_path / "out.nc", decode_times=False, engine="scipy") as data:
+    with xarray.open_dataset(tmp_path / "out.nc", engine="scipy") as data:
+        assert data["time"].dtype == float and data["time"].attrs["units"] == "s"
+        np.testing.assert_array_equal(data["time"], results.points["t_s"])
         assert data["particle_name"].values.tolist() == ["äb", "b", "c"]
         assert data["rowSize"].values.tolist() == [25, 30, 1]
         np.testing.assert_array_equal(data["y"], results.points["y_mm"])

@@ -217,3 +217,20 @@ def test_architecture_names_what_is_there() -> None:
     named = re.findall(r"`((?:rig|factors|estimator|io|scripts|tests)/[\w/]+(?:\.py)?)`", text)
     gone = [p for p in named if not (ROOT / p).exists() and not (ROOT / f"{p}.py").exists()]
     assert len(named) > 30 and not gone
+
+
+def test_pictures_are_those_that_pages_show() -> None:
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+    shown = re.compile(r"!\[[^]]*\]\((?:\.\./|docs/)*pictures/([\w-]+\.png)\)")
+    named = {name for page in pages for name in shown.findall(page.read_text(encoding="utf-8"))}
+    assert named == {file.name for file in (ROOT / "docs" / "pictures").iterdir()}
+
+
+@pytest.mark.slow
+def test_one_command_makes_all_pictures(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "docs" / "pictures.py"), "--out", str(tmp_path / "made")]
+    done = subprocess.run(command, text=True, capture_output=True, timeout=1800)
+    assert done.returncode == 0, done.stderr[-2000:]
+    made = {file.name for file in (tmp_path / "made").iterdir()}
+    missing = {file.name for file in (ROOT / "docs" / "pictures").iterdir()} - made
+    assert missing == ({"report.png", "batch.png"} if "no browser" in done.stdout else set())

@@ -73,14 +73,15 @@ def plate_corners(points_mm: Array, margin: float = 0.0) -> Array:
 def common_plane(results: CalibrationResults) -> Array:
     """Return unit vectors (2, 3), across and along the first axis, of the plane of both axes.
 
-    For one camera or parallel axes they are the first camera's x and z.
+    Across points to the first camera's right, or down where the axes lie one above the other. For
+    one camera or parallel axes they are the first camera's x and z.
     """
-    along = results.cameras[0].camera_from_rig.rotation[2]
+    right, down, along = results.cameras[0].camera_from_rig.rotation
     across = results.cameras[-1].camera_from_rig.rotation[2]
     across = across - (across @ along) * along
     if np.linalg.norm(across) < 0.05:
-        across = results.cameras[0].camera_from_rig.rotation[0]
-    if across @ results.cameras[0].camera_from_rig.rotation[0] < 0:
+        across = right
+    if across @ max(right, down, key=lambda side: abs(across @ side)) < 0:
         across = -across
     return np.array([across / np.linalg.norm(across), along])
 

@@ -109,7 +109,27 @@ def test_outline_of_a_field_is_what_the_image_corners_see() -> None:
     corners = np.array([[-0.5, -0.5], [511.5, -0.5], [511.5, 511.5], [-0.5, 511.5]])
     for section in rig_outline(results).cameras[1].field_mm:
         np.testing.assert_allclose(results.cameras[1].project(section), corners, atol=1e-9)
-    np.testing.assert_allclose(np.abs(common_plane(results)), [[1, 0, 0], [0, 0, 1]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rotvec_deg", "across", "sign"),
+    [((0, 90, 0), (1, 0, 0), 1), ((0, -90, 0), (1, 0, 0), -1), ((0, 30, 0), (1, 0, 0), 1),
+     ((90, 1e-6, 0), (0, 1, 0), -1), ((90, 0, 1e-6), (0, 1, 0), -1),
+     ((-90, 1e-6, 0), (0, 1, 0), 1)],
+)  # fmt: skip
+def test_the_second_camera_is_drawn_where_it_stands(
+    rotvec_deg: tuple[float, ...], across: tuple[int, ...], sign: int
+) -> None:
+    """A camera that is turned by +90 degrees about y stands at the right, by +90 about x above."""
+    pose = Pose.from_rotvec(np.radians(rotvec_deg), [0.0, 0.0, 0.0])
+    found = _results()
+    second = replace(found.cameras[1], camera_from_rig=pose)
+    results = replace(found, cameras=(found.cameras[0], second))
+    plane = common_plane(results)
+    np.testing.assert_allclose(plane, [across, (0, 0, 1)], atol=1e-6)
+    first, other = (c.body_mm.reshape(8, 3).mean(0) @ plane.T for c in rig_outline(results).cameras)
+    assert np.sign(other[0]) == sign and first[1] < -10.0 and abs(first[0]) < 1e-9
+    assert second.unproject([256.0, 256.0])[1] @ np.array(across) * sign < 0  # towards the middle
 
 
 def test_outline_of_a_perspective_camera_stays_in_front_of_its_centre() -> None:

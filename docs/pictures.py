@@ -1,0 +1,221 @@
+"""Make all pictures of docs/pictures again: python docs/pictures.py [--out FOLDER]
+
+It runs `telerig demo` and a small batch in a temporary folder (some minutes), and draws the
+pictures of their reports, a frame of each film, and which folder imports which. The two pictures of
+whole pages need chromium or Chrome; without a browser they stay as they are. Needs telerig[dev].
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import grimp
+import networkx as nx
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from telerig.io.report.calibration import dot_fit, rig, target
+from telerig.io.report.calibration import figures as calibration_figures
+from telerig.io.report.calibration.results import read_results
+from telerig.io.report.run.smoothing import figures
+from telerig.io.report.run.smoothing.results import read_smoothing_results
+from telerig.io.report.run.tracking.figures import ray_miss_histogram
+from telerig.io.report.run.tracking.results import read_track_results, run_cameras
+from telerig.io.report.run.tracking.two_rays import two_rays
+
+FOLDER = Path(__file__).parent / "pictures"
+DPI = 150
+COLOURS = 64
+LARGEST_BYTES, ALL_BYTES = 150_000, 700_000
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+OPENED = ("telerig.estimator", "telerig.io")
+"""Folders that are shown as their inner folders in the picture of the imports."""
+FLOOR_COLOURS = {"rig": "#d9ead3", "factors": "#fce5cd", "io": "#d0e0f0", "estimator": "#fff2cc"}
+_SAVE = Figure.savefig
+
+
+def pictures(work: Path) -> Iterator[tuple[str, Image.Image]]:
+    """Yield the name and the pixels of each picture. work : an empty folder."""
+    yield "imports", imports_picture(folder_graph())
+    telerig("demo", "--out", work / "demo", "--quiet")
+    calibration, run = (work / "demo" / "results" / name for name in ("calibration", "rise"))
+    telerig("report", run, "--film", "--format", "gif", "--quiet")
+    with patch.object(Figure, "savefig", _as_png):
+        drawn = [*calibration_pictures(calibration), *run_pictures(run)]
+    for name, picture in drawn:
+        yield name, Image.open(BytesIO(base64.b64decode(picture.source.partition(",")[2])))
+    for name, folder in (("view", calibration), ("bubble", run)):
+        yield name, Image.open(min((folder / "overlays").glob("*/*")))
+    for name, film, share in (("film", "path.gif", 0.1), ("film-views", "views.gif", 0.5)):
+        with Image.open(run / "film" / film) as frames:
+            frames.seek(int(share * frames.n_frames))
+            yield name, frames.copy()
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        sys.stdout.write("no browser: report.png and batch.png stay as they are\n")
+        return
+    yield "report", screenshot(browser, parts_of_report(calibration), (1280, 1930), work)
+    yield "batch", screenshot(browser, batch_page(work / "batch"), (1280, 1060), work)
+
+
+def telerig(*arguments: str | Path, code: int = 0) -> None:
+    """Run a command. code : the exit code that it has to have."""
+    done = subprocess.run([sys.executable, "-m", "telerig", *map(str, arguments)], check=False)
+    if done.returncode != code:
+        raise SystemExit(f"telerig {arguments[0]} ended with {done.returncode}")
+
+
+def calibration_pictures(folder: Path) -> Iterator[tuple[str, Any]]:
+    results = read_results(folder)
+    yield "rig", rig.rig_plan(results)
+    yield "coverage", calibration_figures.coverage(results, 0)
+    yield "tilts", calibration_figures.tilts(results)
+    yield "residuals", calibration_figures.residual_field(results, 0)
+    yield "residual-histogram", calibration_figures.residual_histogram(results)
+    yield "target", target.target_pictures(results)[0]
+    yield "dot", dot_fit.dot_pictures(results.dot_example)[-1]
+
+
+def run_pictures(folder: Path) -> Iterator[tuple[str, Any]]:
+    tracks = read_track_results(folder)
+    yield "ray-miss", ray_miss_histogram(tracks)
+    cameras, _ = run_cameras(folder, tracks)
+    smoothed = read_smoothing_results(folder, np.array([0.0, -1.0, 0.0]))
+    assert cameras is not None and smoothed is not None
+    yield "two-rays", two_rays(tracks, cameras)
+    up, first = 1, smoothed.cameras[0]
+    yield "closer", figures.closer(smoothed, up)
+    yield "velocity", figures.velocities(smoothed, up)
+    yield "shake", figures.shake_in_time(smoothed, first, "y")
+    yield "shake-spectra", figures.shake_spectra(smoothed, first)
+
+
+def _as_png(figure: Figure, stream: Any, **options: Any) -> None:
+    _SAVE(figure, stream, format="png", dpi=DPI, metadata={"Software": None})
+
+
+def parts_of_report(folder: Path) -> str:
+    """Return the page of a calibration without its tables, and with one row of views."""
+    shown = "".join(f":not(#{name})" for name in ("verdict", "key", "residuals", "overlays", "dot"))
+    style = f"nav, footer, section{shown} {{ display: none }}"
+    style += " #overlays { max-height: 400px; overflow: hidden }"
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    return text.replace("</head>", f"<style>{style}</style></head>", 1)
+
+
+def batch_page(work: Path) -> str:
+    """Return the page of a batch of three small datasets and one without views."""
+    places = [work / f"tank-{number}" for number in range(1, 5)]
+    for seed, place in enumerate(places[:3]):
+        options = ("--no-images", "--accelerometers", "left,right", "--seed", str(seed))
+        telerig("simulate", "rise", *options, "--out", place)
+    places[3].mkdir()
+    shutil.copy(places[0] / "rig.toml", places[3])
+    telerig("batch", *places, "--out", work / "weekly", code=1)
+    text = (work / "weekly" / "report.html").read_text(encoding="utf-8")
+    return text.replace(str(work.resolve()), "/lab")
+
+
+def screenshot(browser: str, text: str, size_px: tuple[int, int], work: Path) -> Image.Image:
+    """Return the upper part of a page in a window of (width, height), at three quarters."""
+    page, file, (width, height) = work / "page.html", work / "page.png", size_px
+    page.write_text(text, encoding="utf-8")
+    subprocess.run(
+        [
+            browser, "--headless", "--no-sandbox", "--hide-scrollbars",
+            "--virtual-time-budget=6000", f"--user-data-dir={work / 'profile'}",
+            f"--window-size={width},{height}", f"--screenshot={file}", page.as_uri(),
+        ],
+        check=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    return Image.open(file).resize((width * 3 // 4, height * 3 // 4), Image.Resampling.LANCZOS)
+
+
+def folder_graph() -> nx.DiGraph:
+    """Return the graph folder -> folder of the imports.
+
+    Only direct imports that no other path explains are in it (the transitive reduction), so that
+    the picture stays readable.
+    """
+    modules = grimp.build_graph("telerig")
+    graph: nx.DiGraph = nx.DiGraph()
+    for importer in modules.modules:
+        for imported in modules.find_modules_directly_imported_by(importer):
+            a, b = _folder_of(importer), _folder_of(imported)
+            if a and b and a != b and not {a, b} & {"errors", "version", "io", "estimator"}:
+                graph.add_edge(a, b)
+    return nx.transitive_reduction(graph)
+
+
+def _folder_of(module: str) -> str:
+    """Return the folder that a module is shown in; "" for modules beside the folders."""
+    parts = module.split(".")
+    depth = 3 if ".".join(parts[:2]) in OPENED else 2
+    return ".".join(parts[1:depth])
+
+
+def imports_picture(graph: nx.DiGraph) -> Image.Image:
+    """Draw each folder one floor above the highest that it imports."""
+    floors: dict[str, int] = {}
+    for folder in reversed(list(nx.topological_sort(graph))):
+        floors[folder] = 1 + max((floors[b] for b in graph.successors(folder)), default=-1)
+    place = {}
+    for floor in sorted(set(floors.values())):
+        here = sorted(f for f, n in floors.items() if n == floor)
+        for i, folder in enumerate(here):
+            place[folder] = ((i - (len(here) - 1) / 2) * 2.6 + 0.5 * (floor % 2), floor)
+    figure = Figure(figsize=(11, 0.85 * len(set(floors.values())) + 1))
+    axes = figure.add_subplot()
+    for a, b in graph.edges:
+        arrow = {"arrowstyle": "->", "color": "#777777", "shrinkA": 12, "shrinkB": 12}
+        axes.annotate("", place[b], place[a], arrowprops=arrow)
+    for folder, (x, y) in place.items():
+        colour = FLOOR_COLOURS.get(folder.split(".")[0], "#eeeeee")
+        box = {"boxstyle": "round,pad=0.35", "facecolor": colour, "edgecolor": "#888888"}
+        axes.text(x, y, folder.replace(".", "/"), ha="center", va="center", fontsize=9, bbox=box)
+    sides = [x for x, _ in place.values()]
+    axes.set(xlim=(min(sides) - 1.5, max(sides) + 1.5), ylim=(-0.6, max(floors.values()) + 0.6))
+    axes.axis("off")
+    stream = BytesIO()
+    figure.savefig(stream, dpi=110, bbox_inches="tight")
+    return Image.open(stream)
+
+
+def save(image: Image.Image, file: Path) -> int:
+    """Write a PNG with few colours and no metadata; return its size in bytes."""
+    few = image.convert("RGB").quantize(COLOURS, method=Image.Quantize.FASTOCTREE)
+    few.save(file, optimize=True)
+    size = file.stat().st_size
+    if size > LARGEST_BYTES:
+        raise SystemExit(f"{file} has {size} bytes: fewer colours or a smaller figure")
+    return size
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=FOLDER)
+    out = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
+    total = 0
+    with tempfile.TemporaryDirectory(prefix="telerig-") as work:
+        for name, image in pictures(Path(work)):
+            size = save(image, out / f"{name}.png")
+            sys.stdout.write(f"{name}: {size} bytes\n")
+            total += size
+    if total > ALL_BYTES:
+        raise SystemExit(f"{total} bytes in all: more than {ALL_BYTES}")
+
+
+if __name__ == "__main__":
+    main()

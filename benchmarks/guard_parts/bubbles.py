@@ -130,10 +130,8 @@ def real_pair() -> list[Metric]:
 
 
 def real_folder() -> Path:
-    """Beside the repository, or beside the folder of its worktrees."""
-    root = Path(__file__).resolve().parents[2]
-    places = [root.parent / "shared" / "real", root.parents[1] / "shared" / "real"]
-    return next((place for place in places if place.is_dir()), places[0])
+    """Return the folder of the real images, beside the repository."""
+    return Path(__file__).resolve().parents[3] / "shared" / "real"
 
 
 TASKS: dict[str, Callable[[], list[Metric]]] = {

@@ -9,7 +9,7 @@ import one_thread  # noqa: F401 - before NumPy
 import os
 import pickle
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -174,10 +174,12 @@ def scene() -> Callable[..., Scene]:
     return make_scene
 
 
-@pytest.fixture
-def without_advice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calibrations in this process propose no next view: a quarter of their time, or more."""
-    monkeypatch.setattr(self_calibration, "next_view", _no_view)
+@pytest.fixture(scope="module")
+def without_advice() -> Iterator[None]:
+    """Calibrations of this module propose no next view: a quarter of their time, or more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(self_calibration, "next_view", _no_view)
+        yield
 
 
 def _no_view(*_: object) -> None:
@@ -212,11 +214,13 @@ def tank_copy(tank: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(tank, tmp_path / "my tank"))
 
 
-@pytest.fixture
-def known_low_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Smoothings in this process do not learn the low-pass of the forces: half of a short one."""
-    known = Inertia((0.002,) * 3)
-    monkeypatch.setattr(accelerations, "learned_low_passes", lambda *_: LowPasses(known, known))
+@pytest.fixture(scope="module")
+def known_low_passes() -> Iterator[None]:
+    """Smoothings of this module are given the bubbles' low-pass; to learn it takes seconds."""
+    known = Inertia((0.01,) * 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(accelerations, "learned_low_passes", lambda *_: LowPasses(known, known))
+        yield
 
 
 @pytest.fixture

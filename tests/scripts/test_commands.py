@@ -19,6 +19,7 @@ import tifffile
 from typer.testing import CliRunner
 
 import telerig
+from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.calibrate import run_calibration
 from telerig.scripts import console
 from telerig.scripts.calibrate import calibrate as calibrate_command
@@ -42,8 +43,9 @@ def run(*arguments: str | Path, code: int = 0) -> str:
 
 
 @pytest.fixture
-def small_copy(paper_copy: Path) -> Path:
-    """Seven of its views."""
+def small_copy(paper_copy: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Seven of its views, after which no next one is proposed."""
+    monkeypatch.setattr(self_calibration, "next_view", lambda *_: None)
     for camera in ("left", "right"):
         for path in images(paper_copy, camera)[7:]:
             path.unlink()
@@ -150,10 +152,10 @@ def test_a_second_run_gives_the_same_bytes(calibrated, paper_images, tmp_path):
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
 
 
-def test_detect_says_what_it_found_and_draws_it(paper_images, tmp_path):
-    text = run("detect", paper_images, "--out", tmp_path / "found", "--quiet")
-    assert len(re.findall(r"15 dots", text)) == 24
-    assert len(list((tmp_path / "found" / "overlays").glob("*/*.jpg"))) == 24
+def test_detect_says_what_it_found_and_draws_it(small_copy, tmp_path):
+    text = run("detect", small_copy, "--out", tmp_path / "found", "--quiet")
+    assert len(re.findall(r"15 dots", text)) == 14
+    assert len(list((tmp_path / "found" / "overlays").glob("*/*.jpg"))) == 14
 
 
 def test_mirrored_camera_is_named(small_copy):
@@ -175,14 +177,14 @@ def test_one_mirrored_image_is_named(small_copy):
 def test_view_of_one_camera_only_is_used_and_said(small_copy):
     gone = images(small_copy, "right")[0]
     gone.unlink()
-    text = run("calibrate", small_copy, "--quiet")
+    text = run("calibrate", small_copy, "--quiet", "--no-report")
     assert re.search(rf"view '?{gone.stem}'?.*(only|alone|one camera)", text), text
 
 
 def test_image_without_dots_is_left_out_with_the_reason(small_copy):
     path = images(small_copy, "left")[2]
     spoil(path, lambda image: np.full_like(image, 40))
-    text = run("calibrate", small_copy, "--quiet")
+    text = run("calibrate", small_copy, "--quiet", "--no-report")
     assert f"note: view {path.stem!r}, camera 'left' is left out: no dots found" in text
 
 
@@ -198,7 +200,7 @@ def test_dots_merged_by_glare_are_rejected_and_the_rest_used(small_copy):
         return out
 
     spoil(path, glare)
-    text = run("calibrate", small_copy, "--quiet")
+    text = run("calibrate", small_copy, "--quiet", "--no-report")
     rejected = pd.read_csv(small_copy / "results/calibration/rejected.csv", dtype={"view": str})
     dots = pd.read_csv(small_copy / "results/calibration/dots.csv", dtype={"view": str})
     mine = dots[(dots["view"] == path.stem) & (dots["camera"] == "left")]

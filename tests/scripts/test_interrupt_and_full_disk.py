@@ -24,22 +24,7 @@ from telerig.io.files.atomic import atomic_folder, atomic_path
 from telerig.scripts.main import app
 
 runner = CliRunner()
-
-
-@pytest.fixture(scope="module")
-def smoothed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset without images, with all of its results."""
-    data = tmp_path_factory.mktemp("disk") / "set"
-    options = ("--quiet", "--no-report")
-    for command in (
-        ("simulate", "S1", "--frames", "30", "--no-images", "--seed", "3", "--out", data),
-        ("calibrate", data, "--model", "radial", *options),
-        ("track", data / "runs/S1", *options),
-        ("smooth", data / "runs/S1", *options),
-    ):
-        done = runner.invoke(app, [str(part) for part in command])
-        assert done.exit_code == 0, done.output
-    return data
+pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
 
 
 @contextmanager
@@ -60,12 +45,12 @@ def contents(folder: Path) -> dict[str, str]:
 
 COMMANDS = {
     "calibrate": ("calibrate", "{set}", "--model", "radial", "--quiet"),
-    "track": ("track", "{set}/runs/S1", "--quiet"),
-    "smooth": ("smooth", "{set}/runs/S1", "--quiet"),
-    "hdf5": ("export", "{set}/results/S1", "--to", "hdf5", "--out", "{set}/out.h5"),
-    "netcdf": ("export", "{set}/results/S1", "--to", "netcdf", "--out", "{set}/out.nc"),
-    "matlab": ("export", "{set}/results/S1", "--to", "mat", "--out", "{set}/out.mat"),
-    "trackpy": ("export", "{set}/results/S1", "--to", "trackpy", "--out", "{set}/out.csv"),
+    "track": ("track", "{set}/runs/rise", "--quiet"),
+    "smooth": ("smooth", "{set}/runs/rise", "--model", "default", "--quiet"),
+    "hdf5": ("export", "{set}/results/rise", "--to", "hdf5", "--out", "{set}/out.h5"),
+    "netcdf": ("export", "{set}/results/rise", "--to", "netcdf", "--out", "{set}/out.nc"),
+    "matlab": ("export", "{set}/results/rise", "--to", "mat", "--out", "{set}/out.mat"),
+    "trackpy": ("export", "{set}/results/rise", "--to", "trackpy", "--out", "{set}/out.csv"),
     "opencv": ("export", "{set}/results/calibration", "--to", "opencv", "--out", "{set}/o.yaml"),
 }
 
@@ -73,10 +58,10 @@ COMMANDS = {
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("size_bytes", [100, 6_000])
 def test_a_full_disk_leaves_the_old_results_and_says_what_to_do(
-    name: str, size_bytes: int, smoothed: Path, tmp_path: Path
+    name: str, size_bytes: int, tank: Path, tmp_path: Path
 ) -> None:
     data = tmp_path / "set"
-    shutil.copytree(smoothed, data)
+    shutil.copytree(tank, data)
     before = contents(data)
     with largest_file(size_bytes):
         done = runner.invoke(app, [part.format(set=data) for part in COMMANDS[name]])
@@ -126,21 +111,21 @@ def interrupted(arguments: list[str], after_s: float) -> tuple[int, str]:
     return process.returncode, out + err
 
 
-def check_interrupts(moments_s: list[float], smoothed: Path, tmp_path: Path) -> None:
+def check_interrupts(moments_s: list[float], tank: Path, tmp_path: Path) -> None:
     for k, after_s in enumerate(moments_s):
         out = tmp_path / f"out{k}"
-        code, text = interrupted(["calibrate", str(smoothed), "--out", str(out)], after_s)
+        code, text = interrupted(["calibrate", str(tank), "--out", str(out)], after_s)
         assert code in (0, 130, -signal.SIGINT), (after_s, code, text)
         for word in ("Traceback", "Exception", "fault of telerig", "terminate called"):
             assert word not in text, (after_s, text)
         assert code == 0 or not out.exists() or (out / "report.html").is_file()
 
 
-def test_ctrl_c_at_any_moment_prints_no_traceback(smoothed: Path, tmp_path: Path) -> None:
-    check_interrupts([0.15, 0.5, 1.0, 2.0], smoothed, tmp_path)
+def test_ctrl_c_at_any_moment_prints_no_traceback(tank: Path, tmp_path: Path) -> None:
+    check_interrupts([0.15, 0.5, 1.0, 2.0], tank, tmp_path)
 
 
 @pytest.mark.slow
-def test_ctrl_c_at_a_hundred_moments(smoothed: Path, tmp_path: Path) -> None:
+def test_ctrl_c_at_a_hundred_moments(tank: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
-    check_interrupts(list(rng.uniform(0.1, 5.0, 100)), smoothed, tmp_path)
+    check_interrupts(list(rng.uniform(0.1, 5.0, 100)), tank, tmp_path)

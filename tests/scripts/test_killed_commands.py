@@ -34,6 +34,8 @@ from telerig.io.report.remake import remake_report, results_folders
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.results import read_track_results
 
+pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
+
 Reader = Callable[[Path], Any]
 
 

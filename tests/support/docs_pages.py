@@ -11,6 +11,7 @@ import contextlib
 import io
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -19,9 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from places import ROOT
+from typer.testing import CliRunner
 
 from telerig.io.dataset.new_dataset import new_dataset
 from telerig.io.rig_file.rig_file import description_from_toml
+from telerig.scripts.main import app
 
 CELL = "{code-cell} ipython3"
 LANGUAGES = ("sh", "python", "toml", "text", CELL, "{toctree}", "{eval-rst}")
@@ -59,6 +62,8 @@ noise_density_ug_sqrt_hz = 22.5
 FENCE = re.compile(
     r"(?P<before>(?:^<!--[^\n]*-->\n)*)^```(?P<language>[^\n]*)\n(?P<code>.*?)^```$", re.M | re.S
 )
+PLAIN = re.compile(r"(telerig [\w ./:=-]+\n)+")
+"""Lines that need no shell."""
 NUMBER = re.compile(r"[-+]?\d[\d.,]*(?:e[-+]?\d+)?")
 
 
@@ -139,12 +144,29 @@ class PageRunner:
         self.ran += 1
 
     def _bash(self, block: Block) -> str:
+        if PLAIN.fullmatch(block.code):
+            return self._here(block)
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", block.code], cwd=self.folder, env=self.environment,
             text=True, timeout=300, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
         assert done.returncode == block.exit_code, f"{block.where}: {done.stdout}"
         return done.stdout
+
+    def _here(self, block: Block) -> str:
+        """Commands alone, in this process: Python and its libraries start once."""
+        said, code = "", 0
+        with contextlib.chdir(self.folder):
+            for line in block.code.splitlines():
+                words = shlex.split(line)[1:]
+                done = CliRunner().invoke(app, words, env=self.environment)
+                if done.exception and not isinstance(done.exception, SystemExit):
+                    raise done.exception
+                said, code = said + done.output, done.exit_code
+                if code:
+                    break
+        assert code == block.exit_code, f"{block.where}: {said}"
+        return said
 
     def _python(self, block: Block) -> str:
         printed = io.StringIO()

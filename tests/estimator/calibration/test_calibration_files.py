@@ -20,6 +20,8 @@ from telerig.estimator.calibration.result.calibration import (
 )
 from telerig.io.results.findings import Code
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 
 @pytest.fixture(scope="module")
 def calibration(scene: Any) -> Calibration:

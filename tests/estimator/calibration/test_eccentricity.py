@@ -22,6 +22,8 @@ from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import Pose
 from telerig.rig.target import Target
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 
 def polygon_centroid(rim: Any) -> Any:
     """Area centroid of a closed polygon (shoelace formula)."""

@@ -37,6 +37,8 @@ from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.target import Target
 from telerig.rig.windows import Wall
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 SOLVERS = ("gtsam", "schur")
 
 MODELS = {

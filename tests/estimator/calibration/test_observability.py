@@ -20,6 +20,8 @@ from telerig.factors.calibration import (
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import rotation_from_rotvec
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 RHO_MM = (36.0, 36.0)
 TABLE = ("scale_px_per_mm", "centre_u_px", "centre_v_px")
 """The parametrisation of the design's table: a centre per camera, no baseline between them."""

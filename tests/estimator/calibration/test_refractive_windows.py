@@ -49,6 +49,8 @@ from telerig.rig.projection import turned_wall
 from telerig.rig.windows import Wall
 from telerig.scripts.main import app
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 Array = NDArray[np.float64]
 
 INDICES = (1.0, 1.52, 1.333)

@@ -20,6 +20,8 @@ from telerig.estimator.calibration.solver.problem import Problem, problem_from_d
 from telerig.estimator.calibration.start import known_target
 from telerig.factors.calibration import State
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 GAUGE_MM = 1e-4
 PRIOR = {"scale": 0.5, "kappa": 0.5, "k1": 0.5, "k2": 0.5, "p1": 0.2, "p2": 0.2}
 NAMES = {

@@ -15,6 +15,8 @@ from telerig.io.results.findings import Code
 from telerig.io.simulation.presets import preset
 from telerig.rig.camera import Camera
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 
 @pytest.fixture(scope="module")
 def paper(scene: Any) -> Any:

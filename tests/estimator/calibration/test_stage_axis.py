@@ -23,6 +23,8 @@ from telerig.io.results.findings import Code
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 AXIS = np.array([0.03, -0.999, 0.02]) / np.linalg.norm([0.03, -0.999, 0.02])
 READINGS = np.linspace(-15.0, 15.0, 11)
 SIGMA_PX = 0.02

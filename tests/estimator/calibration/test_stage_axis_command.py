@@ -17,6 +17,8 @@ from telerig.io.dataset.run import load_run
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.scripts.main import app
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:

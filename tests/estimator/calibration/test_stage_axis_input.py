@@ -24,6 +24,8 @@ from telerig.io.simulation.calibration_files import view_image
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 AXIS = np.array([0.01, -1.0, 0.02]) / np.linalg.norm([0.01, -1.0, 0.02])
 TURN = rotation_from_rotvec([0.1, -0.7, 0.05])
 POSE = Pose(TURN, np.array([0.5, -1.0, 2.0]) - TURN @ [14.0, 7.0, 0.0])

@@ -14,6 +14,8 @@ from telerig.estimator.calibration.result.calibration import Calibration, calibr
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 NAMES = ("left", "middle", "right", "top")
 FREE = (("scale_px_per_mm",), ("scale_px_per_mm", "k1"), (), ("k1",))
 

@@ -10,6 +10,8 @@ import pytest
 from finding_codes import codes, only
 
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration import self_calibration
+from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality.comparison import _chance, compare_calibrations
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
@@ -18,13 +20,15 @@ from telerig.io.results.findings import Code, Finding
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 STILL = range(10, 16)
 
 
 @pytest.fixture(scope="module")
 def at_rest(scene: Any) -> list[Any]:
     """Calibrations of one rig that did not move, by other targets and views."""
-    return [scene("paper", seed).calibrate() for seed in STILL]
+    return [scene("paper", seed).calibrate("radial") for seed in STILL]
 
 
 def test_a_rig_at_rest_has_not_moved(at_rest: list[Any]) -> None:
@@ -42,7 +46,7 @@ def test_a_movement_is_found_with_its_size(scene: Any, at_rest: list[Any]) -> No
     """The second camera turned by 300 µrad about the rig's z axis, and shifted by 12 µm."""
     after = scene(
         "paper", 40, axis_gap_mm=0.312, mount_rotvec_deg=(0.4 + np.degrees(3e-4), -0.7, 0.5)
-    ).calibrate()
+    ).calibrate("radial")
     found = compare_calibrations(at_rest[0], after)
     assert found.moved
     assert found.as_dict()["verdict"] == "MOVED"
@@ -92,7 +96,7 @@ def test_rigs_without_uncertainty_are_compared_exactly(angle: float) -> None:
 def test_exchanged_cameras_and_other_lenses_are_named(scene: Any, at_rest: list[Any]) -> None:
     made = scene("paper", 41)
     names = made.dots["camera"].map({"left": "right", "right": "left"})
-    exchanged = made.with_dots(made.dots.assign(camera=names)).calibrate()
+    exchanged = made.with_dots(made.dots.assign(camera=names)).calibrate("radial")
     assert "exchanged" in compare_calibrations(at_rest[0], exchanged).words()
     larger = at_rest[1].cameras[0]["scale_px_per_mm"] * 1.001
     zoomed = at_rest[1].cameras[0].with_parameters(scale_px_per_mm=larger)
@@ -137,7 +141,7 @@ def test_halves_know_that_the_targets_size_is_common_to_both(scene: Any) -> None
     for seed in range(30, 33):
         made = scene("paper", seed)
         target = replace(made.target, scale_dots=None, scale_distance_mm=None)
-        halves = replace(made, target=target).calibrate().diagnostics["halves"]
+        halves = replace(made, target=target).calibrate("radial").diagnostics["halves"]
         ratio.append(halves["rms_um"] / halves["predicted_um"])
     assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.6
 
@@ -151,8 +155,11 @@ def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:
     assert "! of two calibrations" in found.report()
 
 
-def test_the_next_view_has_the_noise_of_the_covariance(scene: Any) -> None:
+def test_the_next_view_has_the_noise_of_the_covariance(
+    scene: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The same images with more stated noise, and with noise widened by a pattern: one gain."""
+    monkeypatch.setattr(self_calibration, "next_view", next_view)
     made = scene("dense", 3, sigma_px=0.02, views=8)
     found = made.calibrate("none")
     widening, advice = found.diagnostics["structure"]["widening"], found.diagnostics["next_view"]
@@ -164,7 +171,7 @@ def test_the_next_view_has_the_noise_of_the_covariance(scene: Any) -> None:
 
 
 def test_halves_need_views(scene: Any) -> None:
-    few = scene("paper", 1, views=7).calibrate()
+    few = scene("paper", 1, views=7).calibrate("radial")
     assert "HALVES_NOT_COMPARED" in codes(few) and few.diagnostics["halves"] == {}
 
 

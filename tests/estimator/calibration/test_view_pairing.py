@@ -32,10 +32,12 @@ def offset(dots: pd.DataFrame, camera: str, first: int, by: int) -> pd.DataFrame
     return out.drop_duplicates(["view", "camera", "dot"], keep="last", ignore_index=True)
 
 
-@pytest.mark.parametrize(("first", "by"), [(0, -1), (2, 2)])
-def test_images_under_the_names_of_other_views_are_refused(first: int, by: int, paper: Any) -> None:
-    eight = paper.changed(lambda dots: dots[dots["view"] < "view08"])
-    made = eight.changed(lambda dots: offset(dots, "right", first, by))
+@pytest.mark.parametrize(("first", "by", "views"), [(0, -1, 6), (2, 2, 8)])
+def test_images_under_the_names_of_other_views_are_refused(
+    first: int, by: int, views: int, paper: Any
+) -> None:
+    few = paper.changed(lambda dots: dots[dots["view"] < f"view{views:02}"])
+    made = few.changed(lambda dots: offset(dots, "right", first, by))
     with pytest.raises(CalibrationError) as caught:
         made.calibrate("radial")
     text = str(caught.value)

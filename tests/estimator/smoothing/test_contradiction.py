@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from leverages import leverages
+from seeds import first_or_all
 from shake_learning_data import run, true_model
 
 from telerig.errors import CalibrationError
@@ -52,7 +53,7 @@ def found_in(solution: Solution) -> tuple[Contradiction, ...]:
     return contradictions(solution, Evidence.of(solution, drawn(solution))).found
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", first_or_all(*range(3)))
 def test_measurements_that_agree_are_not_contradicted(seed: int) -> None:
     for problem in (marked(seed), run(np.random.default_rng(seed), bubbles=2)[0]):
         assert found_in(solve(problem, true_model())) == ()
@@ -75,7 +76,7 @@ def test_marks_of_another_time_are_named_and_the_bands_are_widened() -> None:
     assert {use["grade"] for use in verdict["usable_for"]} <= {"limited", "no"}
 
 
-@pytest.mark.parametrize("seed", [7, 8])
+@pytest.mark.parametrize("seed", first_or_all(7, 8))
 def test_a_centre_that_wanders_with_the_outline_is_noise_and_no_contradiction(seed: int) -> None:
     """Along the columns; the path along the rows is so free that it takes up the same wander."""
     problem, rng = marked(seed), np.random.default_rng(seed)

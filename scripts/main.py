@@ -15,6 +15,7 @@ from telerig.scripts.batch import batch
 from telerig.scripts.bubbles import bubbles
 from telerig.scripts.calibrate import calibrate
 from telerig.scripts.console import interruptible
+from telerig.scripts.correct import correct
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
 from telerig.scripts.doctor import doctor
@@ -55,9 +56,9 @@ def _main(
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo, "init": init, "doctor": doctor, "plan": plan, "simulate": simulate,
-    "detect": detect, "calibrate": calibrate, "bubbles": bubbles, "track": track, "smooth": smooth,
-    "validate": validate, "run": run_dataset, "batch": batch, "record": record,
-    "export": export, "report": report,
+    "detect": detect, "calibrate": calibrate, "bubbles": bubbles, "track": track,
+    "correct": correct, "smooth": smooth, "validate": validate, "run": run_dataset, "batch": batch,
+    "record": record, "export": export, "report": report,
 }  # fmt: skip
 for name, command in _COMMANDS.items():
     app.command(name)(command)

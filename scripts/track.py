@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -49,34 +50,60 @@ def track(
 
     Writes detections.csv, tracks.csv, events.csv, tracking.json, run.json and report.html. The
     same command, given again, continues an interrupted run. With --cluster the workers detect the
-    bubbles, in batches of frames; they must see the run and the results at the same paths.
+    bubbles, in batches of frames; they must see the run and the results at the same paths. When
+    only corrections.csv has changed, the detection is not repeated.
 
     Exit code 0: tracked. 2: the input cannot be used; the message says what, where and what to do.
     130: interrupted.
     """
-    from telerig.estimator.batch.batch import dask_executor
     from telerig.estimator.batch.jobs import check_run_name
+    from telerig.estimator.tracking.tracks import tracking_words
+
+    begun = time.perf_counter()
+    if out is None:
+        check_run_name(run)
+    recorded = {"from": source, "min_diameter_px": min_diameter, "frames": frames}
+    folder = out or default_folder(run)
+    summary, steps = track_run(
+        run, folder, calibration, recorded,
+        again=typed_command(), cluster=cluster, report=report, quiet=quiet,
+    )  # fmt: skip
+    say(tracking_words(summary, time.perf_counter() - begun, steps))
+    say_written(folder, report)
+
+
+def track_run(
+    run: Path,
+    folder: Path,
+    calibration: Sequence[Path] | None,
+    recorded: Mapping[str, Any],
+    *,
+    again: str,
+    cluster: str | None = None,
+    report: bool = True,
+    quiet: bool = False,
+) -> tuple[dict[str, Any], str]:
+    """Track a run and write the results into ``folder``.
+
+    Returns the content of tracking.json, and how long the steps took in words.
+    recorded : the options "from", "min_diameter_px" and "frames" as run.json holds them; those
+        that it lacks have their defaults.
+    again : the command line that makes the folder again.
+    """
+    from telerig.estimator.batch.batch import dask_executor
     from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.tracking.results_folder import write_tracking
     from telerig.estimator.tracking.track import TrackOptions
-    from telerig.estimator.tracking.tracks import tracking_words
     from telerig.io.dataset.run import load_run
 
-    if out is None:
-        check_run_name(run)
-    begun = time.perf_counter()
-    folder = out or default_folder(run)
     if cluster is not None:
         run, folder = run.resolve(), folder.resolve()
     calibrated, files = calibration_for(run, calibration)
-    chosen = options.chosen("--from", source, ("images", "detections"))
+    chosen = options.chosen("--from", recorded.get("from"), ("images", "detections"))
+    frames = recorded.get("frames")
     count = None if frames is None else first_frames(frames)
-    record = {
-        "command": "track",
-        "options": {"from": source, "min_diameter_px": min_diameter, "frames": frames},
-        "inputs": files,
-        "again": typed_command(),
-    }
+    record = {"command": "track", "options": dict(recorded), "inputs": files, "again": again}
+    settings = TrackOptions(recorded.get("min_diameter_px", TrackOptions.min_diameter_px))
     chosen_cluster = nullcontext() if cluster is None else dask_executor(cluster, "--cluster")
     with chosen_cluster as executor, progress(quiet) as stage:
         stage("reading the run", 0, 1)
@@ -84,11 +111,10 @@ def track(
         if count is not None:
             data = data.first(count)
         summary = write_tracking(
-            data, calibrated, folder, options=TrackOptions(min_diameter_px=min_diameter),
-            record=record, report=report, stage=stage, executor=executor,
+            data, calibrated, folder, options=settings, record=record, report=report, stage=stage,
+            executor=executor,
         )  # fmt: skip
-    say(tracking_words(summary, time.perf_counter() - begun, stage.words()))
-    say_written(folder, report)
+    return summary, stage.words()
 
 
 def first_frames(text: str) -> int:

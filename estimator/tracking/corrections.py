@@ -1,12 +1,13 @@
 """Corrections of tracks by hand: `corrections.csv` in the folder of a run.
 
-A person who has looked at the report may drop, join, split and rename tracks there. Every tracking
-of the run applies the file, row by row in its order, to the finished rows.
+A person who has looked at the report may drop, join, split and rename tracks there, by hand or with
+`telerig correct`. Every tracking of the run applies the file, row by row in its order, to the
+finished rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,14 @@ import numpy as np
 import pandas as pd
 
 from telerig.errors import InputError
+from telerig.estimator.tracking.detect_run import CORRECTIONS
 from telerig.estimator.tracking.filter import TrackEvent
 from telerig.estimator.tracking.frames_to_rows import Linked
-from telerig.io.files.csv_table import Column, read_table
+from telerig.estimator.tracking.tracks import Tracks, load_tracks
+from telerig.io.files.atomic import atomic_path
+from telerig.io.files.csv_table import Column, read_table, write_table
+from telerig.short_text import counted, counted_list
 
-FILE = "corrections.csv"
 _ONCE = ["frame", "particle", "camera"]
 ACTIONS = ("drop", "join", "split", "rename")
 _COLUMNS = [
@@ -76,13 +80,13 @@ class Corrections:
     def warnings(self) -> list[str]:
         """Return a sentence for each correction that changed nothing, or joined nothing."""
         alone = [
-            f"{FILE} row {c.row}: join only renamed track {c.other}: there is no track "
+            f"{CORRECTIONS} row {c.row}: join only renamed track {c.other}: there is no track "
             f"{c.particle} to join it with. Check the row"
             for c in self.used
             if c.action == "join" and c not in self.kept
         ]
         return alone + [
-            f"{FILE} row {c.row}: {c.action} changed nothing: there is no track "
+            f"{CORRECTIONS} row {c.row}: {c.action} changed nothing: there is no track "
             f"{c.other if c.action == 'join' else c.particle}"
             + (f" from frame {c.frame} on" if c.frame else "")
             + ". The ids of the tracks may have changed since the file was written: check the row"
@@ -152,6 +156,70 @@ def _ids(texts: Any, like: pd.Series[Any]) -> pd.Series[Any]:
     return numbers.astype(like.dtype) if isinstance(like.dtype, pd.Int64Dtype) else numbers
 
 
+def add_correction(run: Path, results: Path, row: Mapping[str, Any]) -> str:
+    """Write a row to the corrections of a run, and return in words what it changes in its tracks.
+
+    results : folder with the run's tracks.
+    row : action, particle, other ("" for none), frame (None for all) and reason.
+
+    Raises InputError, and writes nothing, when the row does not fit the tracks: ids that are not
+    there, tracks that are both seen in a frame, an id that is taken, a frame in which the track has
+    nothing to correct.
+    """
+    found, file = load_tracks(results), run / CORRECTIONS
+    numbered = found.table["particle"].dtype.kind == "i"
+    names = [column.name for column in _COLUMNS]
+    before = read_table(file, _COLUMNS, empty=True) if file.is_file() else pd.DataFrame()
+    new = pd.DataFrame([row]).dropna(axis=1)
+    table = pd.concat([before, new], ignore_index=True).reindex(columns=names)
+    with atomic_path(file) as staged:
+        write_table(table.astype({"frame": "Int64"}), staged)
+        *_, one = _read(staged, numbered).corrections
+        words = _effect(one, found, results / "tracks.csv")
+        list(Corrections(file, (one,)).applied(iter([Linked(found.table, found.detections)])))
+    return f"{file} row {one.row}: {words}"
+
+
+def _effect(one: Correction, found: Tracks, where: Path) -> str:
+    """Return in words what a correction changes. Raises InputError when it does not fit."""
+    ids = _texts(found.table["particle"])
+    needed = [one.other, one.particle] if one.action == "join" else [one.particle]
+    for particle in needed:
+        if particle not in ids:
+            known = sorted(set(ids), key=lambda text: (len(text), text))
+            todo = f"use one of {counted_list(known, 'id')}" if known else "there are no tracks"
+            raise InputError(f"there is no track {particle}", where=str(where), todo=todo)
+    of = needed[0]
+    frames = found.table["frame"].to_numpy(np.int64)[ids == of]
+    hit = frames[frames >= one.frame]
+    if not len(hit) or (one.action == "split" and len(hit) == len(frames)):
+        what = f"track {of} is in frames {frames.min()} to {frames.max()}"
+        todo = "give a frame after its first one and up to its last one"
+        what += f"; {one.action} from frame {one.frame} on changes {'all' if len(hit) else 'none'}"
+        raise InputError(f"{what} of it", where=str(where), todo=todo)
+    if one.action == "join":
+        _refuse_overlap(one, found, where)
+    rows = f"{counted(len(hit), 'row')} of track {of}, frames {hit.min()} to {hit.max()}"
+    new = one.particle if one.action == "join" else one.other
+    return f"{one.action}: {rows}, " + (f"now track {new}" if new else "dropped")
+
+
+def _refuse_overlap(one: Correction, found: Tracks, where: Path) -> None:
+    """Raise InputError when tracks to be joined are in one image, or both have a point."""
+    points = found.table[["frame", "particle"]].assign(camera="")
+    seen = pd.concat([points, found.detections[["frame", "particle", "camera"]]])
+    ids, frames = _texts(seen["particle"]), seen["frame"].to_numpy(np.int64)
+    joined = seen[(ids == one.particle) | ((ids == one.other) & (frames >= one.frame))]
+    both = joined.loc[joined.duplicated(["frame", "camera"]), "frame"].unique()
+    if len(both):
+        raise InputError(
+            f"tracks {one.particle} and {one.other} are both seen in "
+            f"{counted(len(both), 'frame')} between {both.min()} and {both.max()}",
+            where=str(where),
+            todo="join only tracks that follow each other in time",
+        )
+
+
 def read_corrections(run: Path, numbered: bool) -> Corrections:
     """Read the corrections of a run; there are none if it has no such file.
 
@@ -160,9 +228,11 @@ def read_corrections(run: Path, numbered: bool) -> Corrections:
     Raises InputError for a file that cannot be read, an unknown action, and a row that lacks what
     its action needs.
     """
-    file = run / FILE
-    if not file.is_file():
-        return Corrections(file)
+    file = run / CORRECTIONS
+    return _read(file, numbered) if file.is_file() else Corrections(file)
+
+
+def _read(file: Path, numbered: bool) -> Corrections:
     table = read_table(file, _COLUMNS, empty=True)
     blank = pd.Series("", table.index)
     others = table.get("other", blank).fillna("").astype(str)
@@ -177,7 +247,8 @@ def read_corrections(run: Path, numbered: bool) -> Corrections:
             raise InputError(f"there is no action {action!r}", where=where, todo=todo)
         lacks_other = (other == "") != (action == "drop") or other == particle
         if lacks_other or (action == "split" and np.isnan(frame)):
-            what = f"{action} has particle {particle!r}, other {other!r}, frame {frame}"
+            first = "" if np.isnan(frame) else int(frame)
+            what = f"{action} has particle {particle!r}, other {other!r}, frame {first!r}"
             raise InputError(what, where=where, todo=_TODO[action])
         if numbered and not all(t.isascii() and t.isdecimal() for t in (particle, other or "0")):
             what, todo = (

@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from telerig import version
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background import methods
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from telerig.io.rig_file.description import ReferencesDescription
 
 Progress = Callable[[str, int, int], None]
+CORRECTIONS = "corrections.csv"
+"""File of a run with corrections of its tracks; programs keep copies under longer names."""
 Batch = tuple[int, int]
 """The first frame of a batch, and the frame after its last."""
 
@@ -174,7 +177,7 @@ def lab_shift_px(
 
 class DetectionStore:
     """Keep the detections of each batch of frames in CSV files, so that an interrupted run can
-    continue.
+    continue. When its rows are complete, `LinkedRows` of the same folder has the detections.
 
     The folder belongs to one fingerprint of input and options; it is emptied if the fingerprint is
     a different one. It holds tables of three kinds: "detections" of bubbles, "rejected" shadows
@@ -289,21 +292,30 @@ def read_batch(path: Path) -> pd.DataFrame:
 
 
 def fingerprint(run: RunData, options: dict[str, Any]) -> str:
-    """Return a hash of the version, the options, and the names, sizes and times of the recording's
-    files.
+    """Return a hash of the options, and of the names, sizes and times of the recording's files and
+    of the program's. Corrections of the tracks do not count.
     """
-    from telerig.version import VERSION
+    found = hashlib.sha256(json.dumps([version.VERSION, options], default=str).encode())
+    for place, name in [*sorted(_program_files()), *_recording_files(run)]:
+        state = (place / name).stat()
+        found.update(f"{name} {state.st_size} {state.st_mtime_ns}\n".encode())
+    return found.hexdigest()
 
-    found = hashlib.sha256(json.dumps([VERSION, options], default=str).encode())
+
+def _program_files() -> Iterator[tuple[Path, str]]:
+    place = Path(version.__file__).parent
+    for folder, _, names in os.walk(place, followlinks=True):
+        inside = Path(folder).relative_to(place)
+        yield from ((place, (inside / n).as_posix()) for n in names if n.endswith(".py"))
+
+
+def _recording_files(run: RunData) -> Iterator[tuple[Path, str]]:
     for folder, folders, names in os.walk(run.path):
         inputs = folders if Path(folder) != run.path else set(folders) & set(run.cameras)
         folders[:] = sorted(inputs)  # results may lie in the run's folder, too
         inside = Path(folder).relative_to(run.path)
-        for name in sorted(names):
-            state = (Path(folder) / name).stat()
-            place = (inside / name).as_posix()
-            found.update(f"{place} {state.st_size} {state.st_mtime_ns}\n".encode())
-    return found.hexdigest()
+        found = [(inside / name).as_posix() for name in sorted(names)]
+        yield from ((run.path, name) for name in found if CORRECTIONS not in name)
 
 
 def detect_missing(

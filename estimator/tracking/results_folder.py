@@ -19,7 +19,13 @@ import pandas as pd
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import outline_points
 from telerig.estimator.bubbles.outline.blobs import Rejected
-from telerig.estimator.tracking.detect_run import DetectionStore, Progress, joined, mask_files
+from telerig.estimator.tracking.detect_run import (
+    CORRECTIONS,
+    DetectionStore,
+    Progress,
+    joined,
+    mask_files,
+)
 from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.track import (
     TrackingStream,
@@ -29,11 +35,11 @@ from telerig.estimator.tracking.track import (
     tracking_stream,
 )
 from telerig.estimator.tracking.tracks import events_table
-from telerig.io.files.atomic import write_json_atomic
+from telerig.io.files.atomic import rename, write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.results.inputs import Source, fingerprints
+from telerig.io.results.inputs import Source, fingerprints, relative
 from telerig.io.results.manifest import replaced_results
 from telerig.io.results.record import run_record
 from telerig.io.results.stale import stale
@@ -43,9 +49,11 @@ if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.io.dataset.run import RunData
 
+WORK = ".work"
+"""Folder inside the results with the rows before corrections."""
 WORST_FRAMES = 8
 _OUTLINE_POINTS = 72
-_TABLES = ("frames.csv", "run.toml", "stage.csv", "references.csv", "corrections.csv")
+_TABLES = ("frames.csv", "run.toml", "stage.csv", "references.csv", CORRECTIONS)
 _RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "bubbles")
 """The tables of rig.toml on which tracking depends."""
 _GREEN, _ORANGE = (40, 200, 70), (255, 140, 40)
@@ -98,7 +106,8 @@ def write_tracking(
     """Track a run, write the results into a folder, and return the content of tracking.json.
 
     Detections made before an interruption are read from ``.<folder>.work`` beside the folder. All
-    files of results appear together at the end.
+    files of results appear together at the end. What the tracks were made from stays in the folder
+    (`WORK`); while nothing but corrections.csv changes, its rows are corrected and written anew.
 
     record : command, inputs, options and times for run.json; ``again``, the command line that makes
         the folder again.
@@ -113,7 +122,9 @@ def write_tracking(
     """
     if report and run.detections is not None:
         _check_ids(run.detections)
-    work = folder.parent / f".{folder.name}.work"
+    work, kept = folder.parent / f".{folder.name}.work", folder / WORK
+    if kept.is_dir() and not work.is_dir():
+        work = kept
     again = str(record.get("again") or f"telerig track {shlex.quote(str(run.path))}")
     inputs = fingerprints(folder, [*_sources(run), *record.get("inputs", [])])
     with replaced_results(folder, "track", again=again, inputs=inputs) as staged:
@@ -127,14 +138,18 @@ def write_tracking(
         table = stream.marks.table if stream.marks is not None else None
         if table is not None:
             write_table(table, staged / "references.csv")
-        write_json_atomic(staged / "run.json", _record(run, options, record))
-        if stream.store is not None:
+        write_json_atomic(staged / "run.json", _record(run, folder, options, record))
+        if run.detections is None:
             _write_pictures(run, stream.store, summary, staged)
         if report:
             from telerig.io.report.run.report import write_track_report
 
             write_track_report(staged)
-    shutil.rmtree(work, ignore_errors=True)
+    for path in work.glob("detections-*.csv"):  # the rows have them
+        path.unlink()
+    if work != kept:
+        shutil.rmtree(kept, ignore_errors=True)
+        rename(work, kept)
     return summary
 
 
@@ -175,13 +190,20 @@ def _write_rows(stream: TrackingStream, staged: Path) -> _Worst:
     return worst
 
 
-def _record(run: RunData, options: TrackOptions, record: Mapping[str, Any]) -> dict[str, Any]:
+def _record(
+    run: RunData, folder: Path, options: TrackOptions, record: Mapping[str, Any]
+) -> dict[str, Any]:
+    inputs = [*record.get("inputs", [])]
     tables = list(run.path.glob("*.csv")) + list(run.path.glob("*.toml"))
     content = run_record(
         str(record.get("command", "track")),
         run.path,
-        [*tables, *record.get("inputs", [])],
-        {**record.get("options", {}), "track": repr(options)},
+        [*tables, *inputs],
+        {
+            **record.get("options", {}),
+            "track": repr(options),
+            "calibration": [relative(file, folder) for file in inputs],
+        },
         record.get("seconds", {}),
     )
     known, files, size = set(tables), 0, 0

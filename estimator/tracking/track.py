@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -43,9 +43,11 @@ from telerig.estimator.tracking.detect_run import (
 )
 from telerig.estimator.tracking.filter import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracking.frames_to_rows import Linked, RowMaker
+from telerig.estimator.tracking.linked_rows import LinkedRows, Linking
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
+from telerig.io.files.atomic import plain
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.results.calibration_words import NO_COVARIANCE
@@ -87,9 +89,8 @@ class TrackOptions:
 class TrackingStream:
     """Hold a run while it is tracked. Read ``rows`` to their end, then ask for the ``summary``.
 
-    linker : turns detections into rows of the tables.
-    frames_without : for each camera, how often each reason for a frame without bubbles occurred.
-    store : detections of the images; None if the run has a table of them.
+    linking : what linking the detections tells beside the rows.
+    store : files of detections; none of bubbles if the run has a table of them.
     marks : marks that were followed in the images; None without a strip of dots.
     linked : the rows, which are computed while they are read.
     detections, points, particles : numbers of detections and points, and ids of tracks, so far.
@@ -102,9 +103,8 @@ class TrackingStream:
 
     run: RunData
     calibration: Calibration
-    linker: RowMaker
-    frames_without: dict[str, dict[str, int]]
-    store: DetectionStore | None
+    linking: Linking
+    store: DetectionStore
     marks: FollowedMarks | None
     linked: Iterator[Linked]
     corrections: Corrections
@@ -123,7 +123,7 @@ class TrackingStream:
     @property
     def events(self) -> list[TrackEvent]:
         """Events of the tracks so far."""
-        events, names = self.linker.events, self.names
+        events, names = self.linking.events, self.names
         if names is not None:
             events = [
                 replace(e, particles=tuple(_name(p, names) for p in e.particles)) for e in events
@@ -155,7 +155,7 @@ class TrackingStream:
 
     def summary(self) -> dict[str, Any]:
         """Return the content of tracking.json. Raises InputError when no bubble was found."""
-        run, model, kinds = self.run, self.linker.model, [e.kind for e in self.events]
+        run, model, kinds = self.run, self.linking.model, [e.kind for e in self.events]
         if not self.detections:
             raise InputError(
                 f"no bubble was found in {run.frame_count} frames",
@@ -176,10 +176,10 @@ class TrackingStream:
             "points": self.points,
             "tracks": len(self.particles),
             "detections_without_partner_or_track": self.detections - 2 * self.paired,
-            "frames_without_bubbles": self.frames_without,
+            "frames_without_bubbles": self.linking.frames_without,
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
             "pairs": with_change(model, change, self.calibration),
-            "shapes": asdict(self.linker.shapes),
+            "shapes": asdict(self.linking.shapes),
             "covariance": "Of the measurement."
             + known
             * " The calibration's share, common to all points, is in calibration_sx_mm, "
@@ -267,7 +267,8 @@ def tracking_stream(
 ) -> TrackingStream:
     """Detect the bubbles, learn the model for pairing them, and return a stream that tracks them.
 
-    work : folder into which the detections are written, so that an interrupted run can continue.
+    work : folder into which detections and rows are written, so that an interrupted run can
+        continue, and a run that is complete repeats nothing but its corrections.
     executor : runs the detection in batches of frames, on computers that see the run and ``work``
         at the same paths; None for processes of this computer.
 
@@ -278,52 +279,63 @@ def tracking_stream(
     calibration = pair_of_run(calibration, run.cameras)
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
-    first_id, labels, store, marks = 0, None, None, None
-    batches: Callable[[], Iterator[pd.DataFrame]]
+    up = upwards(run, axis)
+    inputs = _inputs(run, cameras, chosen, (axis, up))
+    store = DetectionStore(work, fingerprint(run, inputs), run.frame_count)
+    first_id, labels, marks = 0, None, None
+    batches: Callable[[], Iterator[pd.DataFrame]] = store.tables
     if run.detections is not None:
         numbers, labels = numbers_of(ids_of(run.detections))
         taken = [*numbers.values(), *_whole(numbers).values()]  # no new track gets a given name
         first_id = max(taken, default=NO_PARTICLE) + 1
         batches = partial(_given, run.detections, numbers)
-    else:
-        inputs = {
-            "options": repr(chosen), "cameras": repr(cameras), "frames": str(run.frame_count),
-            "axis": repr(axis),
-        }  # fmt: skip
-        if run.rig is not None and run.rig.bubbles:
-            hashes = {name: hash_if_there(file) for name, file in mask_files(run).items()}
-            inputs["bubbles"] = repr((run.rig.bubbles, hashes))
-        strip = described_strip(run)
-        if strip is not None:
-            inputs["references"] = repr(strip)
-        store = DetectionStore(work, fingerprint(run, inputs), run.frame_count)
-        if strip is not None:
-            from telerig.estimator.tracking.follow_marks import follow_references
+    strip = described_strip(run)
+    if strip is not None:
+        from telerig.estimator.tracking.follow_marks import follow_references
 
-            marks = follow_references(run, cameras, axis, strip, store, stage, executor)
-        if store.missing():
+        marks = follow_references(run, cameras, axis, strip, store, stage, executor)
+    stored = LinkedRows(store.folder)
+    linking = stored.linking()
+    if linking is not None:
+        rows = stored.kept()
+    else:
+        if run.detections is None and store.missing():
             strips = marks.strips if marks is not None else None
             scene = make_scene(
                 run, cameras, axis, chosen.min_diameter_px, stage, strips, chosen.background
             )
             detect_missing(scene, store, stage, executor)
-        batches = store.tables
-    without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
-    if stage is not None:
-        stage("pair model", 0, 0)
-    sample = _sample(cameras, batches)
-    model = estimate_pair_model(sample, cameras)
-    tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
-    up = upwards(run, axis)
-    linker = RowMaker(cameras, model, tracker, _shapes(sample, cameras, model, up), up)
-    rows = _linked(run, cameras, batches(), linker, without, stage)
+        if stage is not None:
+            stage("pair model", 0, 0)
+        sample = _sample(cameras, batches)
+        model = estimate_pair_model(sample, cameras)
+        tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
+        linker = RowMaker(cameras, model, tracker, _shapes(sample, cameras, model, up), up)
+        without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
+        linking = Linking(model, linker.shapes, linker.events, without)
+        rows = stored.keep(_linked(run, cameras, batches(), linker, without, stage), linking)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
     corrections = read_corrections(run.path, numbered=labels is None)
     rows = corrections.applied(rows)
-    return TrackingStream(
-        run, calibration, linker, without, store, marks, rows, corrections, names=labels
-    )
+    return TrackingStream(run, calibration, linking, store, marks, rows, corrections, names=labels)
+
+
+def _inputs(
+    run: RunData, cameras: Sequence[Camera], options: TrackOptions, directions: Sequence[Array]
+) -> dict[str, Any]:
+    """Return what the rows depend on beside the recording's files, for `fingerprint`.
+
+    directions : unit vectors (3,) of the stage's travel and against gravity.
+    """
+    masks = {name: hash_if_there(file) for name, file in mask_files(run).items()}
+    described = None if run.rig is None else (run.rig.bubbles, described_strip(run))
+    inputs = {
+        "options": repr(options), "cameras": cameras, "frames": run.frame_count,
+        "source": run.source, "times": run.t_s, "positions": run.position_mm,
+        "directions": directions, "described": repr(described), "masks": masks,
+    }  # fmt: skip
+    return dict(plain(inputs))
 
 
 def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:

@@ -262,12 +262,7 @@ def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") 
     seconds : time that the tracking took.
     steps : how long its steps took, in words.
     """
-    tracks = "1 track" if summary["tracks"] == 1 else f"{summary['tracks']} tracks"
-    lines = [
-        f"Run {summary['run']!r}: {tracks}, {summary['points']} points in space "
-        f"from {summary['detections']} detections in {summary['frames']} frames "
-        f"({seconds:.1f} s{steps and f': {steps}'})",
-    ]
+    lines = [f"{count_words(summary)} ({seconds:.1f} s{steps and f': {steps}'})"]
     left = summary["detections_without_partner_or_track"]
     if left:
         lines.append(f"  {left} detections have no partner in the other view, or no track")
@@ -286,3 +281,12 @@ def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") 
     lines += [f"  warning: {warning}" for warning in summary.get("warnings", [])]
     lines += [f"  note: {note}" for note in summary["notes"]]
     return "\n".join(lines)
+
+
+def count_words(summary: Mapping[str, Any]) -> str:
+    """Return how many tracks and points were found, from the content of tracking.json."""
+    return (
+        f"Run {summary['run']!r}: {counted(summary['tracks'], 'track')}, "
+        f"{summary['points']} points in space from {summary['detections']} detections in "
+        f"{summary['frames']} frames"
+    )

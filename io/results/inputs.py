@@ -85,11 +85,12 @@ def fingerprints(folder: Path, sources: Iterable[Path | Source]) -> dict[str, In
     found = {}
     for source in sources:
         named = Source(source) if isinstance(source, Path) else source
-        found[_relative(named.path, folder)] = named.fingerprint()
+        found[relative(named.path, folder)] = named.fingerprint()
     return found
 
 
-def _relative(path: Path, folder: Path) -> str:
+def relative(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder, or the whole path where there is no way to it."""
     try:
         return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
     except ValueError:  # on another drive

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,11 +13,15 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.errors import InputError
-from telerig.estimator.tracking.corrections import Corrections, read_corrections
+from telerig.estimator.tracking import track as track_module
+from telerig.estimator.tracking.corrections import Corrections, add_correction, read_corrections
 from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.estimator.tracking.results_folder import WORK
+from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.results.stale import stale
 from telerig.scripts.main import app
 
+TABLES = ("tracks.csv", "detections.csv", "events.csv", "tracking.json")
 HEAD = "action,particle,other,frame,reason\n"
 
 
@@ -140,3 +145,96 @@ def test_a_tracking_applies_them_and_tells_of_them(tank_copy: Path) -> None:
     said = found.events[found.events["kind"] == "correction"]
     assert said["reason"].tolist() == ["split: it <hit> another bubble"]
     assert set(found.detections["particle"].dropna()) == {0, 5}
+
+
+def correct(run: Path, *words: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["correct", str(run), *words, "--quiet"])
+    return done.exit_code, done.output
+
+
+def contents(folder: Path) -> list[bytes]:
+    return [(folder / name).read_bytes() for name in TABLES]
+
+
+def test_a_correction_is_that_of_a_whole_tracking_and_repeats_none_of_it(
+    tank_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, results = tank_copy / "runs" / "rise", tank_copy / "results" / "rise"
+    command = ["track", str(run), "--quiet", "--no-report"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    before = contents(results)
+    with monkeypatch.context() as patch:
+        for name in ("make_scene", "detect_missing", "estimate_pair_model", "_linked"):
+            patch.setattr(track_module, name, lambda *_, **__: pytest.fail("repeated"))
+        code, said = correct(run, "split", "0", "5", "--from", "6", "--reason", "a, b <c>")
+        assert code == 0, said
+        assert "row 2" in said and "frames 6 to" in said and "now track 5" in said
+        corrected = contents(results)
+        assert correct(run, "rename", "5", "8")[0] == correct(run, "rename", "8", "5")[0] == 0
+        (run / "corrections.csv").unlink()
+        assert CliRunner().invoke(app, command).exit_code == 0
+        assert contents(results) == before != corrected
+    (run / "corrections.csv").write_text(HEAD + 'split,0,5,6,"a, b <c>"\n')
+    shutil.rmtree(results / WORK)
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert contents(results) == corrected
+
+
+def test_other_detections_are_tracked_anew(tank_copy: Path) -> None:
+    run, results = tank_copy / "runs" / "rise", tank_copy / "results" / "rise"
+    command = ["track", str(run), "--quiet", "--no-report"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    before = pd.read_csv(results / "tracks.csv")
+    found = pd.read_csv(run / "detections.csv")
+    found.assign(u_px=found["u_px"] + 1).to_csv(run / "detections.csv", index=False)
+    assert CliRunner().invoke(app, command).exit_code == 0
+    after = pd.read_csv(results / "tracks.csv")
+    assert after["left_u_px"].tolist() == pytest.approx((before["left_u_px"] + 1).tolist())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["join", "0", "3"], "there is no track 3"),
+        (["drop", "7"], "there is no track 7"),
+        (["split", "0", "5"], "split has particle"),
+        (["split", "0", "5", "--from", "0"], "split from frame 0 on changes all of it"),
+        (["split", "0", "5", "--from", "4000"], "split from frame 4000 on changes none of it"),
+        (["rename", "0", "b"], "no whole number"),
+        (["cut", "0"], "no action 'cut'"),
+        (["drop", "0", "--reason", ""], "reason"),
+    ],
+)
+def test_a_correction_that_does_not_fit_is_not_written(
+    tank_copy: Path, words: list[str], said: str
+) -> None:
+    run = tank_copy / "runs" / "rise"
+    code, found = correct(run, *words)
+    assert code == 2 and said in " ".join(found.split())
+    assert not (run / "corrections.csv").exists()
+
+
+def test_tracks_that_are_both_seen_are_not_joined(tmp_path: Path) -> None:
+    """Frame 4 shows both to one camera only."""
+    run, results = tmp_path / "run", tmp_path / "results"
+    run.mkdir()
+    frames, ids = [0, 1, 2, 3, 3, 5], [1, 1, 1, 1, 2, 2]
+    table = pd.DataFrame({"frame": frames, "particle": ids, "t_s": 0.0})
+    table = table.assign(x_mm=0.0, y_mm=0.0, z_mm=0.0)
+    summary = {"kind": "telerig tracks"}
+    seen = pd.DataFrame({"frame": [*frames, 4, 4], "particle": [*ids, 1, 2], "camera": "left"})
+    Tracks("run", seen.assign(u_px=1.0, v_px=1.0), table, events_table([]), summary).save(results)
+    for first, many in ((0, "2 frames between 3 and 4"), (4, "1 frame between 4 and 4")):
+        row = {"action": "join", "particle": "1", "other": "2", "frame": first, "reason": "x"}
+        with pytest.raises(InputError, match=many):
+            add_correction(run, results, row)
+    assert "track 2, frames 5 to 5" in add_correction(run, results, {**row, "frame": 5})
+    assert (run / "corrections.csv").read_text() == HEAD + "join,1,2,5,x\n"
+
+
+def test_stale_tracks_are_not_corrected(tank_copy: Path) -> None:
+    run = tank_copy / "runs" / "rise"
+    (run / "corrections.csv").write_text(HEAD + "split,0,5,6,by hand\n")
+    code, said = correct(run, "drop", "5")
+    assert code == 2 and "corrections.csv was added" in said
+    assert (run / "corrections.csv").read_text() == HEAD + "split,0,5,6,by hand\n"

@@ -22,7 +22,7 @@ from telerig.estimator.calibration.result.calibration import (
 )
 from telerig.estimator.tracking import detect_run
 from telerig.estimator.tracking import track as track_module
-from telerig.estimator.tracking.results_folder import write_tracking
+from telerig.estimator.tracking.results_folder import WORK, write_tracking
 from telerig.estimator.tracking.track import TrackOptions, tracking_stream
 from telerig.estimator.tracking.tracks import Tracks
 from telerig.io.results.calibration_words import NO_COVARIANCE
@@ -224,6 +224,26 @@ def test_pictures_show_what_the_tables_say(
         overlay = cv2.imread(str(tmp_path / "out" / "overlays" / camera / f"{path.stem}.jpg"))
         colour = np.ptp(overlay[36:45, 20:81].astype(int), axis=2)
         assert colour[:, :21].max() > 60 and colour[:, 40:].max() < 30
+
+
+def test_corrected_images_are_those_of_a_whole_tracking(
+    rise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    shutil.copytree(rise, data)
+    tracked(data, out)
+    text = "action,particle,other,frame,reason\nsplit,0,5,6,x\n"
+    (data / "runs" / "rise" / "corrections.csv").write_text(text, encoding="utf-8")
+    with monkeypatch.context() as patch:
+        patch.setattr(track_module, "make_scene", lambda *_: pytest.fail("repeated"))
+        tracked(data, out)
+    tracked(data, tmp_path / "whole")
+    names = [f.relative_to(out) for f in out.rglob("*.*") if WORK not in f.parts]
+    kinds = {name.suffix for name in names}
+    assert kinds == {".csv", ".json", ".jpg", ".png"}
+    for name in set(names) - {Path("run.json"), Path("manifest.json")}:
+        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    assert set(pd.read_csv(out / "tracks.csv")["particle"]) == {0, 5}
 
 
 def test_results_inside_the_run_are_no_input(rise: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from telerig.io.simulation.calibration.scene import (
     wholly_inside,
 )
 from telerig.io.simulation.config import SimulationConfig
-from telerig.io.simulation.images.plates import Light, pixel_from_plate, render
+from telerig.io.simulation.images.plates import Light, image_centres, render
 from telerig.io.simulation.images.sensor import digitise
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
@@ -110,7 +110,7 @@ def exact_dots(
     target: TrueTarget,
     views: list[View],
 ) -> pd.DataFrame:
-    """Return a table of the true pixels of all dots in the images.
+    """Return a table of the true centres of the dots' images, which are what is measured.
 
     The column inside is 1 for dots that lie completely inside the image and away from its border.
     """
@@ -118,9 +118,7 @@ def exact_dots(
     tables = []
     for view in views:
         for name in view.cameras:
-            uv = pixel_from_plate(
-                cameras[name], view.rig_from_target, target.points_mm, target.plate
-            )
+            uv = image_centres(cameras[name], view.rig_from_target, target.plate)
             inside = wholly_inside(cameras[name], view.rig_from_target, target, config.border_px)
             size = np.array(cameras[name].image_size_px)
             seen = np.all((uv >= -0.5) & (uv <= size - 0.5), -1)

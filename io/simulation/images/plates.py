@@ -270,6 +270,23 @@ def pixel_from_plate(
     return uv
 
 
+def image_centres(camera: Camera, rig_from_target: Pose, plate: Plate) -> Array:
+    """Return the centres of area of the dots' images, (N, 2) in px.
+
+    Perspective and distortion move them away from the images of the dots' centres. Each image is
+    the polygon of 64 points of the dot's rim.
+    """
+    angle = 2 * np.pi * np.arange(64) / 64
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
+    rims = plate.dots_mm[:, None] + plate.diameter_mm[:, None, None] / 2 * circle
+    centre = pixel_from_plate(camera, rig_from_target, plate.dots_mm, plate)
+    rim = pixel_from_plate(camera, rig_from_target, rims, plate) - centre[:, None]
+    following = np.roll(rim, -1, axis=1)
+    twice = rim[..., 0] * following[..., 1] - rim[..., 1] * following[..., 0]
+    moment = np.sum(twice[..., None] * (rim + following), 1) / 3
+    return np.asarray(centre + moment / np.sum(twice, 1)[:, None])
+
+
 def _glass_shift(direction: Array, plate: Plate) -> Array:
     """Return straight hit minus refracted hit (..., 2) of directions (..., 3) in target axes."""
     lateral = direction[..., :2]

@@ -19,7 +19,12 @@ from telerig.io.simulation.calibration.scene import (
 )
 from telerig.io.simulation.calibration_files import exact_dots, view_image
 from telerig.io.simulation.config import CameraConfig
-from telerig.io.simulation.images.plates import pixel_from_plate
+from telerig.io.simulation.images.plates import (
+    Plate,
+    disc_coverage,
+    image_centres,
+    pixel_from_plate,
+)
 from telerig.io.simulation.presets import PRESETS, RUN_PRESETS, preset
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
@@ -201,6 +206,7 @@ def test_truth_reproduces_the_exact_dots(tmp_path):
     simulate("near_telecentric", rng=np.random.default_rng(2), out=tmp_path, images=False)
     truth = json.loads((tmp_path / "truth" / "truth.json").read_text())
     exact = pd.read_csv(tmp_path / "truth" / "dots.csv")
+    target = preset("near_telecentric").target
     points = dict(zip(truth["target"]["dot"], truth["target"]["points_mm"]))
     for (view, name), rows in exact.groupby(["view", "camera"]):
         values = truth["cameras"][name]
@@ -218,9 +224,28 @@ def test_truth_reproduces_the_exact_dots(tmp_path):
         )
         place = truth["views"][view]["rig_from_target"]
         moved = Pose(np.array(place["rotation"]), np.array(place["translation_mm"]))
-        uv = camera.project(moved.apply([points[d] for d in rows["dot"]]))
+        seen = np.array([points[dot] for dot in rows["dot"]])
+        plate = Plate(seen, target.diameter_mm(rows["dot"].to_numpy()), np.zeros(len(seen)))
+        uv = image_centres(camera, moved, plate)
         assert np.allclose(uv, rows[["u_px", "v_px"]], atol=1e-9)
+        assert 1e-6 < np.abs(uv - camera.project(moved.apply(seen))).max() < 0.01
     assert truth["config"]["name"] == "near_telecentric" and truth["seed"]["entropy"] == 2
+
+
+def test_centres_of_images_are_those_of_their_area():
+    """Rasters of dots through an ordinary lens; the images of their centres lie elsewhere."""
+    camera = Camera.create("side", (400, 300), 30.0, kappa_per_mm=8e-3, k1=2e-3)
+    pose = Pose.from_rotvec([0.5, -0.4, 0.2], [0.3, -0.2, 0.0])
+    dots = np.array([[-3.0, -2, 0], [0, 0, 0], [3, 1, 0], [-2, 2.5, 0]])
+    plate = Plate(dots, np.full(4, 1.6), np.zeros(4))
+    expected = image_centres(camera, pose, plate)
+    for dot, centre in zip(dots, expected):
+        one = Plate(dot[None], plate.diameter_mm[:1], plate.hole_mm[:1])
+        area = disc_coverage(camera, pose, one, one.dots_mm, one.diameter_mm, one.hole_mm, 0.7)
+        v, u = np.indices(area.shape)
+        assert np.allclose([np.average(u, weights=area), np.average(v, weights=area)], centre,
+                           atol=2e-4)  # fmt: skip
+    assert np.abs(expected - pixel_from_plate(camera, pose, dots, plate)).max() > 0.05
 
 
 def test_same_seed_same_bytes(tmp_path):

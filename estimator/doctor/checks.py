@@ -20,6 +20,7 @@ from telerig.estimator.batch.jobs import check_run_name
 from telerig.estimator.doctor.cost import cost_words
 from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.recording.ports import NO_PERMISSION, found_ports
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.io.dataset.run import RunData
@@ -206,8 +207,12 @@ def _views(data: Dataset) -> Iterator[Check]:
         yield Check("views", "ok" if done else "warning", words, todo)
         return
     count = len(data.views)
-    single = [v.name for v in data.views if v.image_paths and len(v.image_paths) == 1]
-    words = f"{count} views from {data.source}"
+    seen = {v.name: set(v.image_paths) for v in data.views}
+    if data.table is not None:
+        for view, camera in zip(data.table["view"], data.table["camera"]):
+            seen[view].add(camera)
+    single = [name for name, of in seen.items() if len(of) == 1 < len(data.rig.cameras)]
+    words = f"{counted(count, 'view')} from {data.source}"
     if single:
         words += f", {len(single)} of them from one camera only ({', '.join(single[:4])})"
     if count < FEWEST_VIEWS:

@@ -191,7 +191,6 @@ def load_dataset(
     elif chosen == "dots":
         table = read_dots_csv(folder / "calibration" / "dots.csv", rig)
         views = tuple(View(name) for name in sorted(set(table["view"]), key=natural))
-        _note_single(table.groupby("view")["camera"].agg(set).to_dict(), rig, notes)
     else:
         notes.append("no calibration views were read")
     return Dataset(folder, rig, views, runs, chosen, notes, table)
@@ -279,7 +278,6 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
             for stem, file in files_by_view(entry, notes).items():
                 by_view.setdefault(stem, {})[entry.name] = file
     _check_case(by_view, calibration)
-    _note_single({view: set(paths) for view, paths in by_view.items()}, rig, notes)
     return tuple(
         View(name, {c: by_view[name][c] for c in rig.cameras if c in by_view[name]})
         for name in sorted(by_view, key=natural)
@@ -326,12 +324,3 @@ def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
                 todo="write a view's name in the same way for all cameras, or rename one of the "
                 "files",
             )
-
-
-def _note_single(cameras_of: Mapping[Any, set[str]], rig: RigDescription, notes: list[str]) -> None:
-    """Add a sentence to ``notes`` about the views that only one camera has."""
-    for camera in rig.cameras if len(rig.cameras) > 1 else ():
-        alone = sorted((str(v) for v, seen in cameras_of.items() if seen == {camera}), key=natural)
-        if alone:
-            count = f"{len(alone)} view{'s' if len(alone) > 1 else ''}"
-            notes.append(f"{count} with an image of camera {camera} only: {', '.join(alone)}")

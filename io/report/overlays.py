@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
+from telerig.short_text import counted
 
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -70,7 +71,7 @@ def draw_overlay(
     dots, strange = (_ellipses(table, least_px) for table in (accepted, rejected))
     return _overlay(
         image, dots, labels, [GREEN] * len(dots), strange, list(rejected["reason"]),
-        f"{len(dots)} dots accepted", max_width_px,
+        f"{counted(len(dots), 'dot')} accepted", max_width_px,
     )  # fmt: skip
 
 
@@ -121,7 +122,7 @@ def draw_bubble_overlay(
         size = max(radius, finest_px) if np.isfinite(radius) else 4 * finest_px
         circles.append(np.stack([u + size * np.cos(_TURN), v + size * np.sin(_TURN)], -1))
     reasons = [reason for *_, reason in rejected]
-    found = f"{len(outlines)} bubbles" if found is None else found
+    found = counted(len(outlines), "bubble") if found is None else found
     return _overlay(image, outlines, labels, shades, circles, reasons, found,
                     max_width_px, _LEAST_CONTRAST)  # fmt: skip
 

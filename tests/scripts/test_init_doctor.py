@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from target_pictures import draw, pixel_from_mm
 from typer.testing import CliRunner
@@ -189,11 +190,21 @@ def test_a_port_that_may_not_be_opened_is_named(tmp_path, monkeypatch):
     assert "dialout" in _of(check_ports(tmp_path), str(device), "warning")
 
 
+def test_views_of_one_camera_are_named(data):
+    file = data / "calibration" / "dots.csv"
+    dots = pd.read_csv(file)
+    alone = sorted(set(dots["view"]))[1]
+    dots[(dots["view"] != alone) | (dots["camera"] == "left")].to_csv(file, index=False)
+    views = _of(list(check_dataset(data)), "views", "ok")
+    assert f"1 of them from one camera only ({alone})" in views
+
+
 def test_a_sound_dataset_has_nothing_to_mend(data):
     checks = list(check_dataset(data))
     assert {c.status for c in checks} <= {"ok", "note"}, checks
     assert "12 views from dots" in _of(checks, "views", "ok")
     assert "20 frames from detections" in _of(checks, "run rise", "ok")
+    assert "one camera" not in _of(checks, "views", "ok")
     sensors = _of(checks, "run rise sensors", "ok")
     assert "encoder 1000 Hz" in sensors and "arm_left 2000 Hz" in sensors
 

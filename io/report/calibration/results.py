@@ -23,6 +23,7 @@ from telerig.io.results.calibration import (
     read_joint_covariance,
     read_uncertainty,
 )
+from telerig.io.results.findings import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
 from telerig.rig.camera import Camera
@@ -138,6 +139,12 @@ def _residuals(
     folder: Path, cameras: tuple[Camera, ...], views: Mapping[str, Pose], file: CalibrationFile
 ) -> pd.DataFrame:
     place = folder / "residuals.csv"
+    if not place.is_file() and file.verdict.status == Status.IMPORTED:
+        raise InputError(
+            "was imported, so it has no dots and residuals of which a report could be made",
+            where=str(folder / "calibration.json"),
+            todo="use it as it is, or calibrate (`telerig calibrate`) for a report",
+        )
     if not place.is_file():
         raise InputError(
             "the residuals are missing, a report cannot be made without them",

@@ -108,7 +108,7 @@ def test_views_of_dots(folder: Path) -> None:
     taken = dataset.dots()
     taken.loc[:, "u_px"] = 0.0
     assert dataset.dots()["u_px"].tolist() == [1.0] * 3, "a copy each time"
-    assert dataset.notes == ["1 view with an image of camera left only: v10"]
+    assert dataset.notes == []
     assert "no image of view v2" in error_of(lambda: dataset.image(dataset.views[0], "left"))
 
 
@@ -142,15 +142,11 @@ def test_a_source_that_is_not_there(folder: Path) -> None:
     assert "source is 'pictures'" in message and "--from" in message
 
 
-def test_views_of_one_camera_alone_are_kept_and_noted(folder: Path) -> None:
+def test_views_of_one_camera_alone_are_kept(folder: Path) -> None:
     add_images(folder, "left/a.tif", "left/b.tif", "left/c.tif", "right/a.tif", "right/d.tif")
     dataset = load_dataset(folder)
     assert [view.name for view in dataset.views] == ["a", "b", "c", "d"]
     assert list(dataset.views[3].image_paths) == ["right"]
-    assert dataset.notes == [
-        "2 views with an image of camera left only: b, c",
-        "1 view with an image of camera right only: d",
-    ]
 
 
 def test_one_camera_needs_no_notes(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 from tracked_folder import outline
 
 from telerig.errors import InputError
+from telerig.io.report import overlays
 from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
 
 
@@ -39,6 +40,18 @@ def test_overlay_draws_each_outline_where_it_is() -> None:
         assert columns.mean() == pytest.approx(u, abs=0.2)
     half = draw_bubble_overlay(image, rings, ["7", "8"], colours, max_width_px=150)
     assert half.shape[1] == 150
+
+
+def test_legend_counts_bubbles(monkeypatch: pytest.MonkeyPatch) -> None:
+    legends: list[list[str]] = []
+    draw = overlays._legend
+    monkeypatch.setattr(
+        overlays, "_legend", lambda lines, w: legends.append(lines) or draw(lines, w)
+    )
+    for many in range(3):
+        rings = [outline(20.0 * (k + 1), 30, 8) for k in range(many)]
+        draw_bubble_overlay(np.full((60, 80), 180.0), rings, [""] * many)
+    assert [lines[0].split(",")[0] for lines in legends] == ["0 bubbles", "1 bubble", "2 bubbles"]
 
 
 def test_overlay_tells_why_something_was_rejected() -> None:

@@ -17,12 +17,14 @@ from calibration_folder import write_calibration_folder
 from report_page import Page, edit
 
 from telerig.errors import InputError
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.report.calibration.figures import residual_field
 from telerig.io.report.calibration.report import contact_sheet, write_calibration_report
 from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.tables import parameter_rows, pose_rows, worst_rows
 from telerig.io.report.page import contact_sheet as sheets
 from telerig.io.report.remake import ResultsFolder, remake_report
+from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.short_text import with_sd
 
@@ -113,6 +115,14 @@ def test_hostile_names_stay_text(folder: Path) -> None:
     assert evil not in html and "&lt;/script&gt;&lt;b&gt;x" in html
     scene = html.split("var scene = ")[1]
     assert begun not in scene and "\\u003c!--" in scene
+
+
+def test_an_imported_calibration_is_said_to_have_no_report(tmp_path: Path) -> None:
+    camera = Camera.create("left", (640, 480), 10.0)
+    calibration_from_cameras([camera]).save(tmp_path / "out")
+    with pytest.raises(InputError, match="was imported") as caught:
+        write_calibration_report(tmp_path / "out")
+    assert "residuals.csv" not in str(caught.value)
 
 
 def test_importing_the_report_draws_in_no_plotting_library() -> None:

@@ -169,6 +169,7 @@ def test_a_correction_is_that_of_a_whole_tracking_and_repeats_none_of_it(
         code, said = correct(run, "split", "0", "5", "--from", "6", "--reason", "a, b <c>")
         assert code == 0, said
         assert "row 2" in said and "frames 6 to" in said and "now track 5" in said
+        assert "tracks.csv has changed since they were made" in said, "the smoothing is stale"
         corrected = contents(results)
         assert correct(run, "rename", "5", "8")[0] == correct(run, "rename", "8", "5")[0] == 0
         (run / "corrections.csv").unlink()

@@ -29,6 +29,8 @@ from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, tracks_
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.pose import Pose
 
+pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
+
 Array = NDArray[np.float64]
 COLUMNS = [*CALIBRATION_SHARE, EXTRAPOLATED]
 LENS = Calibration(

@@ -28,6 +28,8 @@ from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.scripts.main import app
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 S2 = Experiment(
     500.0, 1.5, sigma_px=0.5, rise_mm_s=280.0, zigzag_mm=1.77, shake_hz=20.0,
     shake_mm=0.2 / np.sqrt(2),
@@ -129,7 +131,7 @@ def test_a_rig_that_does_not_shake(rig: RigDescription, calibration: telerig.Cal
 
 
 def test_the_command_says_what_to_add(tank: Path, tmp_path: Path) -> None:
-    line = ["plan", str(tank), "--seconds", "0.2", "--quiet", "--out", str(tmp_path / "plan.csv")]
+    line = ["plan", str(tank), "--seconds", "0.1", "--quiet", "--out", str(tmp_path / "plan.csv")]
     result = CliRunner().invoke(app, line)
     assert result.exit_code == 0, result.output
     assert "add: 4 marks in each view" in result.output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -40,6 +41,7 @@ def _load_benchmark() -> ModuleType:
 bodies = _load_benchmark()
 
 
+@cache
 def case(mode: Any, axis: str, ratio: float, count: int = 16, seed: int = 1, views: int = 2) -> Any:
     rng = np.random.default_rng(seed)
     return bodies.run_case(bodies.Case(mode, axis, ratio), count, rng, views)
@@ -95,7 +97,7 @@ def test_a_leaning_spheroid_with_its_own_zonal_mode_is_corrected() -> None:
 
 @pytest.mark.parametrize("order", range(4))
 def test_every_third_mode_of_a_sphere_loses_its_share_of_the_shared_coordinate(order: int) -> None:
-    outcome = case((3, order), "own", 1.0)
+    outcome = case((3, order), "own", 1.0, count=48)
     found = outcome.bodies
     before = (found.silhouette_points_mm - outcome.truth_mm)[:, 1] / outcome.radius_mm
     after = (found.points_mm - outcome.truth_mm)[:, 1] / outcome.radius_mm
@@ -134,7 +136,7 @@ def test_covariance_covers_gaussian_bodies() -> None:
 @pytest.mark.parametrize("order", range(4))
 def test_rims_that_reach_farther_do_not_make_spheres_larger(order: int) -> None:
     """The outlines' size is 0.08-0.14 % above the volume's (docs/decisions/037)."""
-    outcome = case((3, order), "own", 1.0, count=60)
+    outcome = case((3, order), "own", 1.0, count=48)
     off = np.log(outcome.bodies.d_eq_mm / outcome.diameter_mm)
     assert abs(off.mean()) < 5e-4
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from places import REAL, ROOT
+from seeds import few_or_many
 
 from telerig.arrays import Array
 from telerig.estimator.bubbles.detect import find_bubbles, is_crowded
@@ -17,6 +18,7 @@ from telerig.estimator.bubbles.outline.rim_kernels import RAYS, closed_rims, own
 from telerig.estimator.bubbles.outline.rims import find_rims
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
+import dense_scenes
 from bubble_outline_renderer import Drawn, draw
 from dense_bubbles import ELLIPSE
 from dense_scenes import paired, swarm
@@ -53,8 +55,11 @@ def misses(found: Array, bubbles: list[Drawn]) -> Array:
     return np.asarray(np.linalg.norm(found[:, None] - truth, axis=2).min(axis=0))
 
 
-def test_crowded_images_of_a_run_are_searched_by_rims_and_sparse_ones_as_before() -> None:
-    for covered in (0.1, 0.35):
+def test_crowded_images_of_a_run_are_searched_by_rims_and_sparse_ones_as_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for covered, side in ((0.1, 192), (0.35, 384)):
+        monkeypatch.setattr(dense_scenes, "SIDE", side)
         image, truth = swarm(covered, True, np.random.default_rng(70))
         plain, found = (find_bubbles(image, crowds=crowds).accepted for crowds in (False, True))
         if covered < 0.15:
@@ -153,10 +158,11 @@ def test_a_piece_of_rim_has_one_owner() -> None:
     ]  # fmt: skip
 
 
-def test_centres_beside_shadows_and_hidden_neighbours_know_their_errors() -> None:
+@few_or_many(1, 4)
+def test_centres_beside_shadows_and_hidden_neighbours_know_their_errors(draws: int) -> None:
     """Without what the fit itself shows of misled rims the two figures are 328 and 0.24."""
     square = []
-    for seed in range(2):
+    for seed in range(draws):
         image, truth = swarm(0.2, True, np.random.default_rng([17, seed]))
         table = find_bubbles(image, everywhere=True).accepted
         found = table[["u_px", "v_px", "a_px", "b_px", "angle_rad"]].to_numpy(float)
@@ -165,7 +171,7 @@ def test_centres_beside_shadows_and_hidden_neighbours_know_their_errors() -> Non
         covariance = centre_covariances(table)[i]
         square.append(np.einsum("ni,nij,nj->n", miss, np.linalg.inv(covariance), miss))
     every = np.concatenate(square)
-    assert len(every) > 100
+    assert len(every) > 50 * draws
     assert np.mean(every) / 2.0 < 3.0 and np.mean(every > 9.21) < 0.15
 
 

@@ -34,8 +34,8 @@ MISSING = replace(PLATE, mark_style="missing")
 
 @cache
 def views(target: Target) -> list[Any]:
-    """Four images; read only."""
-    poses = ((10.0, 8.0), (35.0, -20.0), (25.0, 95.0), (40.0, 170.0))
+    """Three images; read only."""
+    poses = ((10.0, 8.0), (35.0, -20.0), (40.0, 170.0))
     return [
         draw(target, pixel_from_mm(6.5, tilt, roll, False), size_px=SIZE, seed=k)[0]
         for k, (tilt, roll) in enumerate(poses)

@@ -15,6 +15,8 @@ from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.run.motion import Forces, added_mass_along, driven_paths
 from telerig.rig.bubble_physics import Liquid, added_mass, clift_velocity, drag_coefficient
 
+pytestmark = pytest.mark.usefixtures("without_advice")
+
 WATER = Liquid(998.2, 1e-3, 0.0728)
 
 
@@ -24,7 +26,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Smoothing, pd.DataFra
     folder = tmp_path_factory.mktemp("forces") / "d"
     config = run_preset("forces", frames=120, bubbles=3)
     dataset = telerig.simulate(config, rng=np.random.default_rng(5), out=folder, images=False)
-    calibration, data = telerig.calibrate(dataset), dataset.runs["forces"].load()
+    calibration, data = telerig.calibrate(dataset, model="radial"), dataset.runs["forces"].load()
     smoothing = telerig.smooth(telerig.track(data, calibration), calibration, stage=data)
     return smoothing, pd.read_csv(folder / "truth/runs/forces/bubbles.csv")
 

@@ -153,14 +153,14 @@ def tracks_of(problem: SmoothingProblem) -> pd.DataFrame:
 
 
 def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
-    problem, _ = crowded(300)
+    problem, _ = crowded(200)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
     whole, parts = (
         telerig.smooth(
             tracks_of(problem), calibration, model="default", t_s=problem.t_s,
             options=Options(frames=n),
         )
-        for n in (None, 150)
+        for n in (None, 100)
     )  # fmt: skip
     assert parts.verdict["verdict"] == whole.verdict["verdict"]
     assert parts.summary["bubbles"] == whole.summary["bubbles"]
@@ -223,15 +223,15 @@ def test_bubbles_that_come_late_are_judged(frames: int | None, tmp_path: Path) -
 
 def test_an_encoder_that_covers_a_part_of_the_run() -> None:
     """Where it does not, the carriage is unknown with and without shake, which is no separation."""
-    problem, _ = crowded(200)
+    problem, _ = crowded(120)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
-    t = problem.t_s[:50]
+    t = problem.t_s[:30]
     words = [
         telerig.smooth(
             tracks_of(problem), calibration, stage={"t_s": t, "position_mm": 0.2 * t},
             t_s=problem.t_s, model="default", options=Options(frames=n),
         ).verdict["verdict"]
-        for n in (None, 100)
+        for n in (None, 60)
     ]  # fmt: skip
     assert words == ["UNRESOLVED", "UNRESOLVED"]
 

@@ -147,15 +147,15 @@ def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
 
 
 @pytest.mark.parametrize(
-    ("scenario", "seed", "information", "blamed"),
+    ("scenario", "seed", "information", "blamed", "frames"),
     [
-        ("S1", 907, "one", "accelerometers"),
-        ("S2", 908, "references", "accelerometer arm_left"),
-        *long(("S3", 907, "one", "accelerometer arm_left")),
+        ("S1", 907, "one", "accelerometers", None),
+        ("S2", 908, "references", "accelerometer arm_left", 300),
+        *long(("S3", 907, "one", "accelerometer arm_left", None)),
     ],
 )
 def test_an_arm_is_blamed_only_where_all_measurements_tell_it_from_the_other(
-    scenario: str, seed: int, information: str, blamed: str
+    scenario: str, seed: int, information: str, blamed: str, frames: int | None
 ) -> None:
     """In S1 one bubble tells too little of the left arm's motion along x: both arms are named.
 
@@ -165,7 +165,7 @@ def test_an_arm_is_blamed_only_where_all_measurements_tell_it_from_the_other(
     def turned(name: str, t: Any, reading: Any) -> Any:
         return t, reading * [-1, 1, 1] if name == "arm_left" else reading
 
-    _, said = placed(seed, information, turned, scenario=scenario)
+    _, said = placed(seed, information, turned, scenario=scenario, frames=frames)
     (finding,) = [f for f in said if f.code is not None]
     assert finding.code == "SENSOR_AXES" and finding.where.startswith(blamed)
     if scenario != "S1":

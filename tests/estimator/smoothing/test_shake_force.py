@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import norm
+from seeds import first_or_all
 from shake_learning_data import BUBBLE_HZ, COMMON_HZ, run, true_model
 
 from telerig.errors import InputError
@@ -51,7 +52,7 @@ def test_a_force_with_a_corner_is_told_from_a_white_one() -> None:
     assert 0.02 < found.learned[FORCE] < 0.5
 
 
-@pytest.mark.parametrize("seed", [21, 22])
+@pytest.mark.parametrize("seed", first_or_all(21, 22))
 def test_a_white_force_gets_no_corner(seed: int) -> None:
     """Both are climbed as far: what more steps gain is not laid to the corner."""
     problem, _, _ = run(
@@ -164,7 +165,7 @@ def test_prior_weights_of_a_line_beside_the_bubbles() -> None:
 
 def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None:
     """Elsewhere, of its own: then a second one just here would be a coincidence."""
-    problem, _, _ = run(np.random.default_rng(16), bubbles=3, rate_hz=100.0)
+    problem, _, _ = run(np.random.default_rng(16), bubbles=3, rate_hz=60.0)
     signals, true = pooled(signals_of(problem)[0]), true_model()
 
     def room(*common: RigMode) -> float:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from seeds import first_or_all
 from shake_learning_data import SWING_HZ, run, with_comings_and_goings
 
 from telerig.estimator.smoothing.graph.solve import Options, solve
@@ -114,7 +115,7 @@ def _short_tracks(seed: int, frames_each: int) -> tuple[SmoothingProblem, np.nda
     return cut, np.concatenate(list(places)), shake
 
 
-@pytest.mark.parametrize("seed", [51, 52, 53])
+@pytest.mark.parametrize("seed", first_or_all(51, 52, 53))
 @pytest.mark.parametrize(("frames_each", "within_hz"), [(25, 2.0), (50, 0.75), (100, 0.75)])
 def test_tracks_shorter_than_a_swing_tell_its_frequency_and_size(seed, frames_each, within_hz):
     """The true ones are 6 Hz and 2 mm; so short tracks show above all the acceleration."""
@@ -125,7 +126,7 @@ def test_tracks_shorter_than_a_swing_tell_its_frequency_and_size(seed, frames_ea
     assert found[1] * found[0] ** 2 == pytest.approx(2.0 * SWING_HZ**2, rel=0.25)
 
 
-@pytest.mark.parametrize("seed", [54, 55])
+@pytest.mark.parametrize("seed", first_or_all(54, 55))
 def test_short_tracks_set_the_size_of_the_guessed_modes(seed):
     """The rig shakes along y and not at all along x and z; tracks last 0.1 s."""
     problem, places, shake = _short_tracks(seed, 50)

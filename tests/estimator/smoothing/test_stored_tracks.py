@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("known_low_passes")
 def test_a_run_is_tracked_and_smoothed_from_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = run_preset("swarm", frames=40, bubbles=3)
+    config = run_preset("swarm", frames=24, bubbles=3)
     telerig.simulate(config, rng=np.random.default_rng(1), out=tmp_path / "data", images=False)
     cameras = list(true_cameras(config.calibration).values())
     calibration = calibration_from_cameras(cameras, name="truth")
@@ -43,8 +43,8 @@ def test_a_run_is_tracked_and_smoothed_from_disk(
 
     whole = done(tmp_path / "whole")
     monkeypatch.setattr(frame_table, "LARGE_BYTES", 0)
-    monkeypatch.setattr(frame_table, "_BLOCK_BYTES", 5000)
-    monkeypatch.setattr(tables, "_FRAMES_AT_ONCE", 17)
+    monkeypatch.setattr(frame_table, "_BLOCK_BYTES", 20_000)
+    monkeypatch.setattr(tables, "_FRAMES_AT_ONCE", 11)
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))

@@ -25,7 +25,7 @@ from telerig.io.simulation.presets import run_preset
 Array = NDArray[np.float64]
 
 CAMERAS = tuple(true_cameras(run_preset("swarm").calibration).values())
-FRAMES, DT_S, NOISE_PX, SHAKE_PX = 36, 0.002, 0.05, 1.0
+FRAMES, DT_S, NOISE_PX, SHAKE_PX = 28, 0.002, 0.05, 1.0
 FRONT, BACK = 0, 1
 MODEL = replace(default_model(CAMERAS), frame_px=SHAKE_PX * 2**0.5)
 DIAMETERS_MM = np.array([3.6, 2.0, 2.4, 1.8, 2.8, 3.1])

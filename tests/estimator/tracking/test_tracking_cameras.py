@@ -26,6 +26,8 @@ from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
+pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
+
 THIRD = "[cameras.middle]\nimage_size_px = [512, 512]\nscale_px_per_mm = 10.0\n"
 
 
@@ -72,7 +74,7 @@ def test_a_run_takes_the_two_cameras_that_tracking_names(rise: Path, tmp_path: P
         assert data.cameras == ("left", "right")
         out = tmp_path / name
         write_tracking(data, calibration, out, options=TrackOptions(), record={}, report=False)
-        smooth_run(data, calibration, out, out, report=name == "three")
+        smooth_run(data, calibration, out, out, model="default", report=name == "three")
     for table in ("tracks.csv", "trajectories.csv", "shake.csv"):
         assert (tmp_path / "two" / table).read_text() == (tmp_path / "three" / table).read_text()
     notes = load_run(run).notes
@@ -112,6 +114,6 @@ def test_a_pair_without_the_first_camera(tmp_path: Path) -> None:
     uv = [tracks.table[[f"{c}_u_px", f"{c}_v_px"]].to_numpy(float) for c in run.cameras]
     found = pair.triangulate(*uv, sigma_px=0.1)
     assert np.abs(found.points_mm - tracks.table[["x_mm", "y_mm", "z_mm"]]).to_numpy().max() < 0.5
-    smoothed = telerig.smooth(tracks, calibration, stage=run)
+    smoothed = telerig.smooth(tracks, calibration, stage=run, model="default")
     assert len(smoothed.trajectories) == 20
     assert {"middle_y_mm", "right_y_mm"} <= set(smoothed.shake)

@@ -15,8 +15,7 @@ from report_page import Page
 from smoothed_folder import AXES, changed, read, write_folder
 
 from telerig.errors import InputError
-from telerig.io.report.page.figures import Picture, drawing
-from telerig.io.report.run import report
+from telerig.io.report.page.figures import drawing
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.smoothing.figures import smoothing_drawings
 from telerig.io.report.run.smoothing.results import shake_spectrum, velocity_spectrum
@@ -41,13 +40,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return write_folder(tmp_path / "r", frames=80, bubbles=1)
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page's words without its drawings, which take seconds."""
-    blank = Picture("", "data:,", "")
-    monkeypatch.setattr(report, "drawn_over_cores", lambda drawings: [blank] * len(drawings))
 
 
 def _captions(folder: Path) -> str:

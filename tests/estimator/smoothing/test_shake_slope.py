@@ -31,6 +31,7 @@ from telerig.estimator.smoothing.learning.parameters import (
 )
 from telerig.estimator.smoothing.learning.spectral_lines import moved_to_bubble
 from telerig.estimator.smoothing.problem.problem import BroadBand, ShakeModel
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 
 Array = NDArray[np.float64]
 
@@ -135,6 +136,30 @@ def test_frames_that_are_alike_are_eliminated_once() -> None:
     assert abs(found.log_evidence() - each.log_evidence()) < 1e-2
     for one, other in zip(*(f.chain.moments(f.spread()[0])[1:] for f in (found, each))):
         np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(other).max())
+
+
+def test_a_slow_chain_converges_before_its_frames_are_taken_as_alike(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The mean speed is hardly known beside motion of its own, so that its information of 0.02 is
+    the difference of numbers of 1e7.
+    """
+    t = np.arange(1500) / 1000
+    signal = Signal(
+        np.array([1.0, 0.0, 0.0]), (0,), t, np.zeros((1500, 1, 1)), np.full((1500, 1), 9901.0),
+        np.zeros(1, int), np.zeros(1, int), np.ones(1, bool), np.zeros(1, int), np.zeros(1),
+        np.array([100.0]), np.zeros(1, int), 1, False,
+    )  # fmt: skip
+    bubble = BubbleModel(
+        velocity_sigma_mm_s=11.11, velocity_tau_s=0.3555,
+        zigzags=(Zigzag(5.97, 0.0327, (1.848, 0.0, 1.848)),),
+    )  # fmt: skip
+    found = Factor(signal, replace(true_model(), bubble=bubble))
+    assert found.chain.steady[1] > found.chain.steady[0]
+    monkeypatch.setattr("telerig.estimator.smoothing.learning.evidence._STEADY", 0.0)
+    exact = Factor(signal, replace(true_model(), bubble=bubble))
+    assert found.inner[0] == pytest.approx(exact.inner[0], rel=1e-3)
+    assert found.log_evidence() == pytest.approx(exact.log_evidence(), abs=1e-3)
 
 
 def test_laplace_equals_second_differences_of_the_posterior() -> None:

@@ -32,7 +32,7 @@ SMOOTHING += ["residuals", "constants", "priors"]
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with its page, which no test changes."""
-    folder = write_folder(tmp_path_factory.mktemp("once") / "r")
+    folder = write_folder(tmp_path_factory.mktemp("once") / "r", frames=300)
     write_track_report(folder)
     return folder
 
@@ -305,7 +305,7 @@ def test_short_runs_have_no_spectra(tmp_path: Path) -> None:
 
 
 def test_long_runs_stay_small(tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "r", frames=2_500, bubbles=2)
+    folder = write_folder(tmp_path / "r", frames=1_200, bubbles=2)
     drawn = [draw() for _, draw in smoothing_drawings(read(folder))]
     assert sum(len(p.source) for p in drawn if p is not None) < 2e6
     text = " ".join(p.caption for p in drawn if p is not None)

@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from telerig.estimator.bubbles.detect import detect_bubbles
-from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
+from telerig.estimator.bubbles.pairing.groups import Matches, match_tables
+from telerig.estimator.bubbles.pairing.learning import learn_rig
 from telerig.estimator.bubbles.pairing.matching import (
-    Matches,
-    match_pairs,
     pair_geometry,
     shared_axis,
     view_of,
@@ -114,13 +113,13 @@ def real_pair(folder: Path, overlay: Path | None) -> list[str]:
         counts = " + ".join(str(len(t)) for t in tables)
         by_gap = gap_only(tables, cameras)
         lines.append(f"| {name} | gap only | {counts} | {score(tables, known, *by_gap)} |")
-        model = estimate_pair_model([(tables[0], tables[1])], cameras)
-        pairs = match_pairs(tables[0], tables[1], cameras, model)
-        result = score(tables, known, pairs.first, pairs.second)
+        model = learn_rig([(tables[0], tables[1])], cameras)
+        pairs = match_tables(tables, model)
+        result = score(tables, known, pairs.rows[:, 0], pairs.rows[:, 1])
         lines.append(f"| {name} | telerig | {counts} | {result} |")
         print("\n".join(lines[-2:]))
     lines += ["", "What the model says of the detections of `detect_bubbles`:", ""]
-    lines += [f"- {sentence}" for sentence in model.sentences()]
+    lines += [f"- {sentence}" for sentence in model.pairs[0, 1].sentences()]
     lines += ["", *agreement(found, known), "", *details(found, known, pairs)]
     if overlay is not None:
         draw(images, found, pairs, overlay)
@@ -148,7 +147,7 @@ def details(found: list[pd.DataFrame], known: list[Array], pairs: Matches) -> li
     lines = ["| pair | first (u, v) | second (u, v) | list's rows | gap (px) | gap (sigma) | "
              "height ratio | confidence |", "|---|---|---|---|---|---|---|---|"]  # fmt: skip
     mine = [rows_of_list(t, k) for t, k in zip(found, known)]
-    for k, (i, j) in enumerate(zip(pairs.first, pairs.second)):
+    for k, (i, j) in enumerate(zip(pairs.rows[:, 0], pairs.rows[:, 1])):
         one, two = found[0].iloc[i], found[1].iloc[j]
         lines.append(
             f"| {k + 1} | {one.u_px:.1f}, {one.v_px:.1f} | {two.u_px:.1f}, {two.v_px:.1f} | "
@@ -164,7 +163,7 @@ def draw(
 ) -> None:
     """Both views with outlines; a pair has one number and one colour, what is alone is grey."""
     pictures = []
-    for image, table, matched in zip(images, found, (pairs.first, pairs.second)):
+    for image, table, matched in zip(images, found, (pairs.rows[:, 0], pairs.rows[:, 1])):
         grey = cv2.convertScaleAbs(image, alpha=200.0 / np.percentile(image, 99))
         picture = cv2.cvtColor(cv2.resize(grey, None, fx=2, fy=2), cv2.COLOR_GRAY2BGR)
         number = {int(row): k for k, row in enumerate(matched)}
@@ -194,9 +193,10 @@ def random_scenes(frames: int) -> list[str]:
         rng = np.random.default_rng(seed)
         run = [random_frame(scene, rng) for _ in range(frames)]
         start = time.process_time()
-        model = estimate_pair_model([(f.first, f.second) for f in run], CAMERAS)
+        model = learn_rig([(f.first, f.second) for f in run], CAMERAS)
+        pair = model.pairs[0, 1]
         learnt, start = time.process_time() - start, time.process_time()
-        matches = [match_pairs(f.first, f.second, CAMERAS, model, predicted=f.predicted)
+        matches = [match_tables((f.first, f.second), model, f.predicted)
                    for f in run]  # fmt: skip
         each = (time.process_time() - start) / frames
         hits = [_right(f.first, f.second, m) for f, m in zip(run, matches)]
@@ -209,15 +209,15 @@ def random_scenes(frames: int) -> list[str]:
         right += hits
         lines.append(
             f"| {name} | {good / there:.4f} | {good / made:.4f} | {unsure / made:.4f} | "
-            f"{model.bias_px[0]:+.2f} | {model.frame_px:.2f} | {learnt:.2f} | {1e3 * each:.1f} |"
+            f"{pair.bias_px[0]:+.2f} | {pair.frame_px:.2f} | {learnt:.2f} | {1e3 * each:.1f} |"
         )
         print(lines[-1])
     return [*lines, "", *calibration(np.concatenate(confidence), np.concatenate(right))]
 
 
 def _right(first: pd.DataFrame, second: pd.DataFrame, pairs: Matches) -> NDArray[np.bool_]:
-    who = first.bubble.to_numpy()[pairs.first]
-    return np.asarray((who >= 0) & (who == second.bubble.to_numpy()[pairs.second]))
+    who = first.bubble.to_numpy()[pairs.rows[:, 0]]
+    return np.asarray((who >= 0) & (who == second.bubble.to_numpy()[pairs.rows[:, 1]]))
 
 
 def calibration(confidence: Array, right: Array) -> list[str]:

@@ -21,6 +21,7 @@ from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_ma
 from telerig.estimator.calibration.result.calibration import (
     Calibration,
     load_calibration,
+    of_run,
 )
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.sensors.checks import Mounting
@@ -238,12 +239,11 @@ def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -
     Raises InputError for an impossible experiment.
     """
     planned.check()
-    names = rig.tracking_cameras
-    pair = calibration if len(calibration.cameras) < 3 else calibration.pair(*names)
+    calibration = of_run(calibration, rig.tracking_cameras)
     sigma_px = planned.sigma_px
     if sigma_px is None:
-        sigma_px = centre_sigma_px(planned.diameter_mm * pair.cameras[0]["scale_px_per_mm"])
-    problem = planned_problem(rig, pair, planned, sigma_px)
+        sigma_px = centre_sigma_px(planned.diameter_mm * calibration.cameras[0]["scale_px_per_mm"])
+    problem = planned_problem(rig, calibration, planned, sigma_px)
     model = planned_model(problem, rig, planned)
     solution = solve(problem, model, Options(robust=False))
     table = trajectories(solution, None).iloc[_inner(solution)]

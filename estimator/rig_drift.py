@@ -18,15 +18,16 @@ wrong, because ray misses are correlated in time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.bubbles.pairing.matching import Finding
+from telerig.estimator.bubbles.pairing.matching import Finding, nearly_parallel
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.triangulation import (
@@ -358,7 +359,7 @@ class DriftPrior:
 
 @dataclass(frozen=True)
 class RigChange:
-    """The movement of the second camera relative to the first since the calibration.
+    """The movement of the second of two cameras relative to the first since the calibration.
 
     camera : name of the second camera.
     tangent, covariance : (6,), (6, 6) movement as a tangent of the pose rig_from_<camera>, with the
@@ -369,6 +370,8 @@ class RigChange:
     chance : p-value of the hypothesis that nothing has moved.
     pairs : number of pairs used.
     refined : pose rig_from_<camera> that calibration and run give together, or None.
+    against : name of the first camera.
+    culprit : of more than two cameras the one that has moved, if all others agree; else "".
     """
 
     camera: str
@@ -381,6 +384,8 @@ class RigChange:
     chance: float
     pairs: int
     refined: Pose | None = None
+    against: str = ""
+    culprit: str = ""
 
     @property
     def moved(self) -> bool:
@@ -403,6 +408,7 @@ class RigChange:
         """Return the content of ``rig_change`` in smoothing.json and tracking.json."""
         names = ("offset_mm", "roll_rad", "pitch_rad")
         out: dict[str, Any] = {"camera": self.camera, "moved": self.moved, "chance": self.chance}
+        out |= {"against": self.against, "culprit": self.culprit}
         out |= {n: float(v) for n, v in zip(names, self.values)}
         out |= {f"s{n}": float(s) for n, s in zip(names, self.sigmas)}
         out |= {
@@ -530,7 +536,7 @@ def rig_change_from(
     sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
     return RigChange(
         cameras[1].name, tangent, covariance, place_mm, rows @ tangent, sigmas, priors,
-        p_value_of(tangent, covariance, prior), pairs, refined,
+        p_value_of(tangent, covariance, prior), pairs, refined, cameras[0].name,
     )  # fmt: skip
 
 
@@ -686,12 +692,43 @@ class PairCollector:
         return pairs[(pairs["frame"] - self.first) % self.every == 0]
 
     def found(self) -> RigChange | None:
-        """Return the movement that all collected pairs give, or None if there are too few."""
+        """Return the movement that all collected rows give, or None if there are too few.
+
+        Of more than two cameras it is that of the pair which contradicts the calibration most.
+        """
         import pandas as pd
 
         filled = [p for p in self.parts if len(p)]
-        found = rig_change(pd.concat(filled, ignore_index=True), self.calibration) if filled else ()
-        return found[0] if found else None
+        if not filled:
+            return None
+        table = pd.concat(filled, ignore_index=True)
+        changes: dict[tuple[int, int], RigChange] = {}
+        for pair in combinations(range(len(self.calibration.cameras)), 2):
+            two = self.calibration.subset(*pair)
+            if not nearly_parallel((two.cameras[0], two.cameras[1])):
+                found = rig_change(_seen_by(table, two), two)
+                if found is not None:
+                    changes[pair] = found[0]
+        if not changes:
+            return None
+        moved = {pair for pair, change in changes.items() if change.moved}
+        least = min(changes.values(), key=lambda change: change.chance)
+        culprits = [
+            camera.name
+            for c, camera in enumerate(self.calibration.cameras)
+            if len(moved) > 1 and moved == {pair for pair in changes if c in pair}
+        ]
+        return replace(least, culprit=culprits[0] if len(culprits) == 1 else "")
+
+
+def _seen_by(table: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
+    """Return the rows that both cameras of a calibration see, with the miss of their two rays."""
+    names = [c.name for c in calibration.cameras]
+    both = np.isfinite(table[[f"{name}_u_px" for name in names]].to_numpy(float)).all(1)
+    mine: pd.DataFrame = table.loc[both]
+    uv, _ = _pixels(mine, names)
+    rays = [c.unproject(uv[:, i]) for i, c in enumerate(calibration.cameras)]
+    return mine.assign(ray_miss_mm=midpoint(*rays[0], *rays[1])[1])
 
 
 def pair_columns(cameras: Sequence[str]) -> list[str]:
@@ -789,29 +826,38 @@ def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
 
 
 def with_change(
-    model: PairModel, change: RigChange | None, calibration: Calibration
+    pairs: Mapping[tuple[int, int], PairModel], change: RigChange | None, calibration: Calibration
 ) -> dict[str, Any]:
     """Return the part ``pairs`` of tracking.json.
 
-    model : the statistics of the run's pairs. change : the estimated movement, or None. If the
-    camera has moved, the sentence on this replaces the one on an offset of the calibration.
+    pairs : the statistics of each pair of cameras; of more than two cameras the numbers are those
+    of the pair with the largest gaps. change : the estimated movement, or None. If a camera has
+    moved, the sentence on this replaces the one on an offset of the calibration.
     """
-    words, moved = model.sentences(), change is not None and change.moved
+    moved = change is not None and change.moved
+    without = [Finding.CALIBRATION_OFFSET] if moved else []
+    names = [camera.name for camera in calibration.cameras]
+    words = [
+        text if len(names) == 2 else f"{names[a]} and {names[b]}: {text}"
+        for (a, b), own in pairs.items()
+        for text in own.sentences(without)
+    ]
     if change is not None and moved:
-        words = model.sentences(without=[Finding.CALIBRATION_OFFSET])
-        first = calibration.cameras[0].name
         unsure = "" if np.any(calibration.covariance) else " (or the calibration was never right)"
         words.append(
-            f"Camera {change.camera!r} has moved against {first!r} since the "
+            f"Camera {change.camera!r} has moved against {change.against!r} since the "
             f"calibration{unsure}, {change.size_words()}. All positions are wrong because of this "
             "movement. Calibrate again, or smooth the run with --refine-rig."
         )
+    if change is not None and change.culprit:
+        words.append(f"The other cameras agree, so it is {change.culprit!r} that has moved.")
+    worst = max(pairs.values(), key=lambda own: own.gap_rms_px)
     return {
-        "bias_px": model.bias_px,
-        "scatter_px": model.scatter_px,
-        "frame_px": model.frame_px,
-        "rms_px": model.rms_px,
-        "calibration_problem": model.calibration_problem or moved,
+        "bias_px": worst.bias_px,
+        "scatter_px": worst.scatter_px,
+        "frame_px": worst.frame_px,
+        "rms_px": worst.rms_px,
+        "calibration_problem": any(m.calibration_problem for m in pairs.values()) or moved,
         "words": words,
     }
 

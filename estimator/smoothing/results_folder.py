@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
 from telerig.estimator.calibration.refractive_windows import window_warnings
-from telerig.estimator.calibration.result.calibration import pair_of_run
+from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.smoothing.results_file import StoredTables
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.tracking.tracks import StoredTracks, Tracks, open_track_table, open_tracks
@@ -64,7 +64,7 @@ def smooth_run(
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
     _check_cameras(followed, calibration)
-    calibration = pair_of_run(calibration, run.cameras)
+    calibration = of_run(calibration, run.cameras)
     run, marks = with_followed_references(run, source.parent)
     of_tracks = [source.parent / name for name in _USED] if tracks.is_dir() else [source]
     used = [*of_tracks, *marks, *inputs]

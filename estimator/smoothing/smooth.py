@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import pair_of_run
+from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
@@ -189,7 +189,7 @@ def smooth(
     folder = None if folder is None else Path(folder)
     with phases.phase("checks", "checking tracks and sensors"):
         table = getattr(tracks, "table", tracks)
-        calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
+        calibration = of_run(calibration, _cameras_of(table, calibration, stage, rig))
         refinement = None
         if refine_rig:
             some = table if hasattr(table, "assign") else table.between(0, _MOST_ALIGNED)
@@ -485,7 +485,7 @@ def _cameras_of(table: Any, calibration: Calibration, stage: Any, rig: Any) -> l
     known = [camera.name for camera in calibration.cameras]
     if table is not None:
         return [name for name in known if f"{name}_u_px" in table.columns]
-    of_rig = getattr(rig or getattr(stage, "rig", None), "tracking_cameras", known[:2])
+    of_rig = getattr(rig or getattr(stage, "rig", None), "tracking_cameras", known)
     return list(getattr(stage, "cameras", of_rig))
 
 

@@ -21,7 +21,7 @@ from numpy.random import Generator
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import pair_of_run
+from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.smoothing.graph.solve import Options, Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.results_folder import run_sources, with_followed_references
@@ -109,7 +109,7 @@ def validate(
 
     Raises InputError if no mark is seen long enough, and what `telerig.smooth` raises.
     """
-    calibration = pair_of_run(calibration, run.cameras)
+    calibration = of_run(calibration, run.cameras)
     every = seen_marks(run, calibration)
     chosen = longest(every, marks)
     rests = [Rest.MARKS] if len(every) > 1 else []

@@ -4,8 +4,8 @@ The tracker goes forward only. Where a bubble is born hidden, or in frames with 
 position is better known from later frames: it is smoothed over all frames at hand, and detections
 without a track are given to it where no other explanation is nearly as likely (`follow_back`).
 
-One outline in one image may show two bubbles which the other image separates. One camera alone sees
-the hidden bubble; its depth in that camera follows from the motion between the frames in which both
+One outline in one image may show two bubbles which another image separates. One camera alone sees
+the hidden bubble; its depth in that camera follows from the motion between the frames in which more
 saw it (`shared_rows`).
 """
 
@@ -20,7 +20,8 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints, Rows
-from telerig.estimator.bubbles.pairing.matching import Candidates, Prediction
+from telerig.estimator.bubbles.pairing.groups import Candidates, Pixels
+from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.tracking.association import (
     Projected,
@@ -40,7 +41,7 @@ from telerig.estimator.tracking.filter import (
     birth_covariance,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import stacked_jacobian, triangulate
+from telerig.rig.triangulation import stacked_jacobian, triangulate_views
 
 _ANYWHERE_MM = 100.0
 
@@ -99,27 +100,24 @@ def smooth_points(
     return kernels.smooth(readings.information, readings.pull, matrices, noises, offsets, x, prior)
 
 
-Tables = tuple["pd.DataFrame", "pd.DataFrame"]
-"""One frame's detections in the two cameras."""
-
-Pixels = tuple[Array, Array]
-"""Centres (N, 2) and covariances (N, 2, 2) of the N detections of one camera."""
+Tables = tuple["pd.DataFrame", ...]
+"""One frame's detections in each camera."""
 
 COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
 CENTRE_PX = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 
 
 @dataclass(frozen=True)
-class Pairs(Rows):
-    """M pairs of detections of one frame, each of which shows one bubble in both cameras.
+class Bubbles(Rows):
+    """M bubbles of one frame, each of which two cameras or more see.
 
-    rows : (M, 2) row of the detection in the table of each camera.
-    confidence : (M,) probability that the pair is right.
-    ambiguous : (M,) whether another pair is nearly as probable.
-    given : (M,) id that the user gave to the pair, -1 for none.
+    rows : (M, C) row of the detection in the table of each camera, -1 where it does not see it.
+    confidence : (M,) probability that all detections of the bubble are its own.
+    ambiguous : (M,) whether another group is nearly as probable.
+    given : (M,) id that the user gave to the detections, -1 for none.
     points_mm, covariance_mm2 : (M, 3), (M, 3, 3) position of the outlines' centres with the
         covariance of a bubble of unknown shape.
-    bodies : the M bodies, fitted to both outlines.
+    bodies : the M bodies, fitted to all outlines.
     particle : (M,) id of the track, -1 for none; it is known when the frame is final.
     """
 
@@ -143,25 +141,25 @@ class Pairs(Rows):
 
 @dataclass(frozen=True)
 class Sight:
-    """Hold the detections of one frame as arrays; most fields for both cameras.
+    """Hold the detections of one frame as arrays; tuples have an entry for each camera.
 
     pixels : centres and covariances with the share of the unknown shape.
     centre_px : (N, 5) the columns CENTRE_PX.
     a_px, d_eq_px : (N,) major semi-axes and equivalent diameters.
     given : (N,) ids given by the user, -1 for none.
     flags : (N,) texts.
-    possible : the pairs with given ids, then those of `candidates`, in space.
-    left_px : (E, 4) pixels in both cameras less those of the points.
+    possible : the groups with given ids, then those of `candidates`, in space.
+    left_px : (E, C, 2) pixels less those of the points; NaN where a camera does not see it.
     """
 
-    pixels: tuple[Pixels, Pixels]
-    centre_px: tuple[Array, Array]
-    a_px: tuple[Array, Array]
-    d_eq_px: tuple[Array, Array]
-    given: tuple[Ints, Ints]
-    flags: tuple[list[str], list[str]]
+    pixels: tuple[Pixels, ...]
+    centre_px: tuple[Array, ...]
+    a_px: tuple[Array, ...]
+    d_eq_px: tuple[Array, ...]
+    given: tuple[Ints, ...]
+    flags: tuple[list[str], ...]
     candidates: Candidates
-    possible: Pairs
+    possible: Bubbles
     left_px: Array
 
 
@@ -186,12 +184,12 @@ class Single:
 class Frame:
     """One frame of a run while its tracks may still change.
 
-    tables : its detections in both cameras.
+    tables : its detections in each camera.
     sight : the same as arrays.
-    offset_px : (2, 2) for each camera the shift of all detections, because the cameras shake.
-    pairs : the pairs of detections.
-    unpaired : for each camera the rows of its table that are in no pair.
-    alone : tracks that only one camera continued, by index into the rows of ``unpaired``, those of
+    offset_px : (C, 2) for each camera the shift of all detections, because the cameras shake.
+    bubbles : the bubbles that two cameras or more see.
+    others : for each camera the rows of its table that are of none of these.
+    alone : tracks that only one camera continued, by index into the rows of ``others``, those of
         the first camera first.
     singles : the same with the final ids, after `take_final`.
     motion : motion of all bubbles since the frame before; None for the first frame.
@@ -202,17 +200,17 @@ class Frame:
     tables: Tables
     sight: Sight
     offset_px: Array
-    pairs: Pairs
-    unpaired: tuple[Ints, Ints]
+    bubbles: Bubbles
+    others: tuple[Ints, ...]
     alone: Mapping[int, SeenAlone]
     motion: Motion | None
     singles: list[Single] = field(default_factory=list)
 
     def take_final(self, ids: FrameIds) -> None:
         """Take over the tracker's final ids."""
-        self.pairs.particle[:] = ids.particle
-        cameras = np.repeat([0, 1], [len(rows) for rows in self.unpaired])
-        rows = np.concatenate(self.unpaired)
+        self.bubbles.particle[:] = ids.particle
+        cameras = np.repeat(np.arange(len(self.others)), [len(rows) for rows in self.others])
+        rows = np.concatenate(self.others)
         for index in np.flatnonzero(ids.single != NO_PARTICLE).tolist():
             seen = self.alone[index]
             camera, row = int(cameras[index]), int(rows[index])
@@ -222,14 +220,14 @@ class Frame:
 
     @property
     def particle(self) -> Ints:
-        """The ids (M,) of the tracks of M pairs of a left and a right detection, -1 for none."""
-        return self.pairs.particle
+        """The ids (M,) of the tracks of M bubbles, -1 for none."""
+        return self.bubbles.particle
 
     def owners(self, camera: int) -> Ints:
         """Return the id (N,) of the track of each of a camera's N detections, -1 for none."""
         out = self.sight.given[camera].copy()
-        taken = self.particle != NO_PARTICLE
-        out[self.pairs.rows[taken, camera]] = self.particle[taken]
+        taken = (self.particle != NO_PARTICLE) & (self.bubbles.rows[:, camera] >= 0)
+        out[self.bubbles.rows[taken, camera]] = self.particle[taken]
         for single in self.singles:
             if single.camera == camera:
                 out[single.row] = single.particle
@@ -242,13 +240,14 @@ class Frame:
         """Return the bubbles with tracks that exactly one camera sees."""
         return [s for s in self.singles if len(self.of(s.particle)) == 1]
 
-    def claim(self, pair: Pairs) -> None:
-        """Add one pair with its track. Earlier pairs with one of its two detections are removed."""
-        same = self.pairs.rows == pair.rows
-        if same.all(1).any():
-            self.particle[same.all(1)] = pair.particle
+    def claim(self, one: Bubbles) -> None:
+        """Add one bubble with its track. Earlier ones with one of its detections are removed."""
+        same = (self.bubbles.rows == one.rows) & (one.rows >= 0)
+        known = (self.bubbles.rows == one.rows).all(1)
+        if known.any():
+            self.particle[known] = one.particle
         else:
-            self.pairs = Pairs.concat([self.pairs.take(~same.any(1)), pair])
+            self.bubbles = Bubbles.concat([self.bubbles.take(~same.any(1)), one])
 
 
 def given_ids(table: pd.DataFrame) -> Ints:
@@ -259,7 +258,7 @@ def given_ids(table: pd.DataFrame) -> Ints:
 
 
 def readings_of(
-    frames: Sequence[Frame], particles: Sequence[int], cameras: tuple[Camera, Camera]
+    frames: Sequence[Frame], particles: Sequence[int], cameras: Sequence[Camera]
 ) -> Readings:
     """Return the measurements of some tracks in several frames, in the order of ``particles``.
 
@@ -270,9 +269,9 @@ def readings_of(
     who = np.array([place.get(p, -1) for frame in frames for p in frame.particle.tolist()], int)
     kept = np.flatnonzero(who >= 0)
     if len(kept):
-        at = np.repeat(np.arange(len(frames)), [len(frame.pairs) for frame in frames])
+        at = np.repeat(np.arange(len(frames)), [len(frame.bubbles) for frame in frames])
         points, covariances = (
-            np.concatenate([getattr(frame.pairs, name) for frame in frames])[kept]
+            np.concatenate([getattr(frame.bubbles, name) for frame in frames])[kept]
             for name in ("points_mm", "covariance_mm2")
         )
         out.add(at[kept], who[kept], points, covariances, np.eye(3))
@@ -317,7 +316,7 @@ class SmoothedTracks:
     """
 
     frames: Sequence[Frame]
-    cameras: tuple[Camera, Camera]
+    cameras: tuple[Camera, ...]
     settings: TrackerSettings
     _known: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
@@ -352,7 +351,7 @@ def follow_back(tracks: SmoothedTracks, changeable: set[int]) -> None:
     sizes = _sizes(frames)
     for frame in frames:
         if frame.number in changeable:
-            # Two cameras that each saw a particle alone may be a pair, or one of them is wrong.
+            # Cameras that each saw a particle alone may see it together, or one of them is wrong.
             twice = {s.particle for s in frame.singles if len(frame.of(s.particle)) > 1}
             wrong = twice & set(sizes)
             frame.singles = [s for s in frame.singles if s.particle not in wrong]
@@ -360,7 +359,7 @@ def follow_back(tracks: SmoothedTracks, changeable: set[int]) -> None:
         missing = [
             (i, here)
             for i, here in enumerate(_missing(frames, changeable, sorted(sizes)))
-            if here and any((frames[i].owners(c) == NO_PARTICLE).any() for c in (0, 1))
+            if here and any((frames[i].owners(c) == NO_PARTICLE).any() for c in range(len(cameras)))
         ]
         if not missing:
             break
@@ -383,9 +382,9 @@ def _sizes(frames: Sequence[Frame]) -> dict[int, float]:
     """Median diameter (mm) of the tracks that can be followed; tracks with given ids cannot."""
     found: dict[int, list[float]] = {}
     for frame in frames:
-        pairs = frame.pairs
-        own = (pairs.given == NO_PARTICLE) & (pairs.particle != NO_PARTICLE)
-        for particle, d_eq in zip(pairs.particle[own].tolist(), pairs.d_eq_mm[own].tolist()):
+        here = frame.bubbles
+        own = (here.given == NO_PARTICLE) & (here.particle != NO_PARTICLE)
+        for particle, d_eq in zip(here.particle[own].tolist(), here.d_eq_mm[own].tolist()):
             found.setdefault(particle, []).append(d_eq)
     enough = {p: np.array(d) for p, d in found.items() if len(d) >= _LEAST_POINTS}
     known = {p: d[np.isfinite(d)] for p, d in enough.items()}
@@ -393,20 +392,21 @@ def _sizes(frames: Sequence[Frame]) -> dict[int, float]:
 
 
 def _distance2(
-    frame: Frame,
-    rows: tuple[int, int],
-    predicted: Prediction,
-    k: int,
-    cameras: tuple[Camera, Camera],
+    frame: Frame, rows: Ints, predicted: Prediction, k: int, cameras: Sequence[Camera]
 ) -> float:
-    """Squared Mahalanobis distance of the two cameras' rows from the k-th predicted particle."""
-    expected, by_point = stacked_jacobian(cameras, predicted.points_mm[k : k + 1])
+    """Squared Mahalanobis distance of detections from the k-th predicted particle.
+
+    rows : (C,) of the cameras' tables, -1 for none.
+    """
+    seen = np.flatnonzero(rows >= 0).tolist()
+    some = tuple(cameras[c] for c in seen)
+    expected, by_point = stacked_jacobian(some, predicted.points_mm[k : k + 1])
     covariance = by_point[0] @ predicted.covariance_mm2[k] @ by_point[0].T
     left = -expected[0]
-    for c, ((centre, noise), row) in enumerate(zip(frame.sight.pixels, rows)):
-        at = slice(2 * c, 2 * c + 2)
-        covariance[at, at] += noise[row]
-        left[at] += centre[row] - frame.offset_px[c]
+    for i, c in enumerate(seen):
+        at, (centre, noise) = slice(2 * i, 2 * i + 2), frame.sight.pixels[c]
+        covariance[at, at] += noise[rows[c]]
+        left[at] += centre[rows[c]] - frame.offset_px[c]
     return float(left @ np.linalg.solve(covariance, left))
 
 
@@ -433,23 +433,17 @@ def _claim(
     frame: Frame,
     predicted: Prediction,
     expected: Sequence[Projected],
-    cameras: tuple[Camera, Camera],
+    cameras: Sequence[Camera],
     settings: TrackerSettings,
 ) -> set[int]:
     """Give the frame's free detections to the predicted particles; those to which any was given.
 
-    expected : the predicted points in both cameras.
+    expected : the predicted points in each camera.
     """
-    found = [_nearest(frame, c, predicted, expected[c], settings) for c in (0, 1)]
+    found = [_nearest(frame, c, predicted, own, settings) for c, own in enumerate(expected)]
     changed = set()
-    for k, rows in enumerate(zip(*found)):
-        given = max(rows) >= 0
-        if min(rows) >= 0:
-            given = _claim_pair(frame, rows, k, predicted, cameras, settings)
-        elif given:
-            camera = int(rows[0] < 0)
-            _claim_single(frame, camera, rows[camera], predicted, k)
-        if given:
+    for k, rows in enumerate(np.array(found, np.int64).T):
+        if rows.max() >= 0 and _claim_rows(frame, rows, k, predicted, cameras, settings):
             changed.add(int(predicted.ids[k]))
     return changed
 
@@ -481,46 +475,48 @@ def _nearest(
     return [int(free[j]) if j >= 0 else -1 for j in chosen]
 
 
-def _claim_single(frame: Frame, camera: int, row: int, predicted: Prediction, k: int) -> None:
-    particle, d_eq = int(predicted.ids[k]), float(predicted.d_eq_mm[k])
-    frame.singles.append(Single(particle, camera, row, predicted.points_mm[k], d_eq))
-
-
-def _claim_pair(
+def _claim_rows(
     frame: Frame,
-    rows: tuple[int, int],
+    rows: Ints,
     k: int,
     predicted: Prediction,
-    cameras: tuple[Camera, Camera],
+    cameras: Sequence[Camera],
     settings: TrackerSettings,
 ) -> bool:
-    """Give the detections ``rows`` of the two cameras to the prediction of track k, if they fit.
+    """Give detections, (C,) rows of the cameras' tables or -1, to the prediction of track k.
 
-    Where both agree with it they become one point. Else the detection whose outline is whole is
-    taken alone, if only one is. Returns whether anything was taken.
+    One alone is taken as such; where several agree with the prediction, they become one point. Else
+    those whose outlines are whole are tried, if others are not. Returns whether any were taken.
     """
-    if _distance2(frame, rows, predicted, k, cameras) <= gate2(settings, 4):
-        uv, noise = zip(*([a[r : r + 1] for a in p] for p, r in zip(frame.sight.pixels, rows)))
-        found = triangulate(cameras, uv, noise)
+    seen, d_eq = np.flatnonzero(rows >= 0).tolist(), predicted.d_eq_mm[k : k + 1]
+    if len(seen) == 1:
+        particle, camera = int(predicted.ids[k]), seen[0]
+        point = predicted.points_mm[k]
+        frame.singles.append(Single(particle, camera, int(rows[camera]), point, float(d_eq[0])))
+        return True
+    if _distance2(frame, rows, predicted, k, cameras) <= gate2(settings, 2 * len(seen)):
+        uv, noise = zip(*([a[rows[c]][None] for a in frame.sight.pixels[c]] for c in seen))
+        found = triangulate_views([cameras[c] for c in seen], uv, noise)
         frame.claim(
-            Pairs(
-                np.array([rows], np.int64),
+            Bubbles(
+                rows[None],
                 np.array([_CONFIDENCE]),
                 np.array([True]),
                 np.array([NO_PARTICLE]),
                 found.points_mm,
                 found.covariance_mm2,
-                Bodies.sized(predicted.d_eq_mm[k : k + 1], len(cameras)),
+                Bodies.sized(d_eq, len(cameras)),
                 predicted.ids[k : k + 1],
             )
         )
         return True
-    words = [set(flags[r].split("|")) for flags, r in zip(frame.sight.flags, rows)]
-    first, second = (bool(w & _DOUBTFUL) for w in words)
-    if first == second:
+    flags = [set(frame.sight.flags[c][rows[c]].split("|")) for c in seen]
+    doubtful = np.array([bool(words & _DOUBTFUL) for words in flags])
+    if doubtful.all() or not doubtful.any():
         return False
-    _claim_single(frame, int(first), rows[int(first)], predicted, k)
-    return True
+    whole = rows.copy()
+    whole[np.array(seen)[doubtful]] = -1
+    return _claim_rows(frame, whole, k, predicted, cameras, settings)
 
 
 FRAMES_BEFORE, FRAMES_AFTER = 15, 40
@@ -540,7 +536,7 @@ _BEHIND = 0.25
 def shared_rows(tracks: SmoothedTracks, frames: slice) -> list[dict[str, Any]]:
     """Return rows for the hidden bubbles of some frames; the other frames are context.
 
-    The hidden view's pixel is that of the point; its covariance states only that the bubble is
+    A hidden view's pixel is that of the point; its covariance states only that the bubble is
     behind that outline, so that motion is not counted twice when tracks are smoothed.
     """
     seen = {p for frame in tracks.frames for p in frame.particle.tolist()}
@@ -562,9 +558,10 @@ def shared_rows(tracks: SmoothedTracks, frames: slice) -> list[dict[str, Any]]:
         frame, single = tracks.frames[hidden[k][0]], hidden[k][1]
         if frame is not last:
             known, last = frame.particle != NO_PARTICLE, frame
-            where, sizes = [*frame.pairs.points_mm[known]], frame.pairs.d_eq_mm[known].tolist()
-        view = _of(views[1 - single.camera], slice(k, k + 1))
-        row = _row(frame, single, points[k], covariances[k], view, tracks.cameras)
+            here = frame.bubbles.take(known)
+            where, sizes = [*here.points_mm], here.d_eq_mm.tolist()
+        each = [_of(view, slice(k, k + 1)) for view in views]
+        row = _row(frame, single, points[k], covariances[k], each, tracks.cameras)
         if row is not None and not _taken(single, points[k], where, sizes):
             out.append(row)
             where.append(points[k])
@@ -585,27 +582,31 @@ def _row(
     single: Single,
     point: Array,
     covariance: Array,
-    view: Projected,
-    cameras: tuple[Camera, Camera],
+    views: Sequence[Projected],
+    cameras: Sequence[Camera],
 ) -> dict[str, Any] | None:
-    """None where the point is too uncertain, or no other bubble explains why it is not seen.
+    """None where the point is too uncertain, or a camera's image does not explain why it is not
+    seen there: neither an outline of another bubble nor the image's border.
 
-    view : the point in the camera that does not see it.
+    views : the point in each camera.
     """
-    seen = single.camera
-    other = cameras[1 - seen]
-    uv, spread = view.uv_px[0] + frame.offset_px[1 - seen], view.covariance_px2[0]
-    diameter = single.d_eq_mm * px_per_mm(view.by_point)[0]
-    sd = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
-    reach = _outline_over(frame.sight, 1 - seen, uv, diameter / 2)
-    if not (sd <= min(_SHARPNESS * diameter, _SHARPNESS_PX) and reach > 0):
+    per_camera = {}
+    for c, (camera, view) in enumerate(zip(cameras, views)):
+        if c == single.camera:
+            per_camera[camera.name] = frame.sight.centre_px[c][single.row].tolist()
+            continue
+        uv, spread = view.uv_px[0] + frame.offset_px[c], view.covariance_px2[0]
+        diameter = single.d_eq_mm * px_per_mm(view.by_point)[0]
+        sd = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
+        reach = _outline_over(frame.sight, c, uv, diameter / 2)
+        if sd <= min(_SHARPNESS * diameter, _SHARPNESS_PX) and reach > 0:
+            behind = spread + (_BEHIND * reach) ** 2 * np.eye(2)
+            per_camera[camera.name] = [*uv, behind[0, 0], behind[0, 1], behind[1, 1]]
+        elif _inside(camera, uv, diameter / 2):
+            return None
+    if len(per_camera) < 2:
         return None
-    behind = spread + (_BEHIND * reach) ** 2 * np.eye(2)
-    per_camera = {
-        cameras[seen].name: frame.sight.centre_px[seen][single.row].tolist(),
-        other.name: [*uv, behind[0, 0], behind[0, 1], behind[1, 1]],
-    }
-    flags = sorted({FLAG, *frame.sight.flags[seen][single.row].split("|")} - {""})
+    flags = sorted({FLAG, *frame.sight.flags[single.camera][single.row].split("|")} - {""})
     return {
         "frame": frame.number,
         "particle": single.particle,
@@ -620,6 +621,12 @@ def _row(
         **{f"silhouettes_{x}_mm": v for x, v in zip("xyz", point)},
         "flags": "|".join(flags),
     }
+
+
+def _inside(camera: Camera, uv_px: Array, radius_px: float) -> bool:
+    """Return whether an image shows a part of a disc."""
+    limit = np.array(camera.image_size_px) - 1.0
+    return bool(np.all((uv_px > -radius_px) & (uv_px < limit + radius_px)))
 
 
 def _outline_over(sight: Sight, camera: int, uv_px: Array, radius_px: float) -> float:

@@ -1,4 +1,4 @@
-"""Detections to tracks, frame by frame: pairs across the views, ids in time, points in space."""
+"""Detections to tracks, frame by frame: groups across the views, ids in time, points in space."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import pandas as pd
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
-from telerig.estimator.bubbles.pairing.matching import (
+from telerig.estimator.bubbles.pairing.groups import (
     Candidates,
-    PairModel,
-    Prediction,
-    View,
+    Pixels,
+    Places,
+    RigModel,
     candidates,
-    match_candidates,
-    shared_axis,
-    view_of,
+    match,
+    places_of,
 )
+from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.bubbles.shape.body import Bodies, body_columns, fit_bodies
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
@@ -30,9 +30,8 @@ from telerig.estimator.tracking.backtracking import (
     COVARIANCE_MM2,
     FRAMES_AFTER,
     FRAMES_BEFORE,
+    Bubbles,
     Frame,
-    Pairs,
-    Pixels,
     Sight,
     SmoothedTracks,
     Tables,
@@ -49,9 +48,9 @@ from telerig.estimator.tracking.filter import (
 )
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import stacked_jacobian, triangulate
+from telerig.rig.triangulation import stacked_jacobian
 
-_PAIRS_AT_ONCE = 512
+_BUBBLES_AT_ONCE = 512
 _LEAST_FOR_OFFSET = 3
 
 WANDER = (21 / 8) ** 0.5
@@ -71,8 +70,7 @@ class Linked:
 class RowMaker:
     """Turns frames of detections into finished rows; holds the frames still open, and a few."""
 
-    cameras: tuple[Camera, Camera]
-    model: PairModel
+    model: RigModel
     tracker: Tracker
     shapes: Shapes
     up: Array
@@ -82,14 +80,16 @@ class RowMaker:
     _before: list[Frame] = field(default_factory=list)
     _waiting: int = 0
 
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        return self.model.cameras
+
     def sights(self, frames: Sequence[Tables]) -> list[Sight]:
         """Return the detections of several frames as arrays; all frames at once are quicker."""
-        axis = shared_axis(self.cameras)
         counts = np.array([[len(table) for table in tables] for tables in frames], np.int64)
-        views, pixels, ids, joined, of_cameras = [], [], [], [], []
-        for c, (camera, tables) in enumerate(zip(self.cameras, zip(*frames))):
+        pixels, ids, joined, of_cameras = [], [], [], []
+        for c, tables in enumerate(zip(*frames)):
             table = pd.concat(tables, ignore_index=True)
-            views.append(view_of(table, camera, axis))
             pixels.append(_pixels(table, self._wander))
             ids.append(given_ids(table))
             a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
@@ -103,54 +103,67 @@ class RowMaker:
                     for p in (slice(low, high) for low, high in pairwise(ends))
                 ]
             )
-        possible = self._possible((views[0], views[1]), pixels, ids, joined, counts)
+        possible = self._possible(pixels, ids, joined, counts)
         every: list[tuple[Any, ...]] = [
-            (*zip(*both), *pairs) for *both, pairs in zip(*of_cameras, possible)
+            (*zip(*own), *groups) for *own, groups in zip(*of_cameras, possible)
         ]
         return [Sight(*columns) for columns in every]
 
     def _possible(
         self,
-        views: tuple[View, View],
         pixels: Sequence[Pixels],
         ids: Sequence[Ints],
         tables: Sequence[pd.DataFrame],
         counts: Ints,
-    ) -> list[tuple[Candidates, Pairs, Array]]:
+    ) -> list[tuple[Candidates, Bubbles, Array]]:
         """Return the last three fields of `Sight` for each of F frames.
 
-        counts : (F, 2) detections of the frames, which follow each other in the other arguments.
+        counts : (F, C) detections of the frames, which follow each other in the other arguments.
         """
         frames = [np.repeat(np.arange(len(counts)), many) for many in counts.T]
         free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
         left = np.array([np.bincount(n[i], minlength=len(counts)) for n, i in zip(frames, free)]).T
-        found = candidates((views[0].of(free[0]), views[1].of(free[1])), left, self.model)
-        rows = np.concatenate([f.rows + s for f, s in zip(found, np.cumsum(left, axis=0) - left)])
-        rows = np.stack([own[r] for own, r in zip(free, rows.T)], -1)
-        if any(len(own) < len(i) for own, i in zip(free, ids)):
-            named = [np.flatnonzero(i != NO_PARTICLE) for i in ids]
-            keys = [n[i] + len(counts) * own[i] for n, own, i in zip(frames, ids, named)]
-            _, first, second = np.intersect1d(keys[0], keys[1], return_indices=True)
-            rows = np.concatenate([np.stack([named[0][first], named[1][second]], -1), rows])
-            rows = rows[np.argsort(frames[0][rows[:, 0]], kind="stable")]
-        (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))
-        rays = [(view.origin_mm[i], view.direction[i]) for view, i in zip(views, rows.T)]
-        points = triangulate(self.cameras, (uv_a, uv_b), (cov_a, cov_b), rays=rays)
-        expected, _ = stacked_jacobian(self.cameras, points.points_mm)
-        frame = frames[0][rows[:, 0]]
-        pairs = Pairs(
-            rows - (np.cumsum(counts, axis=0) - counts)[frame],
-            np.ones(len(rows)),
-            np.zeros(len(rows), bool),
-            ids[0][rows[:, 0]],
-            points.points_mm,
-            points.covariance_mm2,
-            self._bodies(tables, rows),
-            np.full(len(rows), NO_PARTICLE),
+        found = candidates(
+            [table.take(mine) for table, mine in zip(tables, free)],
+            [(uv[mine], covariance[mine]) for (uv, covariance), mine in zip(pixels, free)],
+            left, self.model,
+        )  # fmt: skip
+        named, of_named = _named(ids, frames)
+        at = Places.concat(
+            [places_of(self.cameras, pixels, named), *(f.groups.places for f in found)]
         )
-        off = np.hstack([uv_a, uv_b]) - expected
-        cuts = [slice(*ends) for ends in pairwise(np.searchsorted(frame, range(len(counts) + 1)))]
-        return [(one, pairs.take(cut), off[cut]) for one, cut in zip(found, cuts)]
+        starts = np.cumsum(counts, axis=0) - counts
+        rows = [np.where(named >= 0, named - starts[of_named], -1)]
+        for f, one in enumerate(found):
+            begin = (np.cumsum(left, axis=0) - left)[f]
+            own = [
+                np.where(r >= 0, mine[np.minimum(r + b, len(mine) - 1)] - s, -1) if len(mine) else r
+                for r, mine, b, s in zip(one.groups.rows.T, free, begin, starts[f])
+            ]
+            rows.append(np.stack(own, -1))
+        every = np.concatenate(rows)
+        frame = np.concatenate([of_named, np.repeat(np.arange(len(found)), [*map(len, found)])])
+        given = np.max([_at(i, r) for i, r in zip(ids, named.T)], axis=0, initial=NO_PARTICLE)
+        bubbles = Bubbles(
+            every,
+            np.ones(len(every)),
+            np.zeros(len(every), bool),
+            np.concatenate([given, np.full(len(every) - len(named), NO_PARTICLE)]),
+            at.points_mm,
+            at.covariance_mm2,
+            Bodies.none(len(every), len(self.cameras)),
+            np.full(len(every), NO_PARTICLE),
+        )
+        likely = [np.arange(len(named))]
+        first = len(named) + np.cumsum([0, *map(len, found)])
+        likely += [match(f, self.model).candidate + s for f, s in zip(found, first)]
+        self._fit(bubbles, np.concatenate(likely), tables, starts[frame])
+        order = np.argsort(frame, kind="stable")
+        cuts = [
+            order[slice(*ends)]
+            for ends in pairwise(np.searchsorted(frame[order], range(len(counts) + 1)))
+        ]
+        return [(one, bubbles.take(cut), at.left_px[cut]) for one, cut in zip(found, cuts)]
 
     def add(
         self,
@@ -164,21 +177,22 @@ class RowMaker:
 
         number, t_s : number and time of the frame.
         position_mm : encoder position of the stage; None without one.
-        tables : the detections of the two cameras
+        tables : the detections of each camera.
         sight : the same as arrays, if known.
         """
         predicted = self.tracker.predict(t_s, position_mm)
         sight = self.sights([tables])[0] if sight is None else sight
-        pairs, offset_px = pair_frame(sight, self.model, predicted)
-        first, second = (_others(rows, given) for rows, given in zip(pairs.rows.T, sight.given))
-        unpaired = (first, second)
-        measured = _measured(pairs, unpaired, sight.pixels, offset_px)
+        bubbles, offset_px = grouped_frame(sight, self.model, predicted)
+        late = np.flatnonzero(bubbles.bodies.used == "none")
+        self._fit(bubbles, late, tables, np.zeros_like(bubbles.rows))
+        others = tuple(_others(rows, given) for rows, given in zip(bubbles.rows.T, sight.given))
+        measured = _measured(bubbles, others, sight.pixels, offset_px)
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
-            number, t_s, tables, sight, offset_px, pairs, unpaired, result.alone, result.motion
+            number, t_s, tables, sight, offset_px, bubbles, others, result.alone, result.motion
         )
         self._take_final(result)
-        enough = self._waiting >= _PAIRS_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
+        enough = self._waiting >= _BUBBLES_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
         return self._flush(FRAMES_AFTER) if enough else None
 
     @property
@@ -199,7 +213,7 @@ class RowMaker:
             frame = self._open.pop(ids.frame)
             frame.take_final(ids)
             self._closed.append(frame)
-            self._waiting += 1 + len(frame.pairs)
+            self._waiting += 1 + len(frame.bubbles)
 
     def _flush(self, ahead: int) -> Linked:
         """Return rows of closed frames but the last few, which hidden bubbles may need."""
@@ -210,7 +224,7 @@ class RowMaker:
         follow_back(tracks, {f.number for f in (*done, *self._closed)})
         hidden = shared_rows(tracks, slice(len(self._before), len(self._before) + len(done)))
         self._before = [*self._before, *done][-FRAMES_BEFORE:]
-        joined = tuple(pd.concat([f.tables[c] for f in done], ignore_index=True) for c in range(2))
+        joined = [pd.concat(own, ignore_index=True) for own in zip(*(f.tables for f in done))]
         found = self._tracks(done, joined)
         if hidden:
             found = pd.concat(
@@ -219,26 +233,35 @@ class RowMaker:
             found = found.sort_values(["frame", "particle"], kind="stable", ignore_index=True)
         return Linked(found, _detections(done, joined))
 
-    def _bodies(self, tables: Sequence[pd.DataFrame], rows: Ints) -> Bodies:
-        """Fit M bodies to the detections ``rows`` (M, C) of the cameras' tables."""
-        seen = [table.take(mine) for table, mine in zip(tables, rows.T)]
-        sightings = [sightings_from_table(t, c, self.cameras) for c, t in enumerate(seen)]
-        order = np.arange(rows.size).reshape(rows.shape[::-1]).T
-        gap_px = float(np.hypot(self.model.frame_px, self.model.rms_px[0]))
-        return fit_bodies(
-            Sightings.concat(sightings), order, self.cameras, self.up, self.shapes,
-            gap_sigma_px=gap_px,
+    def _fit(
+        self, bubbles: Bubbles, some: Ints, tables: Sequence[pd.DataFrame], starts: Ints
+    ) -> None:
+        """Fit the bodies of some bubbles to their detections.
+
+        starts : (M, C) rows in the tables at which the frames of the M bubbles begin.
+        """
+        if not len(some):
+            return
+        rows = bubbles.rows[some]
+        at = np.where(rows >= 0, rows + starts[some], -1)
+        sightings = [sightings_from_table(t.take(mine[mine >= 0]), c, self.cameras)
+                     for c, (t, mine) in enumerate(zip(tables, at.T))]  # fmt: skip
+        order = np.full(at.T.shape, -1)
+        order[at.T >= 0] = np.arange(np.sum(at >= 0))
+        gap_px = np.hypot(self.model.mean("frame_px"), self.model.mean("gap_rms_px"))
+        bodies = fit_bodies(
+            Sightings.concat(sightings), order.T, self.cameras, self.up, self.shapes,
+            gap_sigma_px=float(gap_px),
         )  # fmt: skip
+        bubbles.bodies.put(some, bodies)
 
     def _tracks(self, frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
-        pairs = Pairs.concat([f.pairs for f in frames])
-        starts = np.repeat(_starts(frames).T, [len(f.pairs) for f in frames], 0)
-        at = pairs.rows + starts
-        first, second = (t.take(at[:, c]).reset_index(drop=True) for c, t in enumerate(joined))
-        bodies, late = pairs.bodies, np.flatnonzero(pairs.bodies.used == "none")
-        if len(late):
-            bodies.put(late, self._bodies(joined, at[late]))
-        many = [len(f.pairs) for f in frames]
+        bubbles = Bubbles.concat([f.bubbles for f in frames])
+        starts = np.repeat(_starts(frames), [len(f.bubbles) for f in frames], 0)
+        bodies = bubbles.bodies
+        self._fit(bubbles, np.flatnonzero(bodies.used == "none"), joined, starts)
+        seen = bubbles.rows >= 0
+        many = [len(f.bubbles) for f in frames]
         table: dict[str, Any] = {
             "frame": np.repeat([f.number for f in frames], many),
             "particle": np.concatenate([f.particle for f in frames]),
@@ -247,74 +270,106 @@ class RowMaker:
         table |= dict(zip(["x_mm", "y_mm", "z_mm"], bodies.points_mm.T))
         table |= dict(zip(COVARIANCE_MM2, bodies.covariance_mm2[:, *np.triu_indices(3)].T))
         shape = _shape_share_px2(self.cameras, bodies)
-        for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
-            values = rows[CENTRE_PX].to_numpy(float, copy=True)
+        words: list[set[str]] = [{"ambiguous"} if unsure else set() for unsure in bubbles.ambiguous]
+        for c, (camera, found) in enumerate(zip(self.cameras, joined)):
+            mine = np.flatnonzero(seen[:, c])
+            rows = found.take(bubbles.rows[mine, c] + starts[mine, c])
+            values = np.full((len(bubbles), 5), np.nan)
+            values[mine] = rows[CENTRE_PX].to_numpy(float)
             values[:, 2:] += shape[:, c][:, *np.triu_indices(2)]
             table |= {f"{camera.name}_{name}": v for name, v in zip(CENTRE_PX, values.T)}
             for k, name in enumerate(("du_px", "dv_px")):
-                table[f"{camera.name}_{name}"] = bodies.shift_px[:, c, k]
+                shift = np.where(seen[:, c], bodies.shift_px[:, c, k], np.nan)
+                table[f"{camera.name}_{name}"] = shift
+            for k, flags in zip(mine.tolist(), flag_words(rows)):
+                words[k].update(flags)
         table["ray_miss_mm"] = bodies.ray_miss_mm
         table |= body_columns(bodies, self.up)
-        table["confidence"] = np.concatenate([f.pairs.confidence for f in frames])
+        table["confidence"] = bubbles.confidence
         table["centre"] = bodies.used
         table |= dict(zip((f"silhouettes_{x}_mm" for x in "xyz"), bodies.silhouette_points_mm.T))
-        ambiguous = np.concatenate([f.pairs.ambiguous for f in frames])
-        words = zip(flag_words(first), flag_words(second), ambiguous)
-        texts = [
-            "|".join(sorted({*a, *b, *(["ambiguous"] if unsure else [])})) for a, b, unsure in words
-        ]
-        table["flags"] = pd.Series(texts, dtype=str)  # text also where there is no pair
-        found = pd.DataFrame(table)
-        return found[found["particle"] != NO_PARTICLE].reset_index(drop=True)
+        texts = ["|".join(sorted(own)) for own in words]
+        table["flags"] = pd.Series(texts, dtype=str)  # text also where there is no bubble
+        rows_of = pd.DataFrame(table)
+        return rows_of[rows_of["particle"] != NO_PARTICLE].reset_index(drop=True)
+
+
+def _named(ids: Sequence[Ints], frames: Sequence[Ints]) -> tuple[Ints, Ints]:
+    """Return the groups (M, C) of rows with one given id in one frame, and their frames (M,)."""
+    own = [np.flatnonzero(i != NO_PARTICLE) for i in ids]
+    tall = max((int(f.max(initial=0)) for f in frames), default=0) + 1
+    keys = [i[mine] * tall + f[mine] for i, f, mine in zip(ids, frames, own)]
+    every, many = np.unique(np.concatenate(keys), return_counts=True)
+    every = every[many > 1]
+    rows = np.full((len(every), len(ids)), -1)
+    for c, (key, mine) in enumerate(zip(keys, own)):
+        _, group, one = np.intersect1d(every, key, return_indices=True)
+        rows[group, c] = mine[one]
+    frame = every % tall
+    order = np.argsort(frame, kind="stable")
+    return rows[order], frame[order]
+
+
+def _at(values: Ints, rows: Ints) -> Ints:
+    """Return values at rows, -1 where the row is -1."""
+    return np.append(values, -1)[rows]
 
 
 def _starts(frames: Sequence[Frame]) -> Ints:
-    """Return the position (2, F) of each frame's first detection in the cameras' tables."""
-    many = np.array([[len(table) for table in f.tables] for f in frames], np.int64).reshape(-1, 2)
-    return (np.cumsum(many, axis=0) - many).T
+    """Return the position (F, C) of each frame's first detection in the cameras' tables."""
+    many = np.array([[len(table) for table in f.tables] for f in frames], np.int64)
+    return np.asarray(np.cumsum(many, axis=0) - many)
 
 
-def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
-    """Return the share (M, 2, 2, 2) of the unknown shape in the centres' covariances, by camera."""
-    out = np.zeros((len(bodies.points_mm), 2, 2, 2))
+def _shape_share_px2(cameras: tuple[Camera, ...], bodies: Bodies) -> Array:
+    """Return the share (M, C, 2, 2) of the unknown shape in the centres' covariances, by camera."""
+    out = np.zeros((len(bodies.points_mm), len(cameras), 2, 2))
     known = np.isfinite(bodies.covariance_mm2).all((1, 2))
     share = (bodies.covariance_mm2 - bodies.silhouette_covariance_mm2)[known]
     values, vectors = np.linalg.eigh(share)
     share = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2)
     _, jacobian = stacked_jacobian(cameras, bodies.points_mm[known])
-    for c in range(2):
+    for c in range(len(cameras)):
         view = jacobian[:, 2 * c : 2 * c + 2]
         out[known, c] = view @ share @ np.swapaxes(view, -1, -2)
     return out
 
 
-def pair_frame(sight: Sight, model: PairModel, predicted: Prediction | None) -> tuple[Pairs, Array]:
-    """Return the pairs of a frame, and the median shift of each camera's pixels.
+def grouped_frame(
+    sight: Sight, model: RigModel, predicted: Prediction | None
+) -> tuple[Bubbles, Array]:
+    """Return the bubbles of a frame, and the median shift of each camera's pixels.
 
-    Detections with given ids are paired by their ids; all others are matched.
+    Detections with given ids are joined by their ids; all others are matched.
 
-    sight : detections of the two cameras.
-    model : the model for pairing.
+    sight : detections of all cameras.
+    model : the model for matching.
     predicted : expected positions of the tracks; None if there are none.
 
-    The shift is (2, 2) in px: for each camera the median of measured minus projected pixels over
-    the pairs; 0 if there are fewer than three pairs.
+    The shift is (C, 2) in px: for each camera the median of measured minus projected pixels over
+    the bubbles that all cameras see; 0 if there are fewer than three. It is taken off what fewer
+    cameras see, so that their points agree with those of the others.
     """
-    found = match_candidates(sight.candidates, model, predicted)
+    found = match(sight.candidates, model, predicted)
     given = np.arange(len(sight.possible) - len(sight.candidates))
     chosen = np.concatenate([given, len(given) + found.candidate])
-    pairs = sight.possible.take(chosen)
-    pairs.confidence[len(given) :] = found.confidence
-    pairs.ambiguous[len(given) :] = found.ambiguous
-    if len(chosen) < _LEAST_FOR_OFFSET:
-        return pairs, np.zeros((2, 2))
-    return pairs, np.median(sight.left_px[chosen], axis=0).reshape(2, 2)
+    bubbles = sight.possible.take(chosen)
+    bubbles.confidence[len(given) :] = found.confidence
+    bubbles.ambiguous[len(given) :] = found.ambiguous
+    part = (bubbles.rows < 0).any(1)
+    if np.sum(~part) < _LEAST_FOR_OFFSET:
+        return bubbles, np.zeros((len(model.cameras), 2))
+    offset = np.median(sight.left_px[chosen][~part], axis=0)
+    if part.any():
+        pixels = [(uv - off, noise) for (uv, noise), off in zip(sight.pixels, offset)]
+        bubbles.points_mm[part] = places_of(model.cameras, pixels, bubbles.rows[part]).points_mm
+    return bubbles, offset
 
 
 def _others(rows: Ints, given: Ints) -> Ints:
     """Return the rows of detections without a given id that are not among ``rows``."""
     out = given == NO_PARTICLE
-    out[rows] = False
+    out[rows[rows >= 0]] = False
     return np.flatnonzero(out)
 
 
@@ -327,31 +382,32 @@ def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
 
 
 def _measured(
-    pairs: Pairs, unpaired: tuple[Ints, Ints], pixels: tuple[Pixels, Pixels], offset_px: Array
+    bubbles: Bubbles, others: Sequence[Ints], pixels: Sequence[Pixels], offset_px: Array
 ) -> FrameMeasurements:
-    """Return the tracker's input; unpaired : rows of the detections without a partner."""
-    (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, unpaired))
+    """Return the tracker's input; others : rows of the detections without a partner."""
+    alone = [(uv[i] - off, noise[i]) for (uv, noise), off, i in zip(pixels, offset_px, others)]
+    uv, noise = map(np.concatenate, zip(*alone))
     singles = SingleMeasurements(
-        np.repeat([0, 1], [len(i) for i in unpaired]).astype(np.int64),
-        np.concatenate([uv_a - offset_px[0], uv_b - offset_px[1]]),
-        np.concatenate([cov_a, cov_b]),
+        np.repeat(np.arange(len(others)), [len(i) for i in others]), uv, noise
     )
     return FrameMeasurements.create(
-        pairs.points_mm,
-        pairs.covariance_mm2,
-        d_eq_mm=pairs.d_eq_mm,
-        confidence=pairs.confidence,
-        particle=pairs.given,
+        bubbles.points_mm,
+        bubbles.covariance_mm2,
+        d_eq_mm=bubbles.d_eq_mm,
+        confidence=bubbles.confidence,
+        particle=bubbles.given,
         singles=singles,
     )
 
 
 def _detections(frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return every detection with the id of its track, blank where it has none."""
-    particle = np.concatenate([frame.owners(c) for c in range(2) for frame in frames])
-    order = [2 * k + c for c in range(2) for k, f in enumerate(frames) for _ in f.sight.given[c]]
-    both = pd.concat(joined, ignore_index=True)
-    both["particle"] = pd.arrays.IntegerArray(particle, particle == NO_PARTICLE)
+    count = range(len(joined))
+    particle = np.concatenate([frame.owners(c) for c in count for frame in frames])
+    order = [len(joined) * k + c for c in count for k, f in enumerate(frames)
+             for _ in f.sight.given[c]]  # fmt: skip
+    every = pd.concat(joined, ignore_index=True)
+    every["particle"] = pd.arrays.IntegerArray(particle, particle == NO_PARTICLE)
     leading = ["frame", "camera", "particle"]
-    both = both[leading + [name for name in both if name not in leading]]
-    return both.take(np.argsort(order, kind="stable")).reset_index(drop=True)
+    every = every[leading + [name for name in every if name not in leading]]
+    return every.take(np.argsort(order, kind="stable")).reset_index(drop=True)

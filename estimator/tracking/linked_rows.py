@@ -25,13 +25,13 @@ _TABLES = ("tracks", "detections")
 class Linking:
     """Hold what the tracking of a run tells beside its rows; complete when all rows were read.
 
-    model : the model for pairing.
+    pairs : the model of each pair of cameras, as in `RigModel`.
     shapes : what the run tells of its bubbles' shapes.
     events : events of the tracks.
     frames_without : for each camera, how often each reason for a frame without bubbles occurred.
     """
 
-    model: PairModel
+    pairs: dict[tuple[int, int], PairModel]
     shapes: Shapes
     events: list[TrackEvent]
     frames_without: dict[str, dict[str, int]]
@@ -56,7 +56,7 @@ class LinkedRows:
             return None
         content = json.loads(self._mark.read_bytes(), object_hook=_from_json)
         return Linking(
-            _pair_model(content["model"]),
+            {(a, b): _pair_model(model) for a, b, model in content["pairs"]},
             Shapes(**content["shapes"]),
             [TrackEvent(**{**e, "particles": tuple(e["particles"])}) for e in content["events"]],
             content["frames_without"],
@@ -76,7 +76,8 @@ class LinkedRows:
             with atomic_path(self._file(count - 1)) as staged:
                 np.savez(staged, **arrays)
             yield _linked(arrays)
-        content = {"parts": count, **asdict(linking)}
+        pairs = [[*pair, asdict(model)] for pair, model in linking.pairs.items()]
+        content = {"parts": count, **asdict(linking), "pairs": pairs}
         write_text_atomic(self._mark, json.dumps(content, default=_as_json))
 
 

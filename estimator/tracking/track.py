@@ -1,4 +1,4 @@
-"""Tracking of a run: background, detection, pairs, tracks; row by row, and resumable."""
+"""Tracking of a run: background, detection, groups, tracks; row by row, and resumable."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
-from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
-from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
+from telerig.estimator.bubbles.pairing.groups import RigModel, candidates_of, match
+from telerig.estimator.bubbles.pairing.learning import learn_rig
 from telerig.estimator.bubbles.shape.learning import learn_shapes
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.estimator.calibration.result.calibration import (
     Calibration,
-    pair_of_run,
+    of_run,
 )
 from telerig.estimator.rig_drift import PairCollector, with_change
 from telerig.estimator.tracking.backtracking import Tables
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 
 MODEL_FRAMES = 60
-"""Frames spread over those with bubbles, from which the pair model is learnt."""
+"""Frames spread over those with bubbles, from which the model of groups is learnt."""
 
 LARGEST_ID = 10**15
 """Tracks are numbered below it; a larger number is the name of a bubble."""
@@ -94,7 +94,7 @@ class TrackingStream:
     marks : marks that were followed in the images; None without a strip of dots.
     linked : the rows, which are computed while they are read.
     detections, points, particles : numbers of detections and points, and ids of tracks, so far.
-    paired : number of points that are measured in both images, so far.
+    together : number of detections that show a bubble together with another camera, so far.
     covered : for each camera, number of detections and the area that they cover (px^2), so far.
     beyond : number of points beyond the dots of the calibration, so far.
     common_mm2 : (3,) sums over the points of the variances by the calibration's errors, so far.
@@ -110,7 +110,7 @@ class TrackingStream:
     corrections: Corrections
     detections: int = 0
     points: int = 0
-    paired: int = 0
+    together: int = 0
     beyond: int = 0
     common_mm2: Array = field(default_factory=lambda: np.zeros(3))
     particles: set[Any] = field(default_factory=set)
@@ -136,7 +136,9 @@ class TrackingStream:
         for part in map(self._with_share, self.linked):
             self.detections += int(np.isfinite(part.detections["u_px"].to_numpy(float)).sum())
             self.points += len(part.tracks)
-            self.paired += int(part.tracks["ray_miss_mm"].notna().sum())
+            measured = part.tracks[part.tracks["ray_miss_mm"].notna()]
+            names = [f"{camera}_u_px" for camera in self.run.cameras]
+            self.together += int(measured[names].notna().to_numpy().sum())
             self.particles |= set(part.tracks["particle"])
             self._pairs.add(part.tracks)
             for camera, areas in part.detections.groupby("camera")["area_px2"]:
@@ -155,7 +157,7 @@ class TrackingStream:
 
     def summary(self) -> dict[str, Any]:
         """Return the content of tracking.json. Raises InputError when no bubble was found."""
-        run, model, kinds = self.run, self.linking.model, [e.kind for e in self.events]
+        run, kinds = self.run, [e.kind for e in self.events]
         if not self.detections:
             raise InputError(
                 f"no bubble was found in {run.frame_count} frames",
@@ -175,10 +177,10 @@ class TrackingStream:
             "detections": self.detections,
             "points": self.points,
             "tracks": len(self.particles),
-            "detections_without_partner_or_track": self.detections - 2 * self.paired,
+            "detections_without_partner_or_track": self.detections - self.together,
             "frames_without_bubbles": self.linking.frames_without,
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
-            "pairs": with_change(model, change, self.calibration),
+            "pairs": with_change(self.linking.pairs, change, self.calibration),
             "shapes": asdict(self.linking.shapes),
             "covariance": "Of the measurement."
             + known
@@ -231,7 +233,7 @@ def track(
     options: TrackOptions | None = None,
     progress: Steps | bool = False,
 ) -> Tracks:
-    """Detect the bubbles of a run, pair them across the two views, and follow them in time.
+    """Detect the bubbles of a run, find the same ones in all views, and follow them in time.
 
     run : the run as read by `telerig.io.dataset.run.load_run` or ``dataset.runs[name].load()``.
     calibration : calibration of the rig.
@@ -265,7 +267,7 @@ def tracking_stream(
     stage: Progress | None = None,
     executor: Executor | None = None,
 ) -> TrackingStream:
-    """Detect the bubbles, learn the model for pairing them, and return a stream that tracks them.
+    """Detect the bubbles, learn how their views agree, and return a stream that tracks them.
 
     work : folder into which detections and rows are written, so that an interrupted run can
         continue, and a run that is complete repeats nothing but its corrections.
@@ -276,7 +278,7 @@ def tracking_stream(
     rows are read.
     """
     chosen = options or TrackOptions()
-    calibration = pair_of_run(calibration, run.cameras)
+    calibration = of_run(calibration, run.cameras)
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
     up = upwards(run, axis)
@@ -308,11 +310,11 @@ def tracking_stream(
         if stage is not None:
             stage("pair model", 0, 0)
         sample = _sample(cameras, batches)
-        model = estimate_pair_model(sample, cameras)
+        model = learn_rig(sample, cameras)
         tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
-        linker = RowMaker(cameras, model, tracker, _shapes(sample, cameras, model, up), up)
+        linker = RowMaker(model, tracker, _shapes(sample, model, up), up)
         without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
-        linking = Linking(model, linker.shapes, linker.events, without)
+        linking = Linking(model.pairs, linker.shapes, linker.events, without)
         rows = stored.keep(_linked(run, cameras, batches(), linker, without, stage), linking)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
@@ -345,16 +347,16 @@ def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:
     return replace(settings, confirm_hits=hits, confirm_frames=max(hits, settings.confirm_frames))
 
 
-def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, Camera]:
-    """Return the two cameras of the calibration.
+def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, ...]:
+    """Return the cameras of the calibration.
 
-    Raises CalibrationError when it has not two cameras, or when the run was not taken with them.
+    Raises CalibrationError when it has only one, or when the run was not taken with them.
     """
-    if len(calibration.cameras) != 2:
+    if len(calibration.cameras) < 2:
         raise CalibrationError(
-            f"tracking in space needs two cameras, but the calibration has "
+            "tracking in space needs two cameras or more, but the calibration has "
             f"{len(calibration.cameras)}",
-            todo="calibrate both cameras together",
+            todo="calibrate all cameras together",
         )
     names = [c.name for c in calibration.cameras]
     if list(run.cameras) != names:
@@ -373,7 +375,7 @@ def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, C
                 where=str(run.path),
                 todo="give the calibration of this rig, made at this image size",
             )
-    return calibration.cameras[0], calibration.cameras[1]
+    return calibration.cameras
 
 
 def stage_axis(run: RunData, calibration: Calibration) -> Array:
@@ -457,23 +459,22 @@ def _labelled(part: Linked, labels: Mapping[int, str]) -> Linked:
     )
 
 
-def _split(table: pd.DataFrame, cameras: tuple[Camera, Camera]) -> dict[int, Tables]:
-    """Return the bubbles of both cameras by frame; rows with a reason only are left out."""
+def _split(table: pd.DataFrame, cameras: Sequence[Camera]) -> dict[int, Tables]:
+    """Return the bubbles of all cameras by frame; rows with a reason only are left out."""
     kept = table[np.isfinite(table["u_px"].to_numpy(float))]
     found = dict(iter(kept.groupby(["frame", "camera"], sort=False)))
-    first, second = (c.name for c in cameras)
     return {
-        int(f): (found.get((f, first), kept.iloc[:0]), found.get((f, second), kept.iloc[:0]))
+        int(f): tuple(found.get((f, c.name), kept.iloc[:0]) for c in cameras)
         for f in sorted(set(table["frame"]))
     }
 
 
 def _sample(
-    cameras: tuple[Camera, Camera], batches: Callable[[], Iterator[pd.DataFrame]]
+    cameras: Sequence[Camera], batches: Callable[[], Iterator[pd.DataFrame]]
 ) -> list[Tables]:
-    """Return the detections of `MODEL_FRAMES` of the frames in which both cameras see bubbles."""
-    both = np.concatenate([np.zeros(0, np.int64), *map(_seen_by_both, batches())])
-    frames = both[np.linspace(0, len(both) - 1, min(len(both), MODEL_FRAMES)).astype(int)]
+    """Return the detections of `MODEL_FRAMES` of the frames in which two cameras see bubbles."""
+    some = np.concatenate([np.zeros(0, np.int64), *map(_seen_by_two, batches())])
+    frames = some[np.linspace(0, len(some) - 1, min(len(some), MODEL_FRAMES)).astype(int)]
     return [
         tables
         for batch in batches()
@@ -481,36 +482,33 @@ def _sample(
     ]
 
 
-def _seen_by_both(batch: pd.DataFrame) -> Ints:
-    """Return the frames of a batch in which both cameras have detections."""
+def _seen_by_two(batch: pd.DataFrame) -> Ints:
+    """Return the frames of a batch in which two cameras or more have detections."""
     cameras = batch[np.isfinite(batch["u_px"].to_numpy(float))].groupby("frame")["camera"].nunique()
-    return np.asarray(cameras.index[cameras == 2], np.int64)
+    return np.asarray(cameras.index[cameras >= 2], np.int64)
 
 
-def _shapes(
-    sample: list[Tables], cameras: tuple[Camera, Camera], model: PairModel, up: Array
-) -> Shapes:
-    """Return how the run's bubbles deviate from spheroids, by its reliable pairs."""
-    parts: tuple[list[pd.DataFrame], ...] = tuple([] for _ in cameras)
-    for tables in sample:
-        found = match_pairs(*tables, cameras, model)
-        reliable = found.confidence > _RELIABLE
-        for part, table, rows in zip(parts, tables, (found.first, found.second)):
-            part.append(table.iloc[rows[reliable]])
-    if not any(map(len, parts[0])):
+def _shapes(sample: list[Tables], model: RigModel, up: Array) -> Shapes:
+    """Return how the run's bubbles deviate from spheroids, by its reliable groups."""
+    if not sample:
         return Shapes()
-    sightings = [
-        sightings_from_table(pd.concat(part, ignore_index=True), c, cameras)
-        for c, part in enumerate(parts)
-    ]
-    count = len(sightings[0])
-    seen = np.arange(count)[:, None] + count * np.arange(len(cameras))
-    return learn_shapes(Sightings.concat(sightings), seen, cameras, up)
+    tables, counts, found = candidates_of(sample, model)
+    starts = np.cumsum(counts, axis=0) - counts
+    seen = []
+    for first, one in zip(starts, found):
+        matches = match(one, model)
+        rows = matches.rows[matches.confidence > _RELIABLE]
+        seen.append(np.where(rows >= 0, rows + first, -1))
+    sightings = [sightings_from_table(t, c, model.cameras) for c, t in enumerate(tables)]
+    many = counts.sum(0)
+    rows = np.concatenate(seen)
+    order = np.where(rows >= 0, rows + np.cumsum(many) - many, -1)
+    return learn_shapes(Sightings.concat(sightings), order, model.cameras, up)
 
 
 def _linked(
     run: RunData,
-    cameras: tuple[Camera, Camera],
+    cameras: tuple[Camera, ...],
     batches: Iterator[pd.DataFrame],
     linker: RowMaker,
     without: dict[str, dict[str, int]],
@@ -521,15 +519,15 @@ def _linked(
         stage("tracks", 0, run.frame_count)
     for batch, last in _with_ends(batches, run.frame_count):
         _count_reasons(batch, without)
-        empty = batch.iloc[:0], batch.iloc[:0]
+        empty = tuple(batch.iloc[:0] for _ in cameras)
         numbers = batch["frame"].to_numpy()
         for first in range(done, last, _FRAMES_AT_ONCE):
             frames = range(first, min(first + _FRAMES_AT_ONCE, last))
             split = _split(batch[(numbers >= first) & (numbers < frames.stop)], cameras)
             tables = [split.get(frame, empty) for frame in frames]
-            for frame, pair, sight in zip(frames, tables, linker.sights(tables)):
+            for frame, own, sight in zip(frames, tables, linker.sights(tables)):
                 position = None if run.position_mm is None else float(run.position_mm[frame])
-                rows = linker.add(frame, float(run.t_s[frame]), position, pair, sight)
+                rows = linker.add(frame, float(run.t_s[frame]), position, own, sight)
                 if rows is not None:
                     yield rows
             if stage is not None:

@@ -265,7 +265,7 @@ def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") 
     lines = [f"{count_words(summary)} ({seconds:.1f} s{steps and f': {steps}'})"]
     left = summary["detections_without_partner_or_track"]
     if left:
-        lines.append(f"  {left} detections have no partner in the other view, or no track")
+        lines.append(f"  {left} detections have no partner in another view, or no track")
     for camera, reasons in summary["frames_without_bubbles"].items():
         lines += [
             f"  camera {camera}: {count} frames without a bubble: {reason}"

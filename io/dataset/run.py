@@ -167,8 +167,8 @@ def load_run(
     rig : the content of rig.toml; None looks for a `rig.toml` two folders above the run.
     source : "images" or "detections", from which bubbles are taken; None takes the only one that
         there is. It has to be given if the folder has both.
-    cameras : names of the cameras; None takes the two that `[tracking]` in rig.toml names, or the
-        first two.
+    cameras : names of the cameras; None takes those that `[tracking]` in rig.toml names, or all
+        that have images (rows in detections.csv).
     image_sizes_px : (width, height) by camera; they replace those of rig.toml.
     pair_by : how the images of several cameras are paired: "numbers", "order" or "auto", see
         `telerig.io.dataset.run.pair_frames`.
@@ -189,13 +189,19 @@ def load_run(
     sizes |= dict(image_sizes_px or {})
     notes: list[str] = []
     images = _choose_source(folder, names, source) == "images"
+    stated = bool(cameras) or rig is None or rig.tracking is not None
+    if images:
+        names = _those_there(names, set(recordings(folder)), stated)
+    detections = None
+    if not images:
+        detections, seen = _detections(folder, names, every, sizes, notes)
+        names = _those_there(names, seen, stated)
     if len(every) > len(names):
         notes.append(f"of {', '.join(every)}, the run is that of cameras {', '.join(names)}")
     sources = _open_sources(folder, names, every) if images else {}
     positions = _paired(folder, sources, every, pair_by, notes) if images else {}
     sizes |= {n: _size(s) for n, s in sources.items() if n not in sizes}
     count = len(positions[names[0]]) if images else None
-    detections = None if images else _detections(folder, names, every, sizes, notes)
     recorded = _recorded_times(sources, positions)
     t_s = _times(folder, every, count, detections, notes, recorded)
     stage = _table(folder / "stage.csv", read_stage_csv)
@@ -236,6 +242,12 @@ def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
             todo="put the run into DATASET/runs/, or give a calibration (--calibration FILE)",
         )
     return list(rig.tracking_cameras)
+
+
+def _those_there(names: list[str], there: set[str], stated: bool) -> list[str]:
+    """Return the cameras with data, unless they are stated or fewer than two have some."""
+    found = [name for name in names if name in there]
+    return names if stated or len(found) < 2 else found
 
 
 def _of(names: list[str], table: pd.DataFrame) -> pd.DataFrame:
@@ -336,8 +348,11 @@ def _detections(
     every: list[str],
     sizes: Mapping[str, tuple[int, int]],
     notes: list[str],
-) -> pd.DataFrame | FrameTable:
-    """Read detections.csv and keep the rows of the cameras ``names``; append to ``notes``."""
+) -> tuple[pd.DataFrame | FrameTable, set[str]]:
+    """Read detections.csv and keep the rows of the cameras ``names``; append to ``notes``.
+
+    Returns the cameras that have rows, too.
+    """
     file, path = folder / "frames.csv", folder / "detections.csv"
     count = len(read_frames_csv(file, None, every)) if file.is_file() else None
     seen: set[str] = set()
@@ -363,7 +378,7 @@ def _detections(
         )
     absent = [name for name in names if name not in seen]
     notes += [f"detections.csv has nothing of camera {name}" for name in absent]
-    return table
+    return table, seen
 
 
 def _times(

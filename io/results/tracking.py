@@ -56,14 +56,18 @@ class Pairs(Part):
 
 
 class RigChange(Part):
-    """Hold how far a camera has moved relative to the other one since the calibration.
+    """Hold how far a camera has moved relative to another one since the calibration.
 
     camera : the camera that is described.
+    against : the other one.
+    culprit : of more than two cameras the one that has moved, if all others agree.
     moved : whether the movement is significant.
     offset_mm : its part along the common perpendicular in mm; None where it is not known.
     """
 
     camera: str = ""
+    against: str = ""
+    culprit: str = ""
     moved: bool = False
     offset_mm: float | None = None
     words: str = ""

@@ -257,8 +257,8 @@ class RigDescription:
     rotvec_from_first_deg : by camera, the nominal rotation vector (3,) in degrees of
         <camera>_from_<first>, for the cameras that the file states. It decides the mirror
         ambiguity.
-    tracking : the two cameras whose images of bubbles are paired, in the rig's order; None when the
-        file does not state them, which means the first two.
+    tracking : the cameras whose images of bubbles are used, in the rig's order; None when the file
+        does not state them, which means all that have images in a run.
     stage, references : None when the file has no such table.
     bubbles : by camera, where in its images bubbles are looked for.
     fluid : the liquid of the tank; None when the file has no such table.
@@ -268,7 +268,7 @@ class RigDescription:
     cameras: Mapping[str, CameraDescription]
     target: Target
     rotvec_from_first_deg: Mapping[str, Vector] = field(default_factory=dict)
-    tracking: tuple[str, str] | None = None
+    tracking: tuple[str, ...] | None = None
     stage: StageDescription | None = None
     accelerometers: Mapping[str, AccelerometerDescription] = field(default_factory=dict)
     references: ReferencesDescription | None = None
@@ -289,8 +289,8 @@ class RigDescription:
 
     @property
     def tracking_cameras(self) -> tuple[str, ...]:
-        """Names of the two cameras that tracking uses; one name for a rig of one camera."""
-        return self.tracking or tuple(self.cameras)[:2]
+        """Names of the cameras that tracking uses."""
+        return self.tracking or tuple(self.cameras)
 
     @property
     def windows(self) -> dict[str, Wall]:

@@ -71,7 +71,8 @@ _ROTVEC_DEG = Annotated[
 @dataclass(frozen=True)
 class _TrackingTable(Table):
     cameras: Annotated[
-        tuple[str, str], Field(description='the names of two cameras, like ["left", "right"]')
+        tuple[str, ...],
+        Field(min_length=2, description='the names of cameras, like ["left", "right"]'),
     ]
 
 
@@ -240,8 +241,8 @@ def _rotvecs_deg(raw: dict[str, Any], names: list[str], problems: Problems) -> d
     return {name: rotvec for name, rotvec in found.items() if rotvec is not None}
 
 
-def _tracking(raw: dict[str, Any], names: list[str], problems: Problems) -> tuple[str, str] | None:
-    """Return the two cameras of `[tracking]`, in the order of the rig."""
+def _tracking(raw: dict[str, Any], names: list[str], problems: Problems) -> tuple[str, ...] | None:
+    """Return the cameras of `[tracking]`, in the order of the rig."""
     if "tracking" not in raw or not names:
         return None
     if len(names) == 1:
@@ -255,14 +256,13 @@ def _tracking(raw: dict[str, Any], names: list[str], problems: Problems) -> tupl
         if name not in names:
             what = f"there is no camera {name!r}"
             problems.add("tracking", "cameras", what, suggestion(name, names))
-    first, second = table.cameras
-    if first == second:
-        what = f"names {first!r} twice"
-        problems.add("tracking", "cameras", what, "name two cameras")
-    if {first, second} - set(names):
+    twice = [name for name in names if table.cameras.count(name) > 1]
+    if twice:
+        what = f"names {twice[0]!r} twice"
+        problems.add("tracking", "cameras", what, "name two cameras or more, each once")
+    if set(table.cameras) - set(names):
         return None
-    first, second = sorted(table.cameras, key=names.index)
-    return first, second
+    return tuple(sorted(table.cameras, key=names.index))
 
 
 def _stage(raw: dict[str, Any], names: list[str], problems: Problems) -> StageDescription | None:

@@ -6,4 +6,18 @@ CALIBRATIONS = (
     "paper", "dense", "scheimpflug", "near_telecentric", "symmetric", "unbounded", "two_sided",
     "three",
 )  # fmt: skip
-RUNS = ("rise", "swarm", "crossing", "forces", "S0", "S1", "S2", "S3", "S4", "S5", "S6")
+RUNS = (
+    "rise",
+    "swarm",
+    "crossing",
+    "forces",
+    "three",
+    "four",
+    "S0",
+    "S1",
+    "S2",
+    "S3",
+    "S4",
+    "S5",
+    "S6",
+)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, TypeVar
 
 from telerig.errors import InputError
@@ -97,6 +98,21 @@ def _three_cameras() -> tuple[CameraConfig, ...]:
         CameraConfig("middle", centre_offset_px=(-3.1, 0.8), scale_px_per_mm=9.97),
         CameraConfig("right", centre_offset_px=(1.2, 2.6), scale_px_per_mm=10.02),
     )
+
+
+def _around(count: int, name: str) -> SimulationConfig:
+    """Return a calibration for runs like `swarm`, seen by three or four cameras around the tank."""
+    names = ("left", "middle", "right") if count == 3 else ("first", "second", "third", "fourth")
+    truth = ((20.08, 2.3, -1.7), (19.94, -3.1, 0.8), (20.04, 1.2, 2.6), (19.9, 2.8, -2.2))
+    cameras = tuple(
+        CameraConfig(one, (1280, 800), scale, 20.0, (u, v), {"k1": k1})
+        for one, (scale, u, v), k1 in zip(names, truth, (2e-3, -1.5e-3, 1e-3, -2e-3))
+    )
+    together = (*pairwise(names), *zip(names, names[1:], names[2:]))
+    return SimulationConfig(
+        name, cameras, _small_target(0.8), views=15, angle_deg=60.0 if count == 3 else 45.0,
+        tilt_deg=(8.0, 65.0), shift_mm=(12.0, 12.0, 12.0), seen_by=together,
+    )  # fmt: skip
 
 
 def _unbounded_target() -> Target:
@@ -214,6 +230,31 @@ def _scenario(
     )
 
 
+_SWARM = RunConfig(
+    "swarm",
+    _like_paper("swarm", (1280, 800), 20.0, 0.8),
+    frames=100,
+    frame_rate_hz=500.0,
+    bubbles=20,
+    bubble=BubbleConfig(
+        d_eq_mm=(0.8, 4.0),
+        aspect=(1.0, 1.35),
+        triaxial=0.04,
+        modes_static={3: 0.006, 4: 0.004},
+        modes_oscillating={2: 0.02, 3: 0.012},
+    ),
+    motion=MotionConfig(
+        "stochastic",
+        rise_mm_s=(220.0, 280.0),
+        wander_mm_s=10.0,
+        lateral_oscillation=(0.8, 6.0, 0.05),
+        spread=(0.9, 0.9),
+    ),
+    stage=StageConfig(follow=0.6, ramp_s=0.0, shake_mm=0.05),
+    image=ImageConfig(window_dirt=30, lens_dirt=25, defocus_px_per_mm=0.05),
+)
+
+
 _RUNS = (
     RunConfig(
         "rise",
@@ -222,29 +263,9 @@ _RUNS = (
             d_eq_mm=(4.0, 5.0), modes_static={3: 0.02}, modes_oscillating={2: 0.04, 3: 0.03}
         ),
     ),
-    RunConfig(
-        "swarm",
-        _like_paper("swarm", (1280, 800), 20.0, 0.8),
-        frames=100,
-        frame_rate_hz=500.0,
-        bubbles=20,
-        bubble=BubbleConfig(
-            d_eq_mm=(0.8, 4.0),
-            aspect=(1.0, 1.35),
-            triaxial=0.04,
-            modes_static={3: 0.006, 4: 0.004},
-            modes_oscillating={2: 0.02, 3: 0.012},
-        ),
-        motion=MotionConfig(
-            "stochastic",
-            rise_mm_s=(220.0, 280.0),
-            wander_mm_s=10.0,
-            lateral_oscillation=(0.8, 6.0, 0.05),
-            spread=(0.9, 0.9),
-        ),
-        stage=StageConfig(follow=0.6, ramp_s=0.0, shake_mm=0.05),
-        image=ImageConfig(window_dirt=30, lens_dirt=25, defocus_px_per_mm=0.05),
-    ),
+    _SWARM,
+    replace(_SWARM, name="three", calibration=_around(3, "three")),
+    replace(_SWARM, name="four", calibration=_around(4, "four")),
     RunConfig(
         "crossing",
         _like_paper("crossing", (1280, 800), 40.0, 0.45),

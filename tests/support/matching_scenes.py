@@ -8,7 +8,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.matching import pair_geometry, shared_axis, view_of
+from telerig.estimator.bubbles.pairing.groups import Matches, RigModel, match_tables
+from telerig.estimator.bubbles.pairing.matching import (
+    PairModel,
+    Prediction,
+    pair_geometry,
+    shared_axis,
+    view_of,
+)
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -38,6 +45,14 @@ def table(uv: Any, semi_axes: Any = 16.0, sigma: Any = 0.1, angle: Any = 0.0) ->
 def geometry(first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]) -> Any:
     axis = shared_axis(cameras)
     return pair_geometry(view_of(first, cameras[0], axis), view_of(second, cameras[1], axis))
+
+
+def match_pairs(
+    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera], model: PairModel,
+    *, predicted: Prediction | None = None,
+) -> Matches:  # fmt: skip
+    """The pairs of two cameras."""
+    return match_tables((first, second), RigModel.of(cameras, {(0, 1): model}), predicted)
 
 
 def frame(
@@ -71,7 +86,9 @@ def frame(
 
 def truth(tables: Frame, pairs: Any) -> NDArray[np.bool_]:
     who = [t["bubble"].to_numpy() for t in tables]
-    return np.asarray((who[0][pairs.first] >= 0) & (who[0][pairs.first] == who[1][pairs.second]))
+    return np.asarray(
+        (who[0][pairs.rows[:, 0]] >= 0) & (who[0][pairs.rows[:, 0]] == who[1][pairs.rows[:, 1]])
+    )
 
 
 def recall_and_precision(frames: list[Frame], matches: list[Any]) -> tuple[float, float]:

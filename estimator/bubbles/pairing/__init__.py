@@ -1,6 +1,6 @@
-"""Which bubble of the second camera is which of the first.
+"""Which detections of all cameras are the same bubble.
 
-In: the detections of one frame in both cameras, and predicted tracks. Out: pairs with
-probabilities. Read ``matching`` first; ``learning`` estimates from a run what both views of a
-bubble have in common.
+In: the detections of one frame in two to four cameras, and predicted tracks. Out: groups with
+probabilities. Read ``matching`` (pairs) first, then ``groups``; ``learning`` estimates from a run
+what the views of a bubble have in common.
 """

@@ -1,10 +1,10 @@
-"""Compiled loops over the pairs of a frame's detections; see `matching`."""
+"""Compiled loops over the pairs and larger groups of a frame's detections."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array, Bools, Ints
 from telerig.compiled import compiled
 
 GATE_SIGMA, NEVER = 5.0, -1e6
@@ -12,164 +12,196 @@ GATE_SIGMA, NEVER = 5.0, -1e6
 
 LARGEST_MAHALANOBIS2 = 60.0
 
-_TAIL, _LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
+TAIL, _LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
 _EXACT_SIDE = 11
 _LARGEST_EXPONENT = 600.0
 """Of the product of all rows' odds to have no partner: exp(-745) is 0."""
-_SHIFT_PASSES = 4
+SHIFT_PASSES = 4
 
 
 @compiled
 def gap_log_odds(
     gap: Array, variance: Array, shift: float, uncertainty: float, span_px: float, out: Array
 ) -> None:
-    """Write into ``out`` (N1, N2) log odds from gaps (px), less their shift (px), and variances
+    """Write into ``out`` (E,) log odds from gaps (px), less their shift (px), and variances
     (px^2), to which the shift's is added.
 
     The density of a true pair's gap is normal with wider tails (for disturbed outlines), and 0
     beyond a limit. It is compared with a uniform density over the span that both images cover.
     """
-    for i in range(gap.shape[0]):
-        for j in range(gap.shape[1]):
-            own = variance[i, j] + uncertainty
-            square = (gap[i, j] - shift) ** 2
-            wide = own + min(max(3.0 * own, _LEAST_TAIL_PX2), MOST_TAIL_PX2)
-            if not square < GATE_SIGMA**2 * wide:
-                out[i, j] = NEVER
+    for e in range(gap.size):
+        own = variance[e] + uncertainty
+        square = (gap[e] - shift) ** 2
+        wide = own + min(max(3.0 * own, _LEAST_TAIL_PX2), MOST_TAIL_PX2)
+        if not square < GATE_SIGMA**2 * wide:
+            out[e] = NEVER
+            continue
+        core = np.exp(-0.5 * square / own)
+        tail = np.exp(-0.5 * square / wide) * np.sqrt(own / wide)
+        density = ((1.0 - TAIL) * core + TAIL * tail) / np.sqrt(2.0 * np.pi * own)
+        out[e] = np.log(max(density * span_px, 1e-300))
+
+
+@compiled
+def _components(rows: Ints, counts: Ints, possible: Bools) -> Ints:
+    """Return for each group (E,) a number that all possible groups have in common which
+    detections connect; -1 for others."""
+    first = np.cumsum(counts) - counts
+    parent = np.arange(counts.sum())
+    out = np.full(len(rows), -1)
+    for turn in range(2):
+        for e in range(len(rows)):
+            if not possible[e]:
                 continue
-            core = np.exp(-0.5 * square / own)
-            tail = np.exp(-0.5 * square / wide) * np.sqrt(own / wide)
-            density = ((1.0 - _TAIL) * core + _TAIL * tail) / np.sqrt(2.0 * np.pi * own)
-            out[i, j] = np.log(max(density * span_px, 1e-300))
+            root = -1
+            for c in range(rows.shape[1]):
+                if rows[e, c] < 0:
+                    continue
+                own = first[c] + rows[e, c]
+                while parent[own] != own:
+                    parent[own] = parent[parent[own]]
+                    own = parent[own]
+                if root < 0:
+                    root = own
+                parent[own] = root
+            if turn == 1:
+                out[e] = root
+    return out
 
 
 @compiled
-def _component(possible: Bools, first: int, rows: Bools, columns: Bools) -> None:
-    """Mark the rows and columns that possible pairs connect with the row ``first``."""
-    rows[:], columns[:] = False, False
-    waiting = np.empty(rows.size, dtype=np.int64)
-    waiting[0], left = first, 1
-    rows[first] = True
-    while left > 0:
-        left -= 1
-        i = waiting[left]
-        for j in range(columns.size):
-            if possible[i, j] and not columns[j]:
-                columns[j] = True
-                for k in range(rows.size):
-                    if possible[k, j] and not rows[k]:
-                        rows[k] = True
-                        waiting[left] = k
-                        left += 1
+def _exact(weight: Array, alone: Array, choice: Ints, mask: Ints, columns: int) -> Array:
+    """Return the probabilities (E,) of groups, by a sum over all sets of disjoint ones.
 
-
-@compiled
-def _exact(weight: Array, alone: Array, out: Array) -> None:
-    """Write into ``out`` (n, m) the probabilities of pairs, by a sum over all assignments.
-
-    weight : (n, m) odds of the pairs; alone : (n,) those of a row without a partner. Dynamic
-    programming over the subsets of columns that the first rows, and the last ones, have taken.
+    weight, mask : (E,) odds of the groups, and bits of the columns that they take.
+    choice : (E,) which of the n rows a group belongs to; a row takes one of its groups or none.
+    alone : (n,) odds of a row that takes none. Dynamic programming over the subsets of columns that
+    the first rows have taken.
     """
-    n, m = weight.shape
-    forward, backward = np.zeros((n + 1, 1 << m)), np.ones((n + 1, 1 << m))
+    n = alone.size
+    forward, backward = np.zeros((n + 1, 1 << columns)), np.ones((n + 1, 1 << columns))
     forward[0, 0] = 1.0
+    ends = np.searchsorted(choice, np.arange(n + 1))
     for i in range(n):
         last = n - 1 - i
-        for taken in range(1 << m):
+        for taken in range(1 << columns):
             forward[i + 1, taken] += alone[i] * forward[i, taken]
-            backward[last, taken] = alone[last] * backward[last + 1, taken]
-            for j in range(m):
-                if not (taken >> j) & 1:
-                    forward[i + 1, taken | (1 << j)] += weight[i, j] * forward[i, taken]
-                    backward[last, taken] += weight[last, j] * backward[last + 1, taken | (1 << j)]
-    for i in range(n):
-        for j in range(m):
-            total = 0.0
-            if weight[i, j] > 0.0:
-                for taken in range(1 << m):
-                    if not (taken >> j) & 1:
-                        total += forward[i, taken] * backward[i + 1, taken | (1 << j)]
-            out[i, j] = weight[i, j] * total / backward[0, 0]
+            for e in range(ends[i], ends[i + 1]):
+                if forward[i, taken] > 0.0 and not taken & mask[e]:
+                    forward[i + 1, taken | mask[e]] += weight[e] * forward[i, taken]
+            total = alone[last] * backward[last + 1, taken]
+            for e in range(ends[last], ends[last + 1]):
+                if not taken & mask[e]:
+                    total += weight[e] * backward[last + 1, taken | mask[e]]
+            backward[last, taken] = total
+    out = np.zeros(weight.size)
+    for e in range(weight.size):
+        total, i = 0.0, choice[e]
+        for taken in range(1 << columns):
+            if not taken & mask[e]:
+                total += forward[i, taken] * backward[i + 1, taken | mask[e]]
+        out[e] = weight[e] * total / backward[0, 0]
+    return out
 
 
 @compiled
-def marginals(log_odds: Array, negligible: float) -> Array:
-    """Return the posterior probability (N1, N2) of each pair; see `matching.marginals`."""
-    n, m = log_odds.shape
-    out = np.zeros((n, m))
-    possible, waiting = np.empty((n, m), dtype=np.bool_), np.ones((n, m), dtype=np.bool_)
-    rows, columns = np.empty(n, dtype=np.bool_), np.empty(m, dtype=np.bool_)
-    again = True
-    while again:
-        again = False
-        for i in range(n):
-            for j in range(m):
-                possible[i, j] = waiting[i, j] and log_odds[i, j] > negligible
-                waiting[i, j] = False
-        for first in range(n):
-            if not possible[first].any():
+def marginals(log_odds: Array, rows: Ints, counts: Ints, negligible: float) -> Array:
+    """Return the posterior probability (E,) of each group; see `groups.marginals`."""
+    out = np.zeros(log_odds.size)
+    waiting = np.ones(log_odds.size, dtype=np.bool_)
+    first = np.cumsum(counts) - counts
+    place = np.empty(counts.sum(), dtype=np.int64)
+    while waiting.any():
+        possible = waiting & (log_odds > negligible)
+        waiting[:] = False
+        component = _components(rows, counts, possible)
+        order = np.argsort(component, kind="mergesort")
+        low = np.searchsorted(component[order], 0)
+        while low < order.size:
+            high = low + 1
+            while high < order.size and component[order[high]] == component[order[low]]:
+                high += 1
+            mine = order[low:high]
+            low = high
+            if mine.size == 1:
+                out[mine[0]] = 1.0 / (1.0 + np.exp(-log_odds[mine[0]]))
                 continue
-            _component(possible, first, rows, columns)
-            mine, others = np.flatnonzero(rows), np.flatnonzero(columns)
-            large = min(mine.size, others.size) > _EXACT_SIDE
-            again = again or large
-            turned = others.size > mine.size
-            if turned:
-                mine, others = others, mine
-            weight, found = np.zeros((mine.size, others.size)), np.empty((mine.size, others.size))
-            alone = np.empty(mine.size)
-            for a in range(mine.size):
-                peak = 0.0
-                for turn in range(2):
-                    for b in range(others.size):
-                        i, j = (others[b], mine[a]) if turned else (mine[a], others[b])
-                        if possible[i, j] and turn == 0:
-                            peak = max(peak, log_odds[i, j])
-                        elif possible[i, j]:
-                            peak = min(peak, _LARGEST_EXPONENT / mine.size)
-                            weight[a, b] = np.exp(log_odds[i, j] - peak)
-                alone[a] = np.exp(-peak)
-            if not large:
-                _exact(weight, alone, found)
-            for a in range(mine.size):
-                for b in range(others.size):
-                    i, j = (others[b], mine[a]) if turned else (mine[a], others[b])
-                    if large:
-                        waiting[i, j] = possible[i, j]
-                    elif possible[i, j]:
-                        out[i, j] = found[a, b]
-                    possible[i, j] = False
+            seen = np.zeros(counts.size, dtype=np.int64)
+            for e in mine:
+                for c in range(counts.size):
+                    if rows[e, c] >= 0:
+                        place[first[c] + rows[e, c]] = -1
+            for e in mine:
+                for c in range(counts.size):
+                    if rows[e, c] >= 0 and place[first[c] + rows[e, c]] < 0:
+                        place[first[c] + rows[e, c]] = seen[c]
+                        seen[c] += 1
+            leading = np.argmax(seen)
+            columns = seen.sum() - seen[leading]
+            if columns > _EXACT_SIDE:
+                waiting[mine] = True
+                continue
+            bit = np.cumsum(seen) - seen
+            bit[leading + 1 :] -= seen[leading]
+            choice, mask = np.empty(mine.size, np.int64), np.zeros(mine.size, np.int64)
+            count = seen[leading]
+            for k in range(mine.size):
+                choice[k] = -1
+                for c in range(counts.size):
+                    if rows[mine[k], c] >= 0:
+                        at = place[first[c] + rows[mine[k], c]]
+                        if c == leading:
+                            choice[k] = at
+                        else:
+                            mask[k] |= 1 << (bit[c] + at)
+                if choice[k] < 0:  # it is in no group of the leading camera: a row of its own
+                    choice[k] = count
+                    count += 1
+            peak = np.zeros(count)
+            for k in range(mine.size):
+                peak[choice[k]] = max(peak[choice[k]], log_odds[mine[k]])
+            peak = np.minimum(peak, _LARGEST_EXPONENT / count)
+            by_row = np.argsort(choice, kind="mergesort")
+            mine, choice, mask = mine[by_row], choice[by_row], mask[by_row]
+            weight = np.exp(log_odds[mine] - peak[choice])
+            out[mine] = _exact(weight, np.exp(-peak), choice, mask, columns)
         negligible += 1.0
     return out
 
 
 @compiled
 def common_shift(
-    gap: Array, variance: Array, appearance: Array, frame_px: float, span_px: float, least: float
+    gap: Array,
+    variance: Array,
+    appearance: Array,
+    rows: Ints,
+    counts: Ints,
+    frame_px: float,
+    span_px: float,
+    least: float,
 ) -> tuple[Array, float, float]:
     """Estimate the shift that all gaps of a frame share; see `matching.common_shift`.
 
-    gap, variance : (N1, N2) gaps less their bias (px), and variances (px^2).
-    appearance : (N1, N2) log odds from everything but the gaps
-    least : see `marginals`.
+    gap, variance : (E,) gaps less their bias (px), and variances (px^2).
+    appearance : (E,) log odds from everything but the gaps
+    rows, counts, least : see `marginals`.
 
-    Returns the log odds (N1, N2) of all pairs, the shift (px) and its variance (px^2).
+    Returns the log odds (E,) of all pairs, the shift (px) and its variance (px^2).
     """
     shift, uncertainty = 0.0, frame_px * frame_px
     odds = np.empty(gap.shape)
     gap_log_odds(gap, variance, shift, uncertainty, span_px, odds)
     odds += appearance
-    for _ in range(_SHIFT_PASSES if frame_px > 0.0 else 0):
-        probability = marginals(odds, least)
+    for _ in range(SHIFT_PASSES if frame_px > 0.0 else 0):
+        probability = marginals(odds, rows, counts, least)
         total, pull = 1.0 / (frame_px * frame_px), 0.0
-        for i in range(gap.shape[0]):
-            for j in range(gap.shape[1]):
-                if probability[i, j] > 0.0:
-                    off = (gap[i, j] - shift) ** 2
-                    weight = probability[i, j] / variance[i, j]
-                    weight /= 1.0 + off / (4.0 * (variance[i, j] + uncertainty))
-                    total += weight
-                    pull += weight * gap[i, j]
+        for e in range(gap.size):
+            if probability[e] > 0.0:
+                off = (gap[e] - shift) ** 2
+                weight = probability[e] / variance[e]
+                weight /= 1.0 + off / (4.0 * (variance[e] + uncertainty))
+                total += weight
+                pull += weight * gap[e]
         shift, uncertainty = pull / total, 1.0 / total
         gap_log_odds(gap, variance, shift, uncertainty, span_px, odds)
         odds += appearance

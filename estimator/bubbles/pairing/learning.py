@@ -11,22 +11,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
+from telerig.estimator.bubbles.pairing.groups import (
+    Candidates,
+    Groups,
+    RigModel,
+    candidates_of,
+    deviation,
+)
 from telerig.estimator.bubbles.pairing.matching import (
+    NEGLIGIBLE,
     Finding,
     LogRatioModel,
     PairGeometry,
     PairModel,
     View,
     appearance_log_odds,
+    bias_basis,
     common_shift,
     marginals,
+    nearly_parallel,
     pair_geometry,
+    prior_log_odds,
     shared_axis,
     views_of,
 )
@@ -71,6 +83,108 @@ def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
         np.zeros(1), np.zeros((1, 1)), np.zeros(3), reach, _PRIOR_SCATTER_PX, 0.0,
         size, contrast, (0.1, 0.1), _span_px(cameras, axis),
     )  # fmt: skip
+
+
+def learn_rig(frames: Sequence[Sequence[pd.DataFrame]], cameras: Sequence[Camera]) -> RigModel:
+    """Learn from a run how the images of one bubble agree in two cameras or more.
+
+    frames : for each frame, the detection tables of all cameras; as for `estimate_pair_model`,
+        which learns from each pair of cameras. With more than two cameras the systematic deviations
+        of larger groups are learned, too, as an offset field of each camera; what a shift of all
+        points explains is left out of them by a prior that favours small ones.
+
+    Raises InputError for tables without centres or covariances and for parallel cameras.
+    """
+    every = list(combinations(range(len(cameras)), 2))
+    seen = [p for p in every if not nearly_parallel((cameras[p[0]], cameras[p[1]]))] or every
+    models = {
+        (a, b): estimate_pair_model([(f[a], f[b]) for f in frames], (cameras[a], cameras[b]))
+        for a, b in seen
+    }
+    model = RigModel.of(cameras, models)
+    some = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).astype(int))
+    return _with_offsets(model, [frames[i] for i in some]) if len(cameras) > 2 else model
+
+
+def _with_offsets(model: RigModel, frames: Sequence[Sequence[pd.DataFrame]]) -> RigModel:
+    """The model with the offsets of all cameras, by expectation-maximisation over the groups."""
+    if not frames:
+        return model
+    wide = MOST_BIAS_PX / 2
+    _, counts, found = candidates_of(frames, model, wide)
+    groups = _joined_frames(found, counts)
+    larger = np.flatnonzero(groups.pair < 0)
+    frame = np.repeat(np.arange(len(found)), [len(f) for f in found])[larger]
+    if not len(larger):
+        return model
+    points = groups.places.points_mm[larger]
+    middle, spread = points.mean(0), np.maximum(2 * points.std(0), 1e-3)
+    model = replace(model, origin_mm=middle, reach_mm=np.maximum(spread, 0.1 * spread.max()))
+    for unsure in (wide, wide / 10, *[0.0] * (_PASSES - 2)):
+        weight = _group_weights(groups, counts, model, unsure)[larger]
+        model, _ = _offset_fit(model, groups.take(larger), weight, frame, 1)
+    best, least = _offset_fit(model, groups.take(larger), weight, frame, 1)
+    for terms in _BIAS_TERMS[1:]:
+        if weight.sum() >= _PAIRS_PER_TERM * terms:
+            trial, left = _offset_fit(model, groups.take(larger), weight, frame, terms)
+            if left < _BETTER**2 * least:
+                best, least = trial, left
+    return best
+
+
+def _joined_frames(found: Sequence[Candidates], counts: Ints) -> Groups:
+    """Return the groups of all frames, with rows among the detections of all frames."""
+    groups = Groups.concat([f.groups for f in found])
+    starts = np.cumsum(counts, axis=0) - counts
+    groups.rows[:] += np.where(groups.rows >= 0, np.repeat(starts, [*map(len, found)], 0), 0)
+    return groups
+
+
+def _group_weights(groups: Groups, counts: Ints, model: RigModel, unsure_px: float) -> Array:
+    """Return the probabilities (G,) of groups whose rows are those of all frames together."""
+    from telerig.estimator.bubbles.pairing import kernels
+
+    variance = model.mean("frame_px") ** 2 / 2 + unsure_px**2
+    total = groups.appearance + deviation(groups.places, groups.noise_px2, model, variance)[4]
+    for k, own in enumerate(model.pairs.values()):
+        mine = np.flatnonzero(groups.pair == k)
+        gap = np.empty(len(mine))
+        kernels.gap_log_odds(
+            groups.gap_px[mine], groups.variance_px2[mine], 0.0, own.frame_px**2, own.span_px, gap
+        )
+        total[mine] = groups.appearance[mine] + gap
+    return np.asarray(kernels.marginals(total, groups.rows, counts.sum(0), NEGLIGIBLE))
+
+
+def _offset_fit(
+    model: RigModel, groups: Groups, weight: Array, frame: Ints, terms: int
+) -> tuple[RigModel, float]:
+    """The model with offsets of so many terms, and the mean square of what they leave of groups in
+    frames that they were not fitted to, in units of the stated noise."""
+    plain = replace(model, offset_px=np.zeros((len(model.offset_px), 1)))
+    variance = model.mean("frame_px") ** 2 / 2
+    chi2 = deviation(groups.places, groups.noise_px2, model, variance)[0]
+    _, own, pull, *_ = deviation(groups.places, groups.noise_px2, plain, variance)
+    basis = bias_basis(groups.places.points_mm, model.origin_mm, model.reach_mm, terms)
+    free = 2.0 * (groups.rows >= 0).sum(1) - 3
+    weight = weight / (1 + chi2 / free / 8)
+    size = pull.shape[1]
+    prior = np.diag(np.tile(_PRIOR_BIAS_SD_PX[:terms] ** -2, size))
+
+    def fitted(used: Bools) -> RigModel:
+        tempered = weight * used
+        matrix = np.einsum("g,gij,ga,gb->iajb", tempered, own, basis, basis, optimize=True)
+        right = np.einsum("g,gi,ga->ia", tempered, pull, basis).ravel()
+        found = np.linalg.solve(matrix.reshape(size * terms, -1) + prior, right)
+        return replace(model, offset_px=found.reshape(size, terms))
+
+    left = np.zeros(len(weight))
+    for half in (frame % 2 == 0, frame % 2 == 1):
+        test = deviation(groups.places, groups.noise_px2, fitted(half), variance)[0]
+        left[~half] = test[~half]
+    return fitted(np.ones(len(weight), bool)), float(
+        np.average(left / free, weights=weight + 1e-12)
+    )
 
 
 def estimate_pair_model(
@@ -296,7 +410,8 @@ def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, floa
     density = np.zeros(len(grid))
     for g in geometries:
         near = np.abs(g.gap_px) < MOST_BIAS_PX + 5
-        odds = appearance_log_odds(g, model, np.array(g.gap_px.shape))
+        odds = appearance_log_odds(g, model)
+        odds += prior_log_odds(np.array(g.gap_px.shape), model.unmatched_share)
         share = 1 / (1 + np.exp(-np.clip(odds + np.log(model.span_px / 4), -30.0, 30.0)))
         kernel = np.exp(-0.5 * (g.gap_px[near][:, None] - grid) ** 2)
         density += np.sum(share[near][:, None] * kernel, axis=0)

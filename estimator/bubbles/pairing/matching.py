@@ -21,7 +21,6 @@ from dataclasses import dataclass, fields
 from enum import Enum, auto
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -40,7 +39,7 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
 )
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import cross, midpoint, stacked_jacobian
+from telerig.rig.triangulation import cross, midpoint
 
 NO_SIZE_FLAGS = ("border", "merged")
 _SCATTER_FACTOR = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
@@ -48,6 +47,7 @@ _UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
 """By flag, the standard deviation that a partly hidden outline adds to the centre, as a share of
 the major semi-axis."""
 _OUTLINE_SAMPLES = 96
+_LEAST_SINE = 0.05
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,19 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
     first, second = (c.camera_from_rig.rotation[2] for c in cameras)
     perpendicular = np.cross(first, second)
     length = np.linalg.norm(perpendicular)
-    if length < 0.05:
+    if nearly_parallel(cameras):
         raise InputError(
             "both cameras look along nearly the same direction",
             todo="turn the cameras: at less than 3 deg between them, bubbles cannot be paired",
         )
     in_first = (cameras[0].camera_from_rig.rotation @ perpendicular)[:2]
     return np.asarray(perpendicular / length * np.sign(in_first[np.argmax(np.abs(in_first))]))
+
+
+def nearly_parallel(cameras: tuple[Camera, Camera]) -> bool:
+    """Return whether two cameras look along nearly the same line, so that they show no depth."""
+    first, second = (c.camera_from_rig.rotation[2] for c in cameras)
+    return bool(np.linalg.norm(np.cross(first, second)) < _LEAST_SINE)
 
 
 def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
@@ -296,22 +302,6 @@ NEGLIGIBLE = -9.0
 """Log odds below which a pair is never considered: its probability stays under exp(-9)."""
 
 
-def best_assignment(log_odds: Array) -> tuple[Ints, Ints]:
-    """Find the most probable assignment of rows to columns.
-
-    log_odds : (N1, N2) log odds of each pair of a first and a second detection.
-
-    Returns the row and the column of each pair (two arrays of equal length). Rows and columns
-    without a partner do not occur.
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    gain = np.where(log_odds > 0, log_odds, 0.0)
-    rows, columns = linear_sum_assignment(gain, maximize=True)
-    kept = gain[rows, columns] > 0
-    return rows[kept].astype(np.int64), columns[kept].astype(np.int64)
-
-
 def marginals(log_odds: Array, negligible: float = NEGLIGIBLE) -> Array:
     """Compute the posterior probability of each pair.
 
@@ -319,13 +309,16 @@ def marginals(log_odds: Array, negligible: float = NEGLIGIBLE) -> Array:
     negligible : pairs with smaller log odds get the probability 0.
 
     Returns (N1, N2) probabilities. They are exact per connected component with up to 11 detections
-    on its smaller side (sum over all assignments by dynamic programming over subsets). Of a larger
-    component the least likely pairs are left out, one unit of log odds after the other, until it
-    falls apart.
+    beside those of the camera with the most (sum over all sets by dynamic programming over
+    subsets); so are those of larger groups. Of a larger component the least likely pairs are left
+    out, one unit of log odds after the other, until it falls apart.
     """
     from telerig.estimator.bubbles.pairing import kernels
 
-    return kernels.marginals(np.asarray(log_odds, float), negligible)
+    odds = np.asarray(log_odds, float)
+    rows = np.stack(np.unravel_index(np.arange(odds.size), odds.shape), -1)
+    found = kernels.marginals(odds.ravel(), rows, np.array(odds.shape), negligible)
+    return np.asarray(found.reshape(odds.shape))
 
 
 @dataclass(frozen=True)
@@ -355,6 +348,17 @@ class LogRatioModel:
 
         relative, axes = eigh(self.scatter, self.spread)
         return axes, np.clip(1 - relative / 2, 0.0, 1 - 1e-6)
+
+
+def bias_basis(points_mm: Array, origin_mm: Array, reach_mm: Array, terms: int) -> Array:
+    """Return the terms (..., B) of an error of the calibration at points (..., 3) of the rig frame.
+
+    origin_mm, reach_mm : (3,) origin and scale. terms : B, which is 1, 4 or 10, see `PairModel`.
+    """
+    scaled = (points_mm - origin_mm) / reach_mm
+    x, y, z = np.moveaxis(np.clip(scaled, -1.5, 1.5), -1, 0)
+    every = [np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
+    return np.stack(every[:terms], -1)
 
 
 class Finding(Enum):
@@ -409,6 +413,11 @@ class PairModel:
     findings: tuple[Finding, ...] = ()
 
     @property
+    def gap_rms_px(self) -> float:
+        """Return the RMS of the gaps as they are."""
+        return self.rms_px[0]
+
+    @property
     def calibration_problem(self) -> bool:
         """Return whether the gaps have a systematic part beyond chance and beyond half a pixel."""
         return bool({Finding.CALIBRATION_OFFSET, Finding.OFFSET_VARIES} & set(self.findings))
@@ -418,10 +427,8 @@ class PairModel:
 
         terms : number B of terms (1, 4 or 10); None takes that of this model.
         """
-        scaled = (points_mm - self.origin_mm) / self.reach_mm
-        x, y, z = np.moveaxis(np.clip(scaled, -1.5, 1.5), -1, 0)
-        every = [np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
-        return np.stack(every[: len(self.bias_px) if terms is None else terms], -1)
+        count = len(self.bias_px) if terms is None else terms
+        return bias_basis(points_mm, self.origin_mm, self.reach_mm, count)
 
     def bias(self, points_mm: Array) -> tuple[Array, Array]:
         """Return the systematic distance (...) in px between the two images of one point along the
@@ -475,20 +482,11 @@ class PairModel:
         ]
 
 
-SAFE_LOG_ODDS = 3.0
-"""Posterior log odds (20 to 1) below which a pair is ambiguous."""
-
 _WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-6, 0.02, 0.05
 _IMPOSSIBLE, _IMPOSSIBLE_SIGMA = 0.15, 10.0
 _UNKNOWN_SIZE = 2.0
 """Log odds against a pair with a bubble that is cut or merged: its partner is often unseen."""
 _RARE, _FREEDOM = 2.5, 6.0
-
-_COMBINATIONS_AT_ONCE = 50_000
-
-_SEEN = 0.95
-_NEW_SHARE = 0.1
-_TRACK_SIZE_SD = 0.1
 
 
 @dataclass(frozen=True)
@@ -507,175 +505,7 @@ class Prediction:
     d_eq_mm: Array
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Hold the E possible pairs of one frame, of N1 first and N2 second detections.
-
-    views : all detections of both cameras.
-    mm_per_px : length of one pixel of the gap (mm), the median over all combinations.
-    rows : (E, 2) rows of the pairs in both views.
-    gap_px, variance_px2 : (E,) gaps less the model's bias, and their variances.
-    appearance : (E,) log odds from everything but the gaps and the tracks.
-    points_mm, variance_mm2 : (E, 3) points midway between the rays, and (E,) their variance in
-        every direction.
-    log_radius : (E,) mean logarithm of the radius in both views (mm); NaN if unknown.
-    log_height_ratio : (E,) logarithm of the height in the first view over that in the second; NaN
-        if unknown.
-    """
-
-    views: tuple[View, View]
-    mm_per_px: float
-    rows: Ints
-    gap_px: Array
-    variance_px2: Array
-    appearance: Array
-    points_mm: Array
-    variance_mm2: Array
-    log_radius: Array
-    log_height_ratio: Array
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def matrix(self, values: Array | Ints, elsewhere: float) -> Array:
-        """Return (N1, N2) the values (E,) of the pairs, and another one for all other rows."""
-        out = np.full([len(view) for view in self.views], elsewhere)
-        out[self.rows[:, 0], self.rows[:, 1]] = values
-        return out
-
-
-@dataclass(frozen=True)
-class Matches:
-    """Hold the M pairs of one frame.
-
-    candidate : (M,) positions of the pairs among the frame's `Candidates`.
-    first, second : (M,) positions of the pair's rows in the two detection tables, from 0.
-    confidence : (M,) posterior probability of the pair.
-    gap_px, gap_sigma : (M,) mismatch along the shared axis, first minus second, after the model's
-        bias and the frame's common shift are subtracted; in px of the first image, and in standard
-        deviations.
-    height_ratio : (M,) height (mm) in the first view divided by that in the second; NaN if unknown.
-    ambiguous : (M,) whether the pair's posterior log odds are below ``SAFE_LOG_ODDS``.
-    frame_shift_px : the shift that all gaps of this frame share, in px of the first image.
-    """
-
-    candidate: Ints
-    first: Ints
-    second: Ints
-    confidence: Array
-    gap_px: Array
-    gap_sigma: Array
-    height_ratio: Array
-    ambiguous: Bools
-    frame_shift_px: float
-
-    def __len__(self) -> int:
-        return len(self.first)
-
-
-def match_pairs(
-    first: pd.DataFrame,
-    second: pd.DataFrame,
-    cameras: tuple[Camera, Camera],
-    model: PairModel,
-    *,
-    predicted: Prediction | None = None,
-) -> Matches:
-    """Find the pairs among the detections of one frame.
-
-    first, second : tables of `detect_bubbles` for the first and the second camera. Their row labels
-        are not used; the result contains positions.
-    cameras : the two calibrated cameras.
-    model : result of `estimate_pair_model` or `default_model`.
-    predicted : where tracks are expected; None if there are no tracks.
-
-    Raises InputError for tables without centres or covariances and for parallel cameras.
-    """
-    axis = shared_axis(cameras)
-    views = (view_of(first, cameras[0], axis), view_of(second, cameras[1], axis))
-    (found,) = candidates(views, np.array([[len(view) for view in views]]), model)
-    return match_candidates(found, model, predicted)
-
-
-def candidates(views: tuple[View, View], counts: Ints, model: PairModel) -> list[Candidates]:
-    """Return the possible pairs of F frames, whose detections follow each other in the views.
-
-    counts : (F, 2) number of detections in each frame and view.
-
-    A gap may be twice as large as that of a pair, because all gaps of a frame shift together.
-    """
-    out: list[Candidates] = []
-    starts, combinations = np.cumsum(counts, axis=0) - counts, counts.prod(1)
-    while len(out) < len(counts):
-        first = len(out)
-        some = np.searchsorted(np.cumsum(combinations[first:]), _COMBINATIONS_AT_ONCE)
-        frames = np.arange(first, min(first + max(int(some), 1), len(counts)))
-        out += _candidates(views, starts[frames], counts[frames], model)
-    return out
-
-
-def _candidates(
-    views: tuple[View, View], starts: Ints, counts: Ints, model: PairModel
-) -> list[Candidates]:
-    from telerig.estimator.bubbles.pairing import kernels
-
-    many = counts.prod(1)
-    ends = np.cumsum([0, *many])
-    frame = np.repeat(np.arange(len(many)), many)
-    rows = np.stack(np.divmod(np.arange(ends[-1]) - ends[frame], counts[frame, 1]), -1)
-    every = compared(*(v.of(i) for v, i in zip(views, (starts[frame] + rows).T)))
-    gap, variance = _unbiased(every, model)
-    limit2 = (2 * kernels.GATE_SIGMA) ** 2 * (variance + model.frame_px**2 + kernels.MOST_TAIL_PX2)
-    kept = np.flatnonzero(gap**2 < limit2)
-    near = every.of(kept)
-    odds = appearance_log_odds(near, model, counts[frame[kept]])
-    first, second = near.views
-    trace = sum(np.trace(v.covariance_px2, axis1=1, axis2=2) for v in near.views)
-    variance_px2 = model.scatter_px**2 + 0.25 * trace + model.frame_px**2
-    sine2 = 1 - (first.direction * second.direction).sum(-1) ** 2
-    arrays: tuple[Any, ...] = (
-        rows[kept], gap[kept], variance[kept], odds, near.points_mm,
-        variance_px2 * near.mm_per_px**2 / sine2,
-        0.25 * (first.log_size + second.log_size).sum(-1), near.size[:, 0],
-    )  # fmt: skip
-    cuts, out = np.searchsorted(kept, ends).tolist(), []
-    for f, ((low, high), (start, stop)) in enumerate(zip(pairwise(ends.tolist()), pairwise(cuts))):
-        both = [v.of(slice(s, s + n)) for v, s, n in zip(views, starts[f], counts[f])]
-        length = float(np.median(every.mm_per_px[low:high])) if high > low else 0.0
-        out.append(Candidates((both[0], both[1]), length, *(a[start:stop] for a in arrays)))
-    return out
-
-
-def match_candidates(
-    found: Candidates, model: PairModel, predicted: Prediction | None = None
-) -> Matches:
-    """Find the pairs among the possible ones of a frame, as `match_pairs` does."""
-    from telerig.estimator.bubbles.pairing import kernels
-
-    odds = found.appearance
-    if predicted is not None and len(predicted.ids) and len(found):
-        odds = odds + track_log_odds(found, model, predicted)
-    total, shift, uncertainty = kernels.common_shift(
-        found.matrix(found.gap_px, np.inf), found.matrix(found.variance_px2, 1.0),
-        found.matrix(odds, 0.0), model.frame_px, model.span_px, NEGLIGIBLE,
-    )  # fmt: skip
-    rows = best_assignment(total)
-    confidence = marginals(total)[rows]
-    at = found.matrix(np.arange(len(found)), -1)[rows].astype(np.int64)
-    gap = found.gap_px[at] - shift
-    return Matches(
-        at,
-        *rows,
-        confidence,
-        gap,
-        gap / np.sqrt(found.variance_px2[at] + uncertainty),
-        np.exp(found.log_height_ratio[at]),
-        confidence < (1 - confidence) * np.exp(SAFE_LOG_ODDS),
-        shift,
-    )
-
-
-def _unbiased(geometry: PairGeometry, model: PairModel) -> tuple[Array, Array]:
+def unbiased(geometry: PairGeometry, model: PairModel) -> tuple[Array, Array]:
     """Return gaps (px) less the model's bias, and their variances (px^2)."""
     bias, variance = model.bias(geometry.points_mm)
     own = geometry.variance_px2 + variance + (model.scatter_px * geometry.scatter_factor) ** 2
@@ -693,24 +523,23 @@ def common_shift(geometry: PairGeometry, model: PairModel) -> tuple[Array, float
     """
     from telerig.estimator.bubbles.pairing import kernels
 
+    counts = np.array(geometry.gap_px.shape)
+    appearance = appearance_log_odds(geometry, model)
+    appearance += prior_log_odds(counts, model.unmatched_share)
+    rows = np.stack(np.unravel_index(np.arange(appearance.size), appearance.shape), -1)
+    gap, variance = unbiased(geometry, model)
     odds, shift, _ = kernels.common_shift(
-        *_unbiased(geometry, model),
-        appearance_log_odds(geometry, model, np.array(geometry.gap_px.shape)),
-        model.frame_px,
-        model.span_px,
-        NEGLIGIBLE,
-    )
-    return odds, shift
+        gap.ravel(), variance.ravel(), appearance.ravel(), rows, counts, model.frame_px,
+        model.span_px, NEGLIGIBLE,
+    )  # fmt: skip
+    return odds.reshape(appearance.shape), shift
 
 
-def appearance_log_odds(geometry: PairGeometry, model: PairModel, counts: Ints) -> Array:
-    """Return the log odds (...) of pairs from everything but the gap.
+def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
+    """Return the log odds (...) of pairs from height, width and contrast.
 
-    They come from height, width, contrast and the number of detections. If two heights differ by
-    more than any measurement error, the pair is excluded; for flagged detections this limit is
-    twice as large.
-
-    counts : (..., 2) or (2,) number of detections in the views of the frame.
+    If two heights differ by more than any measurement error, the pair is excluded; for flagged
+    detections this limit is twice as large.
     """
     from telerig.estimator.bubbles.pairing import kernels
 
@@ -718,7 +547,6 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel, counts: Ints) 
     flagged = geometry.scatter_factor > 1
     wrong = np.where(flagged, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
     odds = _ratio_log_odds(model.size, geometry.size, first.log_size + second.log_size, wrong)
-    odds = odds + _prior_log_odds(counts, model.unmatched_share)
     apart = np.abs(geometry.size[..., 0] - model.size.difference[0])
     limit = max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
     odds[apart > np.where(flagged, 2 * limit, limit)] = kernels.NEVER
@@ -728,7 +556,7 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel, counts: Ints) 
     return odds + _ratio_log_odds(model.contrast, geometry.contrast, contrasts, wrong)
 
 
-def _prior_log_odds(counts: Ints, unmatched: tuple[float, float]) -> Array:
+def prior_log_odds(counts: Ints, unmatched: tuple[float, float]) -> Array:
     """Return the prior log odds of a pair in a frame.
 
     counts : (..., 2) detections of the frame in both views.
@@ -756,63 +584,3 @@ def _ratio_log_odds(expected: LogRatioModel, ratio: Array, total: Array, wrong: 
     total = (total - expected.means.sum(0)).reshape(-1, many)
     odds = kernels.ratio_log_odds(ratio, total, axes, alike, wrong.ravel(), _RARE, _FREEDOM)
     return np.asarray(odds.reshape(wrong.shape))
-
-
-def track_log_odds(found: Candidates, model: PairModel, predicted: Prediction) -> Array:
-    """Return the log odds (E,) that the predicted tracks add.
-
-    Without tracks pairs lie anywhere in the volume that both cameras see. With them most lie where
-    a track is expected (both pixels at once, through the point in space), and so do the
-    detections of bubbles that only one camera found; one track cannot be the unmatched detection
-    of both cameras.
-    """
-    cameras = (found.views[0].camera, found.views[1].camera)
-    points = np.asarray(predicted.points_mm, float)
-    expected = _track_density(found, model, predicted, points) / len(points)
-    expected = (1 - _NEW_SHARE) * _SEEN**2 * expected + _NEW_SHARE
-    seen = stacked_jacobian(cameras, points)
-    first, second = (
-        _unmatched_density(found.views[c], model, predicted, seen, c)[found.rows[:, c]]
-        for c in range(2)
-    )
-    alone = (1 + first.sum(1)) * (1 + second.sum(1)) - (first * second).sum(1)
-    return np.asarray(np.log(expected) - np.log(alone))
-
-
-def _track_density(
-    found: Candidates, model: PairModel, predicted: Prediction, points_mm: Array
-) -> Array:
-    """Return the density (E,) of a pair's point and size at the tracks, relative to anywhere."""
-    from telerig.estimator.bubbles.pairing import kernels
-
-    variances, axes = np.linalg.eigh(predicted.covariance_mm2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_expected = np.log(np.asarray(predicted.d_eq_mm, float) / 2)
-    population = float(np.sqrt(model.size.spread.mean()))
-    sd = min(_TRACK_SIZE_SD, population)
-    density = kernels.track_density(
-        found.points_mm, found.variance_mm2, found.log_radius, points_mm, variances, axes,
-        log_expected, sd, population / sd,
-    )  # fmt: skip
-    widths = [min(v.camera.image_size_px) / v.camera["scale_px_per_mm"] for v in found.views]
-    return np.asarray(density * (widths[0] * widths[1] * model.span_px * found.mm_per_px))
-
-
-def _unmatched_density(
-    view: View, model: PairModel, predicted: Prediction, seen: tuple[Array, Array], c: int
-) -> Array:
-    """Return the density (N, K) of detections of tracks that only this camera sees, relative.
-
-    seen : the tracks' pixels (K, 4) in both cameras, and their derivatives (K, 4, 3).
-    """
-    from telerig.estimator.bubbles.pairing import kernels
-
-    pixels, jacobian = (values[:, 2 * c : 2 * c + 2] for values in seen)
-    spread = jacobian @ predicted.covariance_mm2 @ np.swapaxes(jacobian, 1, 2)
-    common = model.scatter_px**2 + model.frame_px**2 + model.bias_px[0] ** 2 / 4
-    density = kernels.pixel_density(
-        view.uv_px, view.covariance_px2, pixels, spread + common * np.eye(2)
-    )
-    width, height = view.camera.image_size_px
-    usual = max(len(view) * model.unmatched_share[c], 1e-3)
-    return np.asarray(_SEEN * (1 - _SEEN) * density * width * height / usual)

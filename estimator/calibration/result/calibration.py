@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -359,7 +360,7 @@ class Calibration(ShortText):
                 "sigma_px is not of the two cameras whose pixels are given",
                 todo=f"give one value for both, or one for each of {names}",
             )
-        two = self if len(self.cameras) == 2 else self.pair(0, 1)
+        two = self if len(self.cameras) == 2 else self.subset(0, 1)
         pair = (two.cameras[0], two.cameras[1])
         found = triangulate(pair, (uv_first_px, uv_second_px), sigma, method)
         if not include_calibration:
@@ -469,36 +470,38 @@ class Calibration(ShortText):
         covariance[placed] += self.common_covariance(points[placed], information[placed])
         return replace(found, covariance_mm2=covariance.reshape(found.covariance_mm2.shape))
 
-    def pair(self, first: str | int, second: str | int) -> Calibration:
-        """Return the calibration of two of the cameras (names or indices), in the same rig frame.
+    def subset(self, *cameras: str | int) -> Calibration:
+        """Return the calibration of some of the cameras (names or indices), in the same rig frame.
 
-        The pose of the first of the two is taken as exact: its uncertainty moves all triangulated
+        The pose of the first of them is taken as exact: its uncertainty moves all triangulated
         points in the same way (an S-transformation of the gauge). Raises CalibrationError if a
-        camera does not exist, or if the two are not in the order of `rig.toml`.
+        camera does not exist, or if they are not in the order of `rig.toml`.
         """
-        cameras = [self.camera(first), self.camera(second)]
-        a, b = (self.cameras.index(camera) for camera in cameras)
-        if a >= b:
+        chosen = tuple(self.camera(camera) for camera in cameras)
+        at = [self.cameras.index(camera) for camera in chosen]
+        if not at or any(b <= a for a, b in pairwise(at)):
             raise CalibrationError(
-                f"cameras {cameras[0].name!r} and {cameras[1].name!r} are no pair in this order",
-                todo="name two cameras, in the order of rig.toml",
+                f"the cameras {', '.join(c.name for c in chosen)} are not in the rig's order",
+                todo="name each camera once, in the order of rig.toml",
             )
-        names = [f"{self.cameras[c].name}.{p}" for c in (a, b) for p in self.free[c]]
-        poses = [f"{cameras[1].name}.{p}" for p in POSE_COMPONENTS]
-        rows = np.zeros((len(names) + 6, len(self.covariance_names)))
+        names = [f"{self.cameras[c].name}.{p}" for c in at for p in self.free[c]]
+        names += [f"{camera.name}.{p}" for camera in chosen[1:] for p in POSE_COMPONENTS]
+        rows = np.zeros((len(names), len(self.covariance_names)))
         index = {name: i for i, name in enumerate(self.covariance_names)}
-        for row, name in enumerate([*names, *poses]):
+        for row, name in enumerate(names):
             rows[row, index[name]] = 1.0
-        if a > 0:  # T_b Exp(x_b) seen from T_a Exp(x_a): x_b - Ad(b_from_a) x_a
-            b_from_a = cameras[1].camera_from_rig @ cameras[0].rig_from_camera
-            own = [index[f"{cameras[0].name}.{p}"] for p in POSE_COMPONENTS]
-            rows[-6:, own] = -b_from_a.adjoint()
+        if at[0] > 0:  # T_b Exp(x_b) seen from T_a Exp(x_a): x_b - Ad(b_from_a) x_a
+            own = [index[f"{chosen[0].name}.{p}"] for p in POSE_COMPONENTS]
+            for k, camera in enumerate(chosen[1:]):
+                first = len(rows) - 6 * (len(chosen) - 1 - k)
+                b_from_a = camera.camera_from_rig @ chosen[0].rig_from_camera
+                rows[first : first + 6, own] = -b_from_a.adjoint()
         return replace(
             self,
-            cameras=(cameras[0], cameras[1]),
-            free=(self.free[a], self.free[b]),
+            cameras=chosen,
+            free=tuple(self.free[c] for c in at),
             covariance=rows @ self.covariance @ rows.T,
-            covariance_names=(*names, *poses),
+            covariance_names=tuple(names),
             joint_names=(),
             joint_covariance=np.zeros((0, 0)),
         )
@@ -656,17 +659,16 @@ def load_calibration(path: str | Path) -> Calibration:
     )
 
 
-def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
-    """Return the calibration of the two cameras that recorded a run, by their names.
+def of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
+    """Return the calibration of the cameras that recorded a run, by their names.
 
-    The calibration is returned unchanged if it has fewer than three cameras, or if ``names`` are
-    not two of its cameras; `check_calibration` then reports the error.
+    The calibration is returned unchanged if ``names`` are not two or more of its cameras;
+    `check_calibration` then reports the error.
     """
     known = [camera.name for camera in calibration.cameras]
-    if len(known) < 3 or len(names) != 2 or not set(names) <= set(known):
+    if len(names) < 2 or len(names) >= len(known) or not set(names) <= set(known):
         return calibration
-    first, second = sorted(names, key=known.index)
-    return calibration.pair(first, second)
+    return calibration.subset(*sorted(set(names), key=known.index))
 
 
 def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:

@@ -411,7 +411,10 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
             todo="number the bubbles in detections.csv and track them again",
         )
     values = np.stack([numbers(table[column], "tracks", column) for column in needed], -1)
-    bad = ~np.isfinite(values).all(1)
+    seen = values[:, 5:].reshape(len(values), len(cameras), -1)
+    # a camera that does not see the bubble has no number in the row
+    bad = ~np.isfinite(values[:, :5]).all(1) | (np.isnan(seen).all(-1).sum(1) > len(cameras) - 2)
+    bad |= ~(np.isfinite(seen) | np.isnan(seen).all(-1, keepdims=True)).all((1, 2))
     if bad.any():
         raise InputError(
             f"{int(bad.sum())} rows hold values that are not finite, the first is row "
@@ -459,16 +462,18 @@ def _times(table: pd.DataFrame, last: int, frame_times_s: Array | None) -> Array
 def _paired(
     table: pd.DataFrame, index: int, camera: str, number: dict[int, int]
 ) -> tuple[Any, ...]:
-    """Return detections of pairs, corrected to the projected centre of volume where it is known."""
+    """Return one camera's detections of bubbles that several see, corrected to the projected centre
+    of volume where it is known."""
     columns = [f"{camera}_{c}" for c in _PIXELS]
     values = table[columns].to_numpy(float)
     shift = [f"{camera}_du_px", f"{camera}_dv_px"]
     uv = values[:, :2].copy()
     if all(c in table for c in shift):
         uv += np.nan_to_num(table[shift].to_numpy(float))
-    item = table["particle"].map(number).to_numpy(np.int64)
-    frame = table["frame"].to_numpy(np.int64)
-    return item, frame, np.full(len(table), index), uv, _covariance(values)
+    seen = np.isfinite(values).all(1)
+    item = table["particle"].map(number).to_numpy(np.int64)[seen]
+    frame = table["frame"].to_numpy(np.int64)[seen]
+    return item, frame, np.full(len(item), index), uv[seen], _covariance(values[seen])
 
 
 def _single(

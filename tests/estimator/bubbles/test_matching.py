@@ -5,25 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from matching_scenes import frame, recall_and_precision, rig, table, truth
+from matching_scenes import frame, match_pairs, recall_and_precision, rig, table, truth
 from places import REAL
 
 from telerig.errors import InputError
+from telerig.estimator.bubbles.pairing.groups import best_groups
 from telerig.estimator.bubbles.pairing.learning import default_model, estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import (
     Finding,
     Prediction,
-    best_assignment,
-    match_pairs,
 )
 
 PAIR = REAL / "bubble_pair"
 
 
 def test_what_has_no_good_partner_is_left_out() -> None:
-    rows, columns = best_assignment(np.array([[3.0, 2.9], [2.8, -4.0], [-1.0, -2.0]]))
-    assert list(zip(rows.tolist(), columns.tolist())) == [(0, 1), (1, 0)]
-    assert len(best_assignment(-np.ones((2, 3)))[0]) == 0
+    rows = np.array([[0, 0], [0, 1], [1, 0], [1, 1], [2, 0], [2, 1]])
+    found = best_groups(np.array([3.0, 2.9, 2.8, -4.0, -1.0, -2.0]), rows)
+    assert rows[found].tolist() == [[0, 1], [1, 0]]
+    assert len(best_groups(-np.ones(6), rows)) == 0
 
 
 # Pairs
@@ -112,7 +112,7 @@ def test_cameras_that_shake_against_each_other() -> None:
     assert Finding.CAMERA_SHAKE in model.findings
     pairs = [match_pairs(a, b, rig(), model) for a, b in frames]
     assert min(recall_and_precision(frames, pairs)) >= 0.98
-    found = np.array([p.frame_shift_px for p in pairs]) + model.bias_px[0]
+    found = np.array([p.frame_shift_px[0] for p in pairs]) + model.bias_px[0]
     np.testing.assert_allclose(found, shifts, atol=0.2)
 
 
@@ -121,14 +121,14 @@ def test_two_alike_at_one_height_are_never_a_silent_guess() -> None:
     points = np.array([[-5.0, 3.0, 8.0], [9.0, 3.0, -4.0], [0.0, -9.0, 0.0]])
     tables = [table(c.project(points)) for c in cameras]
     pairs = match_pairs(tables[0], tables[1], cameras, default_model(cameras))
-    assert pairs.first.tolist() == [0, 1, 2] and pairs.second[2] == 2
+    assert pairs.rows[:, 0].tolist() == [0, 1, 2] and pairs.rows[:, 1][2] == 2
     assert ((pairs.confidence[:2] > 0.4) & (pairs.confidence[:2] < 0.51)).all()
     assert pairs.ambiguous.tolist() == [True, True, False] and pairs.confidence[2] > 0.95
     track = Prediction(
         np.array([7, 8]), points[:2], np.tile(0.04 * np.eye(3), (2, 1, 1)), np.full(2, 1.6)
     )
     known = match_pairs(tables[0], tables[1], cameras, default_model(cameras), predicted=track)
-    np.testing.assert_array_equal(known.first, known.second)
+    np.testing.assert_array_equal(known.rows[:, 0], known.rows[:, 1])
     assert (known.confidence > 0.95).all() and not known.ambiguous.any()
 
 
@@ -139,7 +139,7 @@ def test_size_and_contrast_decide_where_the_gap_cannot() -> None:
     frames = [frame(np.random.default_rng(i))[0] for i in range(5)]
     model = estimate_pair_model(frames, cameras)
     pairs = match_pairs(tables[0], tables[1], cameras, model)
-    np.testing.assert_array_equal(pairs.first, pairs.second)
+    np.testing.assert_array_equal(pairs.rows[:, 0], pairs.rows[:, 1])
     assert not pairs.ambiguous.any()
     np.testing.assert_allclose(pairs.height_ratio, 1, atol=1e-9)
     cut = [t.assign(flags="border") for t in tables]
@@ -163,7 +163,7 @@ def test_the_order_of_rows_does_not_matter() -> None:
     one = match_pairs(first, second, rig(), model)
     order = rng.permutation(len(second))
     two = match_pairs(first, second.iloc[order], rig(), model)
-    np.testing.assert_array_equal(order[two.second], one.second)
+    np.testing.assert_array_equal(order[two.rows[:, 1]], one.rows[:, 1])
     np.testing.assert_allclose(two.confidence, one.confidence, rtol=1e-9)
 
 
@@ -218,7 +218,7 @@ def test_the_real_pairs_listed_circles() -> None:
         tables.append(table(uv, np.stack([radius, radius], -1), 0.2))
     model = estimate_pair_model([(tables[0], tables[1])], cameras)
     pairs = match_pairs(tables[0], tables[1], cameras, model)
-    found = [o[i] for o, i in zip(order, (pairs.first, pairs.second))]
+    found = [o[i] for o, i in zip(order, (pairs.rows[:, 0], pairs.rows[:, 1]))]
     same = set(found[0][found[0] == found[1]].tolist())
     unsound = {4, 12, 13, 25, 26}
     assert len(same - unsound) >= 30 and not same & unsound

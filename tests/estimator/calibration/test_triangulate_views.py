@@ -120,22 +120,22 @@ def test_a_camera_that_is_not_named_has_seen_nothing() -> None:
     uv = {c.name: c.project(points) for c in calibration.cameras}
     two = calibration.triangulate({"left": uv["left"], "right": uv["right"]}, sigma_px=0.1)
     assert np.isnan(two.ray_miss_mm[:, 1]).all() and two.seen_by.tolist() == [2] * 7
-    pair = calibration.pair("left", "right").triangulate(uv["left"], uv["right"], sigma_px=0.1)
+    pair = calibration.subset("left", "right").triangulate(uv["left"], uv["right"], sigma_px=0.1)
     np.testing.assert_allclose(two.covariance_mm2, pair.covariance_mm2, rtol=1e-8)
     first = calibration.triangulate(uv["left"], uv["middle"], sigma_px=0.1)
-    same = calibration.pair(0, 1).triangulate(uv["left"], uv["middle"], sigma_px=0.1)
+    same = calibration.subset(0, 1).triangulate(uv["left"], uv["middle"], sigma_px=0.1)
     np.testing.assert_array_equal(first.covariance_mm2, same.covariance_mm2)
 
 
 def test_a_pair_without_the_first_camera_rides_on_its_own_first() -> None:
     calibration = calibrated(3)
-    pair = calibration.pair("middle", "right")
+    pair = calibration.subset("middle", "right")
     assert pair.covariance_names[-6] == "right.rx_rad" and len(pair.covariance_names) == 2 + 6
     points = np.array([[3.0, -4.0, 5.0], [-6.0, 2.0, 1.0]])
     pixels = [c.project(points) for c in pair.cameras]
 
     def seen(calibration: Calibration) -> Any:
-        rider = calibration.pair("middle", "right")
+        rider = calibration.subset("middle", "right")
         return rider.triangulate(*pixels, sigma_px=0.1, include_calibration=False).points_mm
 
     def back(calibration_: Calibration) -> Any:
@@ -161,7 +161,7 @@ def test_what_cannot_be_triangulated_says_why() -> None:
         calibration.triangulate({"left": uv, "up": uv})
     with pytest.raises(InputError, match="sigma_px lacks right"):
         calibration.triangulate({"left": uv, "right": uv}, sigma_px={"left": 0.1})
-    with pytest.raises(CalibrationError, match="no pair in this order"):
-        calibration.pair("right", "left")
+    with pytest.raises(CalibrationError, match="not in the rig's order"):
+        calibration.subset("right", "left")
     with pytest.raises(CalibrationError, match="one camera cannot triangulate"):
         calibration_from_cameras(cameras(1)).triangulate(uv, uv)

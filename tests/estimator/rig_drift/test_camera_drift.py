@@ -300,12 +300,13 @@ def test_words_say_it_once() -> None:
     still.add(Run().tracks(cameras, cameras, rng))
     findings = (Finding.CALIBRATION_OFFSET, Finding.UNCLEAR_OFFSET)
     model = replace(default_model(cameras), findings=findings)
-    said = with_change(model, pairs.found(), known)
+    models = {(0, 1): model}
+    said = with_change(models, pairs.found(), known)
     assert said["calibration_problem"]
     assert said["words"][:-1] == model.sentences(without=findings[:1]) and len(said["words"]) == 3
     assert "'right' has moved against 'left'" in said["words"][-1]
     assert "--refine-rig" in said["words"][-1] and "positions are wrong" in said["words"][-1]
-    assert with_change(model, still.found(), known)["words"] == model.sentences()
+    assert with_change(models, still.found(), known)["words"] == model.sentences()
     assert PairCollector(known).found() is None
 
 

@@ -164,7 +164,7 @@ def test_a_correction_is_that_of_a_whole_tracking_and_repeats_none_of_it(
     assert CliRunner().invoke(app, command).exit_code == 0
     before = contents(results)
     with monkeypatch.context() as patch:
-        for name in ("make_scene", "detect_missing", "estimate_pair_model", "_linked"):
+        for name in ("make_scene", "detect_missing", "learn_rig", "_linked"):
             patch.setattr(track_module, name, lambda *_, **__: pytest.fail("repeated"))
         code, said = correct(run, "split", "0", "5", "--from", "6", "--reason", "a, b <c>")
         assert code == 0, said

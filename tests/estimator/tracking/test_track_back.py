@@ -13,6 +13,7 @@ from seeds import few_or_many
 
 import telerig
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
+from telerig.estimator.bubbles.pairing.groups import RigModel
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
@@ -27,7 +28,8 @@ Array = NDArray[np.float64]
 CAMERAS = tuple(true_cameras(run_preset("swarm").calibration).values())
 FRAMES, DT_S, NOISE_PX, SHAKE_PX = 28, 0.002, 0.05, 1.0
 FRONT, BACK = 0, 1
-MODEL = replace(default_model(CAMERAS), frame_px=SHAKE_PX * 2**0.5)
+PAIR = replace(default_model(CAMERAS), frame_px=SHAKE_PX * 2**0.5)
+MODEL = RigModel.of(CAMERAS, {(0, 1): PAIR})
 DIAMETERS_MM = np.array([3.6, 2.0, 2.4, 1.8, 2.8, 3.1])
 START_MM = np.array(
     [[0.0, 9.0, 0.0], [3.2, 9.4, 0.3], [-12, 3, 8], [14, -4, -9], [-9, -8, -12], [10, 12, 12]]
@@ -73,7 +75,7 @@ def linked(
     rng = np.random.default_rng(seed)
     truth, shake = paths(rng), rng.normal(0, SHAKE_PX, (FRAMES, 2, 2))
     shapes = Shapes(third=1e-3, fourth=1e-3)
-    linker = RowMaker(CAMERAS, MODEL, Tracker(CAMERAS), shapes, np.array([0.0, -1.0, 0.0]))
+    linker = RowMaker(MODEL, Tracker(CAMERAS), shapes, np.array([0.0, -1.0, 0.0]))
     for frame in range(FRAMES):
         tables = []
         for camera in (0, 1):

@@ -1,4 +1,4 @@
-"""Runs of a rig of three cameras: tracked and smoothed with the two that `[tracking]` names."""
+"""Runs of a rig of three cameras: tracked and smoothed with all, or with those that are named."""
 
 from __future__ import annotations
 
@@ -81,14 +81,18 @@ def test_a_run_takes_the_two_cameras_that_tracking_names(rise: Path, tmp_path: P
     assert any("of left, middle, right, the run is that of cameras left, right" in n for n in notes)
 
 
-def test_by_default_the_first_two_are_tracked(rise: Path, tmp_path: Path) -> None:
-    data = load_run(with_third(rise, tmp_path / "rig", ""))
-    assert data.cameras == ("left", "middle")
-    assert set(data.detections["camera"]) == {"left", "middle"}
+def test_by_default_all_that_saw_bubbles_are_tracked(rise: Path, tmp_path: Path) -> None:
+    run = with_third(rise, tmp_path / "rig", "")
+    assert load_run(run).cameras == ("left", "middle", "right")
+    table = pd.read_csv(run / "detections.csv")
+    table[table["camera"] != "middle"].to_csv(run / "detections.csv", index=False)
+    data = load_run(run)
+    assert data.cameras == ("left", "right")
+    assert set(data.detections["camera"]) == {"left", "right"}
 
 
 def test_detections_of_none_of_the_two_are_refused(rise: Path, tmp_path: Path) -> None:
-    run = with_third(rise, tmp_path / "rig", "")
+    run = with_third(rise, tmp_path / "rig", '[tracking]\ncameras = ["left", "middle"]\n')
     table = pd.read_csv(run / "detections.csv")
     table[table["camera"] == "right"].to_csv(run / "detections.csv", index=False)
     with pytest.raises(InputError, match="no row of the cameras left, middle"):
@@ -110,10 +114,65 @@ def test_a_pair_without_the_first_camera(tmp_path: Path) -> None:
     assert run.cameras == ("middle", "right")
     tracks = telerig.track(run, calibration)
     assert len(tracks.table) == 20
-    pair = calibration.pair("middle", "right")
+    pair = calibration.subset("middle", "right")
     uv = [tracks.table[[f"{c}_u_px", f"{c}_v_px"]].to_numpy(float) for c in run.cameras]
     found = pair.triangulate(*uv, sigma_px=0.1)
     assert np.abs(found.points_mm - tracks.table[["x_mm", "y_mm", "z_mm"]]).to_numpy().max() < 0.5
     smoothed = telerig.smooth(tracks, calibration, stage=run, model="default")
     assert len(smoothed.trajectories) == 20
     assert {"middle_y_mm", "right_y_mm"} <= set(smoothed.shake)
+
+
+@pytest.fixture(scope="module")
+def swarm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]:
+    folder = tmp_path_factory.mktemp("swarm") / "three"
+    config = run_preset("three", frames=24, bubbles=10)
+    data = simulate(config, rng=np.random.default_rng(5), out=folder, images=False)
+    truth = json.loads((folder / "truth" / "truth.json").read_text())
+    known = calibration_from_cameras(true_cameras(truth))
+    return next((data.path / "runs").iterdir()), replace(known, findings=())
+
+
+def test_a_camera_that_is_gone_for_a_while_loses_no_track(
+    swarm: tuple[Path, Calibration], tmp_path: Path
+) -> None:
+    run, calibration = swarm
+    whole = telerig.track(load_run(run), calibration)
+    copy = Path(shutil.copytree(run.parents[1], tmp_path / "set")) / "runs" / run.name
+    table = pd.read_csv(copy / "detections.csv")
+    gone = (table["camera"] == "middle") & table["frame"].between(8, 15)
+    table[~gone].to_csv(copy / "detections.csv", index=False)
+    tracks = telerig.track(load_run(copy), calibration)
+    assert tracks.table["particle"].nunique() == whole.table["particle"].nunique()
+    assert not set(tracks.events["kind"]) & {"break", "gap"}
+    known = tracks.table["frame"].between(8, 15)
+    middle = tracks.table[[f"middle_{x}" for x in ("u_px", "v_px", "suu_px2", "du_px")]]
+    assert middle[known].isna().all(axis=None) and not middle[~known].isna().all(1).all()
+    others = tracks.table[["left_u_px", "right_u_px", "ray_miss_mm", "x_mm"]]
+    assert np.isfinite(others[known].to_numpy()).all()
+    joined = tracks.table.merge(whole.table, on=["frame", "particle"], suffixes=("", "_whole"))
+    assert len(joined) > 0.97 * len(whole.table)
+    off = joined[["x_mm", "y_mm", "z_mm"]].to_numpy()
+    off = off - joined[["x_mm_whole", "y_mm_whole", "z_mm_whole"]].to_numpy()
+    # the shake of the camera that is gone, 1 px, is in the points of all others
+    assert np.abs(off[joined["frame"].between(8, 15)]).max() < 0.2
+    assert np.abs(off[~joined["frame"].between(8, 15)]).max() < 1e-9
+    smoothed = telerig.smooth(tracks, calibration, stage=load_run(copy), model="default")
+    assert {"left_y_mm", "middle_y_mm", "right_y_mm"} <= set(smoothed.shake)
+
+
+def test_rows_say_which_cameras_see_a_bubble(swarm: tuple[Path, Calibration]) -> None:
+    run, calibration = swarm
+    tracks = telerig.track(load_run(run), calibration)
+    names = [camera.name for camera in calibration.cameras]
+    seen = tracks.table[[f"{name}_u_px" for name in names]].notna()
+    assert seen.sum(1).min() >= 2 and (seen.sum(1) == 3).mean() > 0.6
+    of_tracks = tracks.detections.dropna(subset=["particle"])
+    for name in names:
+        own = tracks.table.loc[seen[f"{name}_u_px"], ["frame", "particle", f"{name}_u_px"]]
+        there = of_tracks[of_tracks["camera"] == name]
+        joined = own.merge(there, on=["frame", "particle"])
+        assert len(joined) == len(own)
+        assert (joined[f"{name}_u_px"] == joined["u_px"]).all()
+    counted = tracks.summary["detections"] - int(seen.to_numpy().sum())
+    assert tracks.summary["detections_without_partner_or_track"] == counted

@@ -98,13 +98,15 @@ def test_defaults_of_the_target() -> None:
     )  # fmt: skip
 
 
-def test_three_cameras_and_the_two_that_are_tracked(tmp_path: Path) -> None:
+def test_three_cameras_and_those_that_are_tracked(tmp_path: Path) -> None:
     third = "[cameras.top]\nimage_size_px = [8, 8]\nscale_px_per_mm = 1.0\n[stereo]\n"
     text = changed("[stereo]", third + "top_from_left_rotvec_deg = [-90.0, 0.0, 0.0]")
     rig = parse(text)
     assert rig.others == ("right", "top")
     assert rig.rotvec_from_first_deg == {"right": (0, 90, 0), "top": (-90, 0, 0)}
-    assert rig.tracking is None and rig.tracking_cameras == ("left", "right")
+    assert rig.tracking is None and rig.tracking_cameras == ("left", "right", "top")
+    three = parse(text + '[tracking]\ncameras = ["top", "right", "left"]\n')
+    assert three.tracking == ("left", "right", "top")
     rig = parse(text + '[tracking]\ncameras = ["top", "left"]\n')
     assert rig.tracking_cameras == ("left", "top")
     write_rig_toml(rig, tmp_path / "rig.toml")

@@ -153,7 +153,7 @@ def test_a_third_camera_under_a_wrong_key() -> None:
     [
         ('["left", "rihgt"]', "did you mean right"),
         ('["left", "left"]', "names 'left' twice"),
-        ('["left"]', "the names of two cameras"),
+        ('["left"]', "the names of cameras"),
     ],
 )
 def test_the_cameras_of_tracking(cameras: str, words: str) -> None:

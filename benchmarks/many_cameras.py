@@ -1,0 +1,208 @@
+"""Tracking with three and four cameras, beside the best two of them.
+
+Usage: python benchmarks/many_cameras.py [--only NAME ...] [--out FOLDER]
+
+Simulated swarms with rendered images (presets `three` and `four`, exact calibrations): bubbles are
+detected once, and the same detections are tracked by all cameras and by the pair whose lines of
+sight are nearest to a right angle. Both are scored by the bubbles that two cameras or more see
+whole. `results/many_cameras.json` keeps each scene, `results/many_cameras.md` has the tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent))
+from guard_parts.product import exact_calibration, run_preset
+
+import telerig
+
+Array = NDArray[np.float64]
+RESULTS = Path(__file__).parent / "results"
+NEAR_PX = 3.0
+SCENES: dict[str, dict[str, Any]] = {
+    "three cameras, 20 bubbles": {"preset": "three", "bubbles": 20, "frames": 12},
+    "three cameras, 60 bubbles": {"preset": "three", "bubbles": 60, "frames": 8},
+    "four cameras, 20 bubbles": {"preset": "four", "bubbles": 20, "frames": 12},
+    "four cameras, 60 bubbles": {"preset": "four", "bubbles": 60, "frames": 8},
+    "crossings: three, 60 bubbles, 4 % covered":
+        {"preset": "three", "bubbles": 60, "frames": 16, "d_eq_mm": (0.8, 2.0)},
+    "three cameras, one gone for 50 of 100 frames":
+        {"preset": "three", "bubbles": 20, "frames": 100, "gone": (25, 75)},
+}  # fmt: skip
+
+
+def scene(folder: Path, given: dict[str, Any]) -> list[dict[str, Any]]:
+    """Simulate, track and score; one record for each set of cameras."""
+    config = run_preset(given["preset"], frames=given["frames"], bubbles=given["bubbles"])
+    if "d_eq_mm" in given:
+        config = replace(config, bubble=replace(config.bubble, d_eq_mm=given["d_eq_mm"]))
+    images = "gone" not in given
+    data = telerig.simulate(config, rng=np.random.default_rng(7), out=folder / "set", images=images)
+    (name,) = data.runs
+    run = data.runs[name].path
+    truth = json.loads((data.path / "truth" / "truth.json").read_text(encoding="utf-8"))
+    calibration = exact_calibration(truth)
+    true = pd.read_csv(data.path / "truth" / "runs" / name / "bubbles.csv")
+    cameras = [camera.name for camera in calibration.cameras]
+    sets: list[tuple[str, list[str], Path]] = []
+    if images:
+        found = telerig.track(telerig.load_run(run), calibration).detections
+        bare = found.drop(columns=["particle", "reason"], errors="ignore")
+        bare[bare["u_px"].notna()].to_csv(run / "detections.csv", index=False)
+        pair = right_angle(calibration)
+        sets = [("all", cameras, run), (" and ".join(pair), pair, run)]
+    else:
+        first, end = given["gone"]
+        copy = Path(shutil.copytree(data.path, folder / "gone"))
+        table = pd.read_csv(run / "detections.csv")
+        gone = (table["camera"] == cameras[1]) & table["frame"].between(first, end - 1)
+        table[~gone].to_csv(copy / "runs" / name / "detections.csv", index=False)
+        sets = [("all", cameras, run), (f"{cameras[1]} gone", cameras, copy / "runs" / name)]
+    out = []
+    for label, names, place in sets:
+        begun = time.process_time()
+        source = telerig.load_run(place, source="detections", cameras=names)
+        tracks = telerig.track(source, calibration)
+        spent = time.process_time() - begun
+        own = scores(tracks, true, names, cameras)
+        out.append({"cameras": label, **own, "cpu_s": spent})
+    return out
+
+
+def right_angle(calibration: Any) -> list[str]:
+    """The two cameras whose lines of sight are nearest to a right angle."""
+    views = [(c.name, c.camera_from_rig.rotation[2]) for c in calibration.cameras]
+    best = min(combinations(views, 2), key=lambda pair: abs(float(pair[0][1] @ pair[1][1])))
+    return [name for name, _ in best]
+
+
+def scores(tracks: Any, true: pd.DataFrame, names: list[str], cameras: list[str]) -> dict[str, Any]:
+    """Compare tracks by the cameras ``names`` with the truth of all ``cameras``."""
+    table = tracks.table
+    at, there = (pixels(t, names) for t in (table, true))
+    chosen = np.full(len(table), -1)
+    rows_of = true.groupby("frame").indices
+    for i, frame in enumerate(table["frame"]):
+        rows = rows_of.get(frame, np.zeros(0, int))
+        off = np.nanmax(np.linalg.norm(there[rows] - at[i], axis=-1), axis=1)
+        if len(rows) and np.nanmin(off) < NEAR_PX:
+            chosen[i] = rows[np.nanargmin(off)]
+    shows = chosen >= 0
+    right = shows & ~pd.Series(chosen).duplicated().to_numpy()
+    in_view = (true[[f"{c}_whole" for c in cameras]].sum(axis=1) >= 2).to_numpy()
+    by_these = (true[[f"{c}_whole" for c in names]].sum(axis=1) >= 2).to_numpy()
+    hit = np.zeros(len(true), bool)
+    hit[chosen[right]] = True
+    bubble = true.iloc[chosen[right]].reset_index(drop=True)
+    mine = table[right].reset_index(drop=True)
+    # a bubble's path between its first and its last point: how many tracks it is in
+    parts = mine["particle"].groupby(bubble["particle"]).nunique()
+    swaps = sum(int((np.diff(own) != 0).sum())
+                for _, own in bubble["particle"].groupby(mine["particle"]))  # fmt: skip
+    shift = np.nan_to_num(pixels(mine, names, "{c}_d{x}_px"))
+    off_px = (pixels(mine, names) + shift) - pixels(bubble, names)
+    sd_px = np.sqrt(pixels(mine, names, "{c}_s{x}{x}_px2"))
+    error = (
+        mine[["x_mm", "y_mm", "z_mm"]].to_numpy()
+        - bubble[["x_rig_mm", "y_rig_mm", "z_rig_mm"]].to_numpy()
+    )
+    # the shake of the cameras moves all points of a frame that the same cameras see
+    seen = np.isfinite(pixels(mine, names)[..., 0])
+    group = mine["frame"].to_numpy() * 16 + seen @ (1 << np.arange(len(names)))
+    _, index, many = np.unique(group, return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(index, e) for e in error.T], -1) / many[:, None]
+    free = many[index] > 3
+    own = (error - mean[index])[free] * np.sqrt(many / np.maximum(many - 1, 1))[index][free, None]
+    names_of = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "sxy_mm2", "syy_mm2", "syz_mm2",
+                "sxz_mm2", "syz_mm2", "szz_mm2"]  # fmt: skip
+    spread = mine[names_of].to_numpy().reshape(-1, 3, 3)[free]
+    nees = np.einsum("ni,nij,nj->n", own, np.linalg.inv(spread), own) / 3
+    sd = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 3)
+    return {
+        "bubbles in view": int(in_view.sum()),
+        "seen by these": int(by_these.sum()),
+        "recall": float(hit[in_view].mean()),
+        "recall of what these see": float(hit[by_these].mean()),
+        "precision": float(right.mean()),
+        "swaps": swaps,
+        "breaks": int((tracks.events["kind"] == "break").sum()),
+        "tracks": int(table["particle"].nunique()),
+        "bubbles in two tracks": int((parts > 1).sum()),
+        "pixel error": float(np.sqrt(np.nanmean(off_px**2))),
+        "pixel NEES": float(np.nanmean((off_px / sd_px) ** 2)),
+        "error": float(1e3 * np.sqrt(np.mean(own**2))),
+        "median error": float(1e3 * np.median(np.sqrt(np.mean(own**2, axis=1)))),
+        "stated sd": float(1e3 * np.sqrt(np.mean(sd**2))),
+        "NEES": float(np.mean(nees)),
+        "median of NEES": float(np.median(nees) / 0.789),
+    }
+
+
+def pixels(table: pd.DataFrame, names: list[str], pattern: str = "{c}_{x}_px") -> Array:
+    """Return (N, C, 2) from a table's columns."""
+    columns = [pattern.format(c=c, x=x) for c in names for x in "uv"]
+    return table[columns].to_numpy(float).reshape(len(table), len(names), 2)
+
+
+def page(records: dict[str, list[dict[str, Any]]]) -> str:
+    lines = [
+        "# Three and four cameras", "", "Made by `python benchmarks/many_cameras.py`.", "",
+        "Recall is of the bubbles that two of all cameras or more see whole, so a pair is charged",
+        "with those that only others see; the next column is of those that the cameras of the row",
+        "see. Errors in space are per coordinate, less what all points of a frame share that the",
+        "same cameras see (they shake by 1 px); NEES by the stated covariance, as a mean and",
+        "as a median over that of chi-square. CPU is that of tracking detections that are there.",
+        "",
+        "| scene | cameras | bubbles in view | recall | of what these see | precision | swaps | breaks | tracks | "
+        "bubbles in two tracks | pixel error (px) | NEES | error (µm), median | stated sd (µm) | NEES, median | CPU (s) |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name in SCENES:
+        for r in records.get(name, []):
+            lines.append(
+                f"| {name} | {r['cameras']} | {r['bubbles in view']} | {r['recall']:.4f} | "
+                f"{r['recall of what these see']:.4f} | {r['precision']:.4f} | {r['swaps']} | "
+                f"{r['breaks']} | {r['tracks']} | {r['bubbles in two tracks']} | "
+                f"{r['pixel error']:.3f} | {r['pixel NEES']:.2f} | {r['error']:.1f}, "
+                f"{r['median error']:.2f} | {r['stated sd']:.2f} | {r['NEES']:.2f}, "
+                f"{r['median of NEES']:.2f} | {r['cpu_s']:.0f} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    kept = options.out / "many_cameras.json"
+    records = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
+    for name, given in SCENES.items():
+        if options.only and not any(word in name for word in options.only):
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            records[name] = scene(Path(folder), given)
+        for record in records[name]:
+            print(name, record, flush=True)
+        kept.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        (options.out / "many_cameras.md").write_text(page(records), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

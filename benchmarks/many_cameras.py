@@ -167,9 +167,10 @@ def page(records: dict[str, list[dict[str, Any]]]) -> str:
         "same cameras see (they shake by 1 px); NEES by the stated covariance, as a mean and",
         "as a median over that of chi-square. CPU is that of tracking detections that are there.",
         "",
-        "| scene | cameras | bubbles in view | recall | of what these see | precision | swaps | breaks | tracks | "
-        "bubbles in two tracks | pixel error (px) | NEES | error (µm), median | stated sd (µm) | NEES, median | CPU (s) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| scene | cameras | bubbles in view | recall | of what these see | precision | swaps | "
+        "breaks | tracks | bubbles in two tracks | pixel error (px) | NEES | error (µm), median | "
+        "stated sd (µm) | NEES, median | CPU (s) |",
+        "|---" * 16 + "|",
     ]  # fmt: skip
     for name in SCENES:
         for r in records.get(name, []):

@@ -7,17 +7,5 @@ CALIBRATIONS = (
     "three",
 )  # fmt: skip
 RUNS = (
-    "rise",
-    "swarm",
-    "crossing",
-    "forces",
-    "three",
-    "four",
-    "S0",
-    "S1",
-    "S2",
-    "S3",
-    "S4",
-    "S5",
-    "S6",
-)
+    "rise", "swarm", "three", "four", "crossing", "forces", "S0", "S1", "S2", "S3", "S4", "S5", "S6",
+)  # fmt: skip

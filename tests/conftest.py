@@ -20,6 +20,7 @@ import pytest
 from batch_dataset import make_results
 from made_once import made_once
 from run_files import LEFT, RIG, RIGHT, write_images
+from undrawn_pages import undrawn_pages
 
 import telerig
 from telerig.estimator.calibration import self_calibration
@@ -220,6 +221,13 @@ def known_low_passes() -> Iterator[None]:
     known = Inertia((0.01,) * 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(accelerations, "learned_low_passes", lambda *_: LowPasses(known, known))
+        yield
+
+
+@pytest.fixture(scope="module")
+def undrawn() -> Iterator[None]:
+    """Pages of this module are written without their drawings, which take seconds."""
+    with undrawn_pages():
         yield
 
 

@@ -17,11 +17,13 @@ import cv2
 import docs_pages
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import telerig
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
+from telerig.scripts.main import app
 
 ROOT = docs_pages.ROOT
 PAGES = [
@@ -195,11 +197,8 @@ def test_pages_build_without_a_warning(tmp_path: Path) -> None:
     [("record", "[until Ctrl-C]"), ("batch", "[one per core]"), ("record", "[devices.NAME]")],
 )
 def test_help_keeps_what_stands_in_brackets(command: str, words: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "telerig.scripts.main", command, "--help"],
-        text=True, capture_output=True, timeout=60, env={**os.environ, "COLUMNS": "160"},
-    )  # fmt: skip
-    assert words in done.stdout
+    done = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "160"})
+    assert words in done.output
 
 
 def test_each_parameter_of_a_public_docstring_begins_a_line() -> None:

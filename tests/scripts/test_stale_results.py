@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from telerig.scripts.main import app
 
-pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
+pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes", "undrawn")
 
 
 def telerig(*words: object) -> tuple[int, str]:

@@ -18,7 +18,7 @@ from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
 from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
 from telerig.scripts.main import app
 
-pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
+pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes", "undrawn")
 
 RESULTS = ["calibration/calibration.json", "rise/tracks.csv", "rise/trajectories.csv"]
 

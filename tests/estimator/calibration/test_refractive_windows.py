@@ -49,7 +49,7 @@ from telerig.rig.projection import turned_wall
 from telerig.rig.windows import Wall
 from telerig.scripts.main import app
 
-pytestmark = pytest.mark.usefixtures("without_advice")
+pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from telerig.io.dataset.run import load_run
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.scripts.main import app
 
-pytestmark = pytest.mark.usefixtures("without_advice")
+pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
 
 
 @pytest.fixture(scope="module")

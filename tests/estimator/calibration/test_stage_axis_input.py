@@ -24,7 +24,7 @@ from telerig.io.simulation.calibration_files import view_image
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
-pytestmark = pytest.mark.usefixtures("without_advice")
+pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
 
 AXIS = np.array([0.01, -1.0, 0.02]) / np.linalg.norm([0.01, -1.0, 0.02])
 TURN = rotation_from_rotvec([0.1, -0.7, 0.05])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import pytest
+from collections.abc import Iterator
 
-from telerig.io.report.page.figures import Picture
-from telerig.io.report.run import report
+import pytest
+from undrawn_pages import undrawn_pages
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page's words without its drawings, which take seconds."""
-    blank = Picture("", "data:,", "")
-    monkeypatch.setattr(report, "drawn_over_cores", lambda drawings: [blank] * len(drawings))
+def undrawn() -> Iterator[None]:
+    """The pages of one test without their drawings, which others of its module need."""
+    with undrawn_pages():
+        yield

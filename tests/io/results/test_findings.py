@@ -22,7 +22,7 @@ from telerig.io.report.calibration.report import write_calibration_report
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.findings import Code, Finding, Status, objections, verdict_of
 
-pytestmark = pytest.mark.usefixtures("without_advice")
+pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
 
 DOCS = Path(__file__).parents[3] / "docs"
 MISSING_MANIFEST = "ignore:.*there is no manifest.json"

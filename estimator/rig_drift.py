@@ -27,12 +27,14 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.bubbles.pairing.matching import Finding, nearly_parallel
+from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.triangulation import (
+    LEAST_SINE,
     POSE_COMPONENTS,
     midpoint,
+    nearly_parallel,
     rig_jacobian,
     stacked_jacobian,
 )
@@ -334,7 +336,6 @@ prior one."""
 
 _GRID = 0.7
 _SINGULAR = 1e-10
-_LEAST_SINE = 0.05
 
 
 @dataclass(frozen=True)
@@ -444,7 +445,7 @@ def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
     rays = [c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2) for c in cameras]
     cross = np.cross(rays[0][1], rays[1][1])[0]
     sine = float(np.linalg.norm(cross))
-    if sine < _LEAST_SINE:
+    if sine < LEAST_SINE:
         raise CalibrationError(
             "both cameras have the same line of sight",
             todo="a movement can be found only between cameras with different lines of sight",

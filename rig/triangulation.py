@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     import xarray
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
+LEAST_SINE = 0.05
+"""Of the angle between two lines of sight that show a depth."""
 VOLUME_SHARE = 0.6
 """Edge of the working volume, as a share of the smallest field of view of the cameras."""
 _STEPS = 20
@@ -313,6 +315,12 @@ def _check_count(sigmas: tuple[ArrayLike, ...], cameras: int) -> None:
             f"{len(sigmas)} entries of sigma_px for {cameras} cameras",
             todo="give one number, or a tuple with one entry for each camera",
         )
+
+
+def nearly_parallel(cameras: Sequence[Camera]) -> bool:
+    """Return whether two cameras look along nearly the same line, so that they show no depth."""
+    first, second = (camera.camera_from_rig.rotation[2] for camera in cameras)
+    return bool(np.linalg.norm(np.cross(first, second)) < LEAST_SINE)
 
 
 def triangulate_any(

@@ -48,7 +48,7 @@ def report(
     A folder of results (calibration.json, tracking.json or batch.json) gives its report.html, a
     dataset gives those of its calibration and all its runs. With --film each run also gets
     film/path.mp4 and film/path.gif, its path in space turned once about the vertical, and
-    film/views.mp4 and film/views.gif, the images of both cameras with the detected bubbles.
+    film/views.mp4 and film/views.gif, the images of all cameras with the detected bubbles.
 
     Exit code 0: written. 2: the input cannot be used. 130: interrupted.
     """

@@ -12,6 +12,7 @@ which is the sum of the squares of what each bubble adds.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import stacked_jacobian
+from telerig.rig.triangulation import nearly_parallel, stacked_jacobian
 
 _SAMPLES = 2**15
 _EDGE_PX = 2.5
@@ -42,13 +43,13 @@ def swarm_numbers(
     carriage_mm : (F,) position of the stage in each frame.
     axis : (3,) direction of its travel.
     up : (3,) unit vector against gravity.
-    cameras : the two cameras of the run.
+    cameras : those of the run, two or more.
 
     The result is empty where no shape is known; "left_out" counts bubbles that hardly fit the
     images, or whose shape is not known.
     """
     shapes = bodies[bodies["aspect"].notna()].groupby("particle")
-    if len(cameras) != 2 or not len(shapes) or not len(trajectories):
+    if len(cameras) < 2 or not len(shapes) or not len(trajectories):
         return {}
     sight = _Sight(cameras)
     frames, left_out, rows = len(carriage_mm), 0, []
@@ -107,31 +108,39 @@ def _sums(rows: Array) -> dict[str, float]:
 
 
 class _Sight:
-    """Where bubbles are seen whole by both cameras; volumes by quasi-random points."""
+    """Where bubbles are seen whole by two cameras or more; volumes by quasi-random points."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         from scipy.stats import qmc
 
-        self.cameras = (cameras[0], cameras[1])
+        self.cameras = tuple(cameras)
         self.size = np.concatenate([np.array(c.image_size_px, float) for c in cameras])
-        _, jacobian = stacked_jacobian(self.cameras, np.zeros((1, 3)))
+        pixel, jacobian = stacked_jacobian(self.cameras, np.zeros((1, 3)))
         self.jacobian = jacobian[0]
-        # a box of rig axes that holds all that both cameras see
-        middle = (self.size - 1) / 2
-        pixel, _ = stacked_jacobian(self.cameras, np.zeros((1, 3)))
-        centre = np.linalg.lstsq(self.jacobian, middle - pixel[0], rcond=None)[0]
-        reach = 1.1 * np.abs(np.linalg.pinv(self.jacobian)) @ self.size / 2 + 1e-9
+        # a box of rig axes that holds all that two cameras see
+        ends = []
+        for pair in combinations(range(len(cameras)), 2):
+            if nearly_parallel((cameras[pair[0]], cameras[pair[1]])):
+                continue
+            rows = [2 * c + i for c in pair for i in range(2)]
+            inverse = np.linalg.pinv(self.jacobian[rows])
+            middle = inverse @ ((self.size - 1) / 2 - pixel[0])[rows]
+            far = 1.1 * np.abs(inverse) @ self.size[rows] / 2 + 1e-9
+            ends.append((middle - far, middle + far))
+        low, high = np.min([e[0] for e in ends], 0), np.max([e[1] for e in ends], 0)
+        centre, reach = (low + high) / 2, (high - low) / 2
         self.box_mm3 = float(np.prod(2 * reach))
         points = centre + reach * (2 * qmc.Halton(3, scramble=False).random(_SAMPLES) - 1)
         self.pixels, _ = stacked_jacobian(self.cameras, points)
 
     def _whole(self, pixels: Array, extents_px: Array) -> Array:
         margin = extents_px + _EDGE_PX
-        return np.asarray(((pixels >= margin) & (pixels <= self.size - 1 - margin)).all(-1))
+        inside = (pixels >= margin) & (pixels <= self.size - 1 - margin)
+        return np.asarray(inside.reshape(*inside.shape[:-1], -1, 2).all(-1).sum(-1) >= 2)
 
     def volume_mm3(self, moments: Array) -> tuple[float, Array]:
         """Volume in which the centre of a body of moments A A^T (3, 3) may lie, and the half widths
-        (4,) of its outlines in px."""
+        (2 C,) of its outlines in px."""
         extents = np.sqrt(np.einsum("ki,ij,kj->k", self.jacobian, moments, self.jacobian))
         return self.box_mm3 * float(self._whole(self.pixels, extents).mean()), extents
 

@@ -246,7 +246,7 @@ def check_tracks(table: Any, calibration: Calibration) -> list[Finding]:
                 "run again "
                 "with this calibration",
             )
-    if len(calibration.cameras) != 2 or not len(table):
+    if len(calibration.cameras) < 2 or not len(table):
         return []
     off = _off_px(table, calibration)
     if off < _DIFFERENT_PX:
@@ -268,17 +268,19 @@ def _off_px(table: Any, calibration: Calibration) -> float:
     some = np.unique(np.linspace(0, len(table) - 1, min(len(table), _SAMPLED)).astype(int))
     rows = table.iloc[some]
     points = rows[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-    uv = []
+    uv = {}
     for camera in calibration.cameras:
         pixels = rows[[f"{camera.name}_u_px", f"{camera.name}_v_px"]].to_numpy(float)
         shift = [f"{camera.name}_du_px", f"{camera.name}_dv_px"]
         if all(c in rows for c in shift):
             pixels = pixels + np.nan_to_num(rows[shift].to_numpy(float))
-        uv.append(pixels)
-    good = np.isfinite(points).all(1) & np.isfinite(np.hstack(uv)).all(1)
+        uv[camera.name] = pixels
+    seen = np.sum([np.isfinite(pixels).all(1) for pixels in uv.values()], axis=0)
+    good = np.isfinite(points).all(1) & (seen >= 2)
     if not good.any():
         return 0.0
-    again = calibration.triangulate(uv[0][good], uv[1][good], include_calibration=False).points_mm
+    pixels_of = {name: pixels[good] for name, pixels in uv.items()}
+    again = calibration.triangulate(pixels_of, include_calibration=False).points_mm
     distance = [
         np.linalg.norm(c.project(again) - c.project(points[good]), axis=-1)
         for c in calibration.cameras

@@ -36,13 +36,13 @@ from telerig.estimator.bubbles.pairing.matching import (
     bias_basis,
     common_shift,
     marginals,
-    nearly_parallel,
     pair_geometry,
     prior_log_odds,
     shared_axis,
     views_of,
 )
 from telerig.rig.camera import Camera
+from telerig.rig.triangulation import nearly_parallel
 from telerig.statistics import robust_sd
 
 MOST_FRAMES = 60

@@ -39,7 +39,7 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
 )
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import cross, midpoint
+from telerig.rig.triangulation import cross, midpoint, nearly_parallel
 
 NO_SIZE_FLAGS = ("border", "merged")
 _SCATTER_FACTOR = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
@@ -47,7 +47,6 @@ _UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
 """By flag, the standard deviation that a partly hidden outline adds to the centre, as a share of
 the major semi-axis."""
 _OUTLINE_SAMPLES = 96
-_LEAST_SINE = 0.05
 
 
 @dataclass(frozen=True)
@@ -136,12 +135,6 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
         )
     in_first = (cameras[0].camera_from_rig.rotation @ perpendicular)[:2]
     return np.asarray(perpendicular / length * np.sign(in_first[np.argmax(np.abs(in_first))]))
-
-
-def nearly_parallel(cameras: tuple[Camera, Camera]) -> bool:
-    """Return whether two cameras look along nearly the same line, so that they show no depth."""
-    first, second = (c.camera_from_rig.rotation[2] for c in cameras)
-    return bool(np.linalg.norm(np.cross(first, second)) < _LEAST_SINE)
 
 
 def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:

@@ -1,4 +1,4 @@
-"""The films of a run: its path in space, and the images of both cameras where they are at hand."""
+"""The films of a run: its path in space, and the images of all cameras where they are at hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The film of both cameras' images side by side, with outlines, numbers and tails drawn in."""
+"""The film of all cameras' images side by side, with outlines, numbers and tails drawn in."""
 
 from __future__ import annotations
 

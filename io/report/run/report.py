@@ -77,7 +77,7 @@ def write_track_report(
 def render(
     results: TrackResults,
     smoothing: SmoothingResults | None = None,
-    rig: tuple[tuple[Camera, Camera] | None, str] = (None, ""),
+    rig: tuple[tuple[Camera, ...] | None, str] = (None, ""),
     outdated: Sequence[str] = (),
     page_folder: Path | None = None,
 ) -> str:
@@ -85,7 +85,7 @@ def render(
 
     results : of the tracking.
     smoothing : None for a page without it.
-    rig : the two cameras and "", or None and the reason why they are not known.
+    rig : the cameras and "", or None and the reason why they are not known.
     outdated : the results that are older than their inputs, in words, from `stale`.
     page_folder : where the page will lie; None for the results folder.
     """
@@ -150,7 +150,7 @@ def _rows(content: Mapping[str, Any], file: str) -> list[tuple[str, str]]:
 def _pictures(
     results: TrackResults,
     smoothing: SmoothingResults | None,
-    cameras: tuple[Camera, Camera] | None,
+    cameras: tuple[Camera, ...] | None,
 ) -> dict[str, Any]:
     every = range(len(results.cameras))
     drawings: list[tuple[str, Callable[[], Any]]] = [

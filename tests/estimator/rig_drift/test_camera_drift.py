@@ -36,7 +36,7 @@ from telerig.estimator.smoothing.problem.problem import RigMode, ShakeModel
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import triangulate, triangulate_views
 
 Array = NDArray[np.float64]
 Pair = tuple[Camera, Camera]
@@ -308,6 +308,40 @@ def test_words_say_it_once() -> None:
     assert "--refine-rig" in said["words"][-1] and "positions are wrong" in said["words"][-1]
     assert with_change(models, still.found(), known)["words"] == model.sentences()
     assert PairCollector(known).found() is None
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_of_three_cameras_the_one_that_moved_is_named(which: int) -> None:
+    config = run_preset("three").calibration
+    cameras = tuple(true_cameras(config).values())
+    names = tuple(f"{c.name}.{n.split('.')[1]}" for c in cameras[1:] for n in NAMES)
+    covariance = np.diag(np.tile(np.repeat(np.square((2e-5, 5e-4)), 3), 2))
+    known = Calibration(
+        cameras, np.zeros(0, np.int64), np.zeros((0, 3)), {}, covariance, names, ((), (), ())
+    )
+    true = list(cameras)
+    up = np.array([0.0, 0.0, 0.0, 0.0, 0.08, 0.0])  # 0.08 mm along y
+    pose = moved_pose(cameras[which].camera_from_rig.inverse(), up)
+    true[which] = replace(cameras[which], camera_from_rig=pose.inverse())
+    rng, t = np.random.default_rng(which), np.arange(300) / 100.0
+    points = np.stack([8 * np.cos(11 * t), 5 * (t - t.mean()), 8 * np.sin(11 * t)], -1)
+    uv = [c.project(points) + 0.1 * rng.standard_normal((300, 2)) for c in true]
+    uv[0][::3] = np.nan  # the first camera misses every third frame
+    found = triangulate_views(cameras, uv, 0.1)
+    table = pd.DataFrame({"frame": np.arange(300), "particle": 0, "t_s": t})
+    table[["x_mm", "y_mm", "z_mm"]] = found.points_mm
+    table["ray_miss_mm"] = np.sqrt(np.nanmean(found.ray_miss_mm**2, axis=1))
+    for camera, pixels in zip(cameras, uv):
+        table[[f"{camera.name}_u_px", f"{camera.name}_v_px"]] = pixels
+        table[[f"{camera.name}_d{x}_px" for x in "uv"]] = 0.0
+        table[[f"{camera.name}_s{x}_px2" for x in ("uu", "uv", "vv")]] = [0.01, 0.0, 0.01]
+    pairs = PairCollector(known)
+    pairs.add(table)
+    change = pairs.found()
+    assert change is not None and change.moved
+    assert change.culprit == cameras[which].name
+    assert abs(change.values[0]) == pytest.approx(0.08, abs=4 * change.sigmas[0])
+    assert cameras[which].name in {change.camera, change.against}
 
 
 def test_a_long_run_is_collected_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,8 +75,9 @@ def bubbles_in_time(results: TrackResults) -> Picture:
         sheet.axes.set_ylim(0, None)
     empty = int(np.sum(counts["both"] == 0))
     caption = (
-        "The black line should follow the lower of the cameras' lines: what lies above it has no "
-        f"partner or track. {number(empty)} of {number(frames)} frames have no bubble in space."
+        "The black line should follow the second highest of the cameras' lines: what lies above it "
+        "has no partner or track. "
+        f"{number(empty)} of {number(frames)} frames have no bubble in space."
     )
     if width > 1:
         caption += f" Each step is the mean of {width} frames."
@@ -130,7 +131,7 @@ def confidence(results: TrackResults) -> Picture:
     """Draw the histogram of the probability that two outlines belong to one bubble."""
     values = results.tracks["confidence"].to_numpy(float)
     settings: dict[str, Any] = {
-        "xlabel": "confidence of the pair",
+        "xlabel": "confidence",
         "ylabel": "points",
         "xlim": (0, 1),
     }
@@ -141,11 +142,11 @@ def confidence(results: TrackResults) -> Picture:
         sheet.axes.set_ylim(0, 3 * max(float(sheet.axes.get_ylim()[1]), 1.0))
     low = int(np.sum(values < 0.9))
     caption = (
-        "Probability that the two outlines belong to the same bubble, on a logarithmic axis of "
-        "counts. "
+        "Probability that these outlines and no others belong to the bubble, on a logarithmic "
+        "axis of counts. "
         f"{number(low)} of {number(len(values))} points ({share(low, len(values))}) lie below 0.9."
     )
-    return Picture("Confidence of the pairs", sheet.source, caption)
+    return Picture("Confidence", sheet.source, caption)
 
 
 def _edges(values: Array, high: float = 1.0) -> Array:
@@ -211,9 +212,10 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
     miss = 1e3 * results.tracks["ray_miss_mm"].to_numpy(float)
     sd, learnt = _predicted_um(results), 1e3 * (learnt_sd_mm(results) or 0.0)
     known = miss[np.isfinite(miss)]
-    spread = _reach(known, sd)
-    edges = np.linspace(-spread, spread, _MISS_BINS + 1)
-    settings: dict[str, Any] = {"xlim": (-spread, spread), "yticks": []}
+    spread, signed = _reach(known, sd), len(results.cameras) == 2
+    known = known if signed else np.abs(known)
+    edges = np.linspace(-spread if signed else 0.0, spread, _MISS_BINS + 1)
+    settings: dict[str, Any] = {"xlim": (edges[0], spread), "yticks": []}
     settings |= {"xlabel": "ray miss / µm", "ylabel": "density"}
     with drawing(2.9, legend="above", **settings) as sheet:
         axes = sheet.axes
@@ -221,7 +223,7 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
         share_of = count / max(len(known), 1) / np.diff(edges)
         axes.stairs(share_of, edges, color=camera_colour(0), fill=True, alpha=0.5, label="measured")
         top = float(share_of.max(initial=0.0))
-        if sd is not None:
+        if sd is not None and signed:
             curve = _mixture(edges, sd)
             axes.plot(*curve, color="black", linewidth=1.2, label="noise of the outlines")
             top = max(top, min(2 * top, float(curve[1].max())))
@@ -235,6 +237,12 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
     caption = f"Mean {number(mean, 2)} µm, RMS {number(rms(known), 2)} µm. "
     if sd is None:
         caption += "There are too few points to say what the outlines' noise predicts."
+    elif not signed:
+        predicted = number(rms(sd), 2)
+        caption += (
+            f"The outlines' noise predicts {predicted} µm RMS; more is shake, shape or wrong "
+            "groups. It is the RMS distance of the point from the rays of the cameras that see it."
+        )
     else:
         caption += (
             f"The outlines' noise predicts the black curve (sd {number(median(sd), 2)} µm): a "
@@ -356,4 +364,6 @@ def shared_pictures(results: TrackResults) -> list[Any]:
     The height is the first: an error of the angle between the cameras or of a scale shows there.
     """
     across = [i for i in range(3) if abs(results.up[i]) < 0.5]
+    if len(results.cameras) > 2:  # their ray miss has no sign
+        return []
     return [(results.up, "height"), *((np.eye(3)[i], "xyz"[i]) for i in across)]

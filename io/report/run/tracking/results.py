@@ -31,7 +31,7 @@ from telerig.io.results.tracking import (
     tracks_columns,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import midpoint
+from telerig.rig.triangulation import triangulate_views
 
 _FILES = (
     "tracking.json", "tracks.csv", "detections.csv", "events.csv", "references.csv", "run.json"
@@ -190,9 +190,17 @@ def ray_miss_sd_mm(results: TrackResults) -> Array | None:
     variance = np.zeros(len(results.tracks))
     for camera, per_px in zip(results.cameras, worth):
         columns = [f"{camera}_{name}" for name in ("suu_px2", "suv_px2", "svv_px2")]
-        uu, uv, vv = results.tracks[columns].to_numpy(float).T
+        uu, uv, vv = np.nan_to_num(results.tracks[columns].to_numpy(float)).T
         variance += per_px[0] ** 2 * uu + 2 * per_px[0] * per_px[1] * uv + per_px[1] ** 2 * vv
+    if len(results.cameras) > 2:  # of n rays the deviations have 2 n - 3 degrees of freedom
+        many = views(results)
+        variance *= np.where(many > 2, (2 * many - 3) / np.maximum(many, 1) ** 2, 1.0)
     return np.sqrt(np.where(variance > 0, variance, np.nan))
+
+
+def views(results: TrackResults) -> Ints:
+    """Return how many cameras (N,) see the bubble of each row."""
+    return np.asarray(results.tracks[[f"{c}_u_px" for c in results.cameras]].notna().sum(axis=1))
 
 
 def learnt_sd_mm(results: TrackResults) -> float | None:
@@ -209,11 +217,15 @@ def learnt_sd_mm(results: TrackResults) -> float | None:
 
 
 def _mm_per_px(results: TrackResults) -> Array | None:
-    """Return by camera what one px of u and v moves a ray along the common perpendicular."""
+    """Return by camera what one px of u and v moves a ray along the common perpendicular; of more
+    than two cameras in any direction across the ray."""
     maps = [_affine(results, camera) for camera in results.cameras]
     known = [m for m in maps if m is not None]
-    if len(known) != 2:
+    if len(known) != len(maps) or len(known) < 2:
         return None
+    if len(known) > 2:
+        scale = [float(np.linalg.det(m @ m.T)) ** 0.25 for m in known]
+        return np.repeat(np.sqrt(0.5) / np.array(scale)[:, None], 2, axis=1)
     first, second = (np.cross(m[0], m[1]) for m in known)
     across = np.cross(first, second)
     length = np.linalg.norm(across)
@@ -246,6 +258,12 @@ def ray_miss_ratio(
     if predicted_mm is None:
         return None
     miss = results.tracks["ray_miss_mm"].to_numpy(float)
+    if len(results.cameras) > 2:
+        from scipy.special import chdtri
+
+        free = np.maximum(2 * views(results) - 3, 1)
+        predicted_mm = predicted_mm * np.sqrt(chdtri(free, 0.5) / free) / NORMAL_MEDIAN
+    centred &= len(results.cameras) == 2
     units = np.abs(miss - (median(miss) or 0.0 if centred else 0.0)) / predicted_mm
     units = units[np.isfinite(units)]
     return float(np.median(units)) / NORMAL_MEDIAN if len(units) else None
@@ -289,8 +307,8 @@ def track_lengths(results: TrackResults) -> Ints:
 _AGREE_MM, _NEAR_MM = 1e-4, 0.02
 
 
-def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Camera] | None, str]:
-    """Return the two cameras, or None and the reason in words.
+def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, ...] | None, str]:
+    """Return the cameras, or None and the reason in words.
 
     calibration.json is looked for in the run's results folder and in `calibration/` beside it.
     It counts only if the rays of the pixels in tracks.csv meet where that table says, so another
@@ -306,39 +324,41 @@ def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Came
     with reading(file.parent, [file.name]):
         stated = CalibrationFile.read(file)
     known = {camera.name: camera for camera in stated.rig_cameras(windows=True)}
-    if len(results.cameras) != 2 or not set(results.cameras) <= set(known):
+    if len(results.cameras) < 2 or not set(results.cameras) <= set(known):
         return None, f"calibration.json beside it has cameras {', '.join(known)}, not the run's"
-    cameras = (known[results.cameras[0]], known[results.cameras[1]])
+    cameras = tuple(known[name] for name in results.cameras)
     return (cameras, "") if _agree(results, cameras) else (
         None, "calibration.json beside it is not the one that the run was tracked with"
     )  # fmt: skip
 
 
-def pair_pixels(results: TrackResults, rows: Ints) -> list[Array]:
-    """Per camera (N, 2), the outlines' centres."""
-    return [results.tracks[[f"{c}_u_px", f"{c}_v_px"]].to_numpy(float)[rows]
-            for c in results.cameras]  # fmt: skip
+def outline_pixels(results: TrackResults, rows: Ints) -> Array:
+    """Return the outlines' centres (N, C, 2) of rows, NaN where a camera does not see it."""
+    columns = [f"{c}_{x}_px" for c in results.cameras for x in "uv"]
+    pixels = results.tracks[columns].to_numpy(float)[rows]
+    return pixels.reshape(len(rows), len(results.cameras), 2)
 
 
 def paired_rows(results: TrackResults) -> Ints:
-    """Return the rows of tracks.csv that both cameras measured."""
-    every = np.arange(len(results.tracks))
+    """Return the rows of tracks.csv that two cameras or more measured."""
     good = np.isfinite(results.tracks["ray_miss_mm"].to_numpy(float))
-    for uv in pair_pixels(results, every):
-        good &= np.isfinite(uv).all(1)
-    return np.flatnonzero(good)
+    seen = np.isfinite(outline_pixels(results, np.arange(len(good)))).all(-1).sum(1)
+    return np.flatnonzero(good & (seen >= 2))
 
 
-def _agree(results: TrackResults, cameras: tuple[Camera, Camera]) -> bool:
-    """Return whether the rays' distances and points agree with tracks.csv."""
+def _agree(results: TrackResults, cameras: tuple[Camera, ...]) -> bool:
+    """Return whether the rays' points, and of two cameras their distances, are in tracks.csv."""
     rows = paired_rows(results)
     if not len(rows):
         return True
-    rays = [camera.unproject(uv) for camera, uv in zip(cameras, pair_pixels(results, rows))]
-    middle, miss = midpoint(*rays[0], *rays[1])
-    stated = results.tracks["ray_miss_mm"].to_numpy(float)[rows]
+    pixels = outline_pixels(results, rows)
+    found = triangulate_views(cameras, list(np.moveaxis(pixels, 1, 0)), 1.0, "midpoint")
+    stated = np.abs(results.tracks["ray_miss_mm"].to_numpy(float)[rows])
+    two = np.isfinite(pixels).all(-1).sum(1) == 2
+    miss = np.nansum(found.ray_miss_mm, axis=-1)
     names = SILHOUETTES if set(SILHOUETTES) <= set(results.tracks) else POINT
-    away = np.linalg.norm(middle - results.tracks[list(names)].to_numpy(float)[rows], axis=1)
-    if np.median(np.abs(miss - stated)) > _AGREE_MM:
+    place = results.tracks[list(names)].to_numpy(float)[rows]
+    away = np.linalg.norm(found.points_mm - place, axis=1)
+    if two.any() and np.median(np.abs(miss - stated)[two]) > _AGREE_MM:
         return False
-    return bool(np.nanmedian(away) < _NEAR_MM + np.median(np.abs(stated)))
+    return bool(np.nanmedian(away) < _NEAR_MM + np.median(stated))

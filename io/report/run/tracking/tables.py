@@ -62,11 +62,12 @@ def _many(count: int, word: str) -> str:
 
 
 def _matched(results: TrackResults) -> tuple[int, int] | None:
-    """Detections that belong to a bubble seen by both cameras, of all."""
+    """Detections that belong to a bubble seen by two cameras or more, of all."""
     found = len(results.detections) or results.file.detections or 0
     if found <= 0:
         return None
-    return min(len(results.cameras) * len(results.tracks), found), found
+    seen = results.tracks[[f"{c}_u_px" for c in results.cameras]].notna().to_numpy().sum()
+    return min(int(seen), found), found
 
 
 def _matched_words(results: TrackResults) -> str:
@@ -76,7 +77,7 @@ def _matched_words(results: TrackResults) -> str:
     part, whole = matched
     return (
         f"{number(whole)} bubbles were found in single images; {share(part, whole)} of them have "
-        "a partner in the other camera and a track."
+        "a partner in another camera and a track."
     )
 
 
@@ -92,6 +93,10 @@ def _miss_words(results: TrackResults) -> str:
     miss = 1e3 * results.tracks["ray_miss_mm"].to_numpy(float)
     typical, ratio = median(np.abs(miss)), ray_miss_ratio(results, ray_miss_sd_mm(results))
     text = f"The two rays of a bubble miss each other by {number(typical, 2)} µm (median), "
+    if len(results.cameras) > 2:
+        text = (
+            f"The rays of a bubble miss its point by {number(typical, 2)} µm (median of the RMS), "
+        )
     if ratio is None:
         return text + "there are too few points to say what that should be."
     text += f"{number(ratio, 2)} times what the outlines' noise predicts."
@@ -118,7 +123,7 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
     if results.pairs.calibration_problem:
         offset, varies = _offset(results.pairs.bias_px)
         words.append(
-            "The two cameras disagree along the direction perpendicular to both optical axes"
+            "Two cameras disagree along the direction perpendicular to both optical axes"
             + ("" if offset is None else f" (offset {number(offset)} px{varies})")
             + ": this is a calibration problem. Calibrate again before you use these tracks."
         )
@@ -133,7 +138,7 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
     matched = _matched(results)
     if matched is not None and matched[0] < _MATCHED_TOO_FEW * matched[1]:
         words.append(
-            "More than half of the bubbles have no partner in the other camera or no track: look "
+            "More than half of the bubbles have no partner in another camera or no track: look "
             "at the worst frames below."
         )
     stated = [sentence(text) for text in results.file.warnings]
@@ -166,8 +171,8 @@ def key_numbers(results: TrackResults) -> list[Figure]:
                f"median; {of_noise}RMS {number(rms(miss), 2)} µm"),
         Figure("Diameter", f"{number(median(size), 3)} mm", "median, sphere of equal volume"),
         Figure("Ambiguous", share(ambiguous, len(tracks)),
-               f"{number(ambiguous)} pairs that another pairing explains almost as well"),
-        Figure("Centre", _centres(results), "of volume, or the mean of the two silhouettes"),
+               f"{number(ambiguous)} bubbles that another grouping explains almost as well"),
+        Figure("Centre", _centres(results), "of volume, or the mean of the silhouettes"),
     ]  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from telerig.io.report.page.figures import (
     camera_colour,
     drawing,
 )
-from telerig.io.report.run.tracking.results import TrackResults, pair_pixels, paired_rows
+from telerig.io.report.run.tracking.results import TrackResults, outline_pixels, paired_rows
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
 from telerig.short_text import nice_below
@@ -58,11 +58,18 @@ def ray_pair(
                    float(miss))  # fmt: skip
 
 
-def rays_of_row(results: TrackResults, cameras: tuple[Camera, Camera], row: int) -> RayPair:
-    """Return the rays of both outlines' centres in a row of tracks.csv."""
-    first, second = pair_pixels(results, np.array([row]))
-    rays = [camera.unproject(uv) for camera, uv in zip(cameras, (first, second))]
-    return ray_pair(rays[0][0][0], rays[0][1][0], rays[1][0][0], rays[1][1][0])
+def rays_of_row(results: TrackResults, cameras: tuple[Camera, ...], row: int) -> RayPair:
+    """Return the rays of the outlines' centres in a row of tracks.csv, of the first two cameras
+    that see it."""
+    rays = [cameras[c].unproject(outline_pixels(results, np.array([row]))[0, c])
+            for c in _seen_by(results, row)]  # fmt: skip
+    return ray_pair(*rays[0], *rays[1])
+
+
+def _seen_by(results: TrackResults, row: int) -> list[int]:
+    """Return the first two cameras that see the bubble of a row."""
+    seen = np.isfinite(outline_pixels(results, np.array([row]))[0]).all(-1)
+    return [int(c) for c in np.flatnonzero(seen)[:2]]
 
 
 def typical_row(results: TrackResults) -> int | None:
@@ -75,9 +82,9 @@ def typical_row(results: TrackResults) -> int | None:
 
 
 def two_rays(
-    results: TrackResults, cameras: tuple[Camera, Camera], row: int | None = None
+    results: TrackResults, cameras: tuple[Camera, ...], row: int | None = None
 ) -> Picture | None:
-    """The drawing of a pair (default: a typical one): the bubble with its rays, and a close-up.
+    """The drawing of two rays (default: typical ones): the bubble with them, and a close-up.
 
     None where tracks.csv has no pair.
     """
@@ -87,7 +94,7 @@ def two_rays(
     pair = rays_of_row(results, cameras, row)
     here = results.tracks.iloc[row]
     diameter = float(here["d_eq_mm"]) if np.isfinite(here["d_eq_mm"]) else 1.0
-    names = [camera.name for camera in cameras]
+    names = [cameras[c].name for c in _seen_by(results, row)]
     with drawing(_HEIGHT_IN) as sheet:
         whole, close = sheet.axes, sheet.figure.add_axes((0, 0, 1, 1))
         _draw_whole(whole, pair, diameter, names, results.up)
@@ -99,7 +106,7 @@ def two_rays(
         whole.set_title(f"bubble of {diameter:.3g} mm", fontsize=8.5)
         close.set_title("close-up, where they pass", fontsize=8.5)
     caption = (
-        f"Bubble {int(here['particle'])} in frame {int(here['frame'])}, a pair with the run's "
+        f"Bubble {int(here['particle'])} in frame {int(here['frame'])}, one with the run's "
         f"median ray miss: the rays of the two outlines' centres pass each other at "
         f"{1e3 * abs(pair.miss_mm):.3g} µm. Coloured dots are the points of each ray closest to "
         "the other, the cross half way between them is the triangulated point before shape and "

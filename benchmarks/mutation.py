@@ -96,7 +96,7 @@ def changes_of(product: Path, file: str) -> Iterator[Change]:
             if isinstance(value, bool):
                 text = repr(not value)
             else:
-                text = repr(value + 1 if isinstance(value, int) else 1.5 * value)
+                text = repr(value + 1 if isinstance(value, int) else 1.5 * value or 1.0)
             yield Change(file, node.lineno, at(node), at(node, True), text, definition)
         for kind, start, end in gaps:
             old, new = SWAPS.get(type(kind), ("", ""))

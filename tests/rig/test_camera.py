@@ -53,19 +53,16 @@ def test_unproject_inverts_project(model, shape):
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, rtol=1e-14)
 
 
-@pytest.mark.parametrize("given", [[1, 2], [[1, 2]], 5.0, [], "abc", [[1, 2, 3], [1, 2]]])
-def test_what_is_no_array_of_points(given):
-    with pytest.raises(InputError) as error:
-        camera("all").project(given)
-    assert "left" in error.value.where and "(..., 3)" in error.value.todo
-
-
-@pytest.mark.parametrize("given", [[1, 2, 3], [[1, 2, 3]], 5.0, [], "abc"])
-def test_what_is_no_array_of_pixels(given):
-    for function in (camera("all").unproject, camera("all").distorted_pixel):
-        with pytest.raises(InputError) as error:
-            function(given)
-        assert "left" in error.value.where and "(..., 2)" in error.value.todo
+@pytest.mark.parametrize("given", [[1], [[1, 2, 3, 4]], 5.0, [], "abc", [[1, 2, 3], [1, 2]]])
+def test_what_is_no_array_of_points_or_pixels(given):
+    one, two, three = camera("all"), [1, 2], [[1, 2, 3]]
+    for function, wrong, size in (
+        (one.project, two, 3), (one.unproject, three, 2), (one.distorted_pixel, three, 2),
+    ):  # fmt: skip
+        for bad in (given, wrong):
+            with pytest.raises(InputError) as error:
+                function(bad)
+            assert "left" in error.value.where and f"(..., {size})" in error.value.todo
 
 
 @pytest.mark.parametrize("model", MODELS)

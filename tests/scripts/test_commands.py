@@ -226,18 +226,16 @@ def test_colour_image_is_refused(small_copy):
     assert path.with_suffix(".png").name in text and "colour" in text
 
 
-def test_truncated_image_is_refused_and_nothing_is_written(small_copy):
+def test_a_truncated_image_and_one_of_another_size_are_refused_and_nothing_is_written(small_copy):
     path = images(small_copy, "right")[5]
-    path.write_bytes(path.read_bytes()[:3000])
-    text = run("calibrate", small_copy, "--quiet", code=2)
-    assert path.name in text
-    assert not (small_copy / "results").exists()
-
-
-def test_wrong_size_names_both(small_copy):
-    spoil(images(small_copy, "right")[1], lambda image: image[:500])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:3000])
+    assert path.name in run("calibrate", small_copy, "--quiet", code=2)
+    path.write_bytes(whole)
+    spoil(path, lambda image: image[:500])
     text = run("calibrate", small_copy, "--quiet", code=2)
     assert "512" in text and "500" in text
+    assert not (small_copy / "results").exists()
 
 
 def test_nominal_rotation_on_the_wrong_side_shows_both_twins(small_copy):

@@ -247,8 +247,8 @@ def test_symmetric_hexagonal_grids_list_every_equivalent(target: Target, order: 
         assert {tuple(np.array(label)[found[0]]) for label in labels} == {*map(tuple, found)}
 
 
-def test_a_part_of_a_hexagonal_grid_without_marks_is_refused() -> None:
-    target = staggered(9, 12, HEXAGONAL)
+@pytest.mark.parametrize("target", [staggered(9, 12, HEXAGONAL), replace(LARGE, marks=())])
+def test_a_part_of_a_grid_without_marks_is_refused(target: Target) -> None:
     dots, truth = photograph(target, View(missing=0, false=0), np.random.default_rng(3))
     part = dots[target.nominal_mm(truth)[:, 0] < 60].reset_index(drop=True)
     with pytest.raises(DetectionError, match="seen in part and has no marks"):
@@ -321,14 +321,6 @@ def test_a_part_of_a_bounded_target_is_numbered_from_its_marks() -> None:
         dots, truth = photograph(LARGE, view, np.random.default_rng([16, seed]))
         if np.isin(LARGE.id_from_row_column(*np.transpose(LARGE.marks)), truth).all():
             assert is_right(number_dots(dots, LARGE), truth)
-
-
-def test_a_part_of_an_unmarked_target_is_refused() -> None:
-    target = replace(LARGE, marks=())
-    dots, truth = photograph(target, View(missing=0, false=0), np.random.default_rng(3))
-    part = dots[truth % 12 < 9].reset_index(drop=True)
-    with pytest.raises(DetectionError, match="seen in part and has no marks"):
-        number_dots(part, target)
 
 
 def test_an_unbounded_target_without_visible_marks_is_refused() -> None:

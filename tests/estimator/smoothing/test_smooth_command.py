@@ -80,15 +80,12 @@ def test_only_tracked_frames_count(tmp_path: Path) -> None:
     assert whole.summary["swarm"] == cut.summary["swarm"] != {}
 
 
-def test_without_tracks_it_says_what_to_do(data: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(
-        app, ["smooth", str(data / "runs" / "rise"), "--tracks", str(tmp_path)]
-    )
+@pytest.mark.parametrize(
+    ("option", "value", "words"), [("--tracks", ".", "telerig track"), ("--model", "best", "auto")]
+)
+def test_no_tracks_and_an_unknown_model_are_refused(
+    data: Path, option: str, value: str, words: str
+) -> None:
+    result = CliRunner().invoke(app, ["smooth", str(data / "runs" / "rise"), option, value])
     assert result.exit_code == 2
-    assert "telerig track" in result.output
-
-
-def test_an_unknown_model_is_refused(data: Path) -> None:
-    result = CliRunner().invoke(app, ["smooth", str(data / "runs" / "rise"), "--model", "best"])
-    assert result.exit_code == 2
-    assert "auto" in result.output
+    assert words in result.output

@@ -826,6 +826,9 @@ def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
     return np.stack(uv, 1), np.stack(spread, 1)
 
 
+REFINE = ", or smooth the run with --refine-rig"
+
+
 def with_change(
     pairs: Mapping[tuple[int, int], PairModel], change: RigChange | None, calibration: Calibration
 ) -> dict[str, Any]:
@@ -848,7 +851,7 @@ def with_change(
         words.append(
             f"Camera {change.camera!r} has moved against {change.against!r} since the "
             f"calibration{unsure}, {change.size_words()}. All positions are wrong because of this "
-            "movement. Calibrate again, or smooth the run with --refine-rig."
+            f"movement. Calibrate again{'' if len(names) > 2 else REFINE}."
         )
     if change is not None and change.culprit:
         words.append(f"The other cameras agree, so it is {change.culprit!r} that has moved.")

@@ -55,10 +55,17 @@ def refinement_of(
 ) -> Refinement | None:
     """Return what `Refinement` holds for a run; None if it is not wanted.
 
-    Raises InputError for runs without two cameras or with too few pairs.
+    Raises InputError for runs of more or fewer than two cameras, or with too few pairs.
     """
     if not wanted:
         return None
+    if len(calibration.cameras) > 2:
+        raise InputError(
+            f"the run has {len(calibration.cameras)} cameras, and a rig of two can be refined",
+            where="refine_rig",
+            todo="calibrate again; or track and smooth it with two cameras, [tracking] cameras in "
+            "rig.toml, of which one has moved",
+        )
     prior = wanted if isinstance(wanted, DriftPrior) else DriftPrior()
     found = None if tracks is None else rig_change(tracks, calibration, prior)
     if found is None:

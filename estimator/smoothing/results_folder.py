@@ -125,14 +125,15 @@ def _check_cameras(tracks: Tracks | StoredTracks | Any, calibration: Calibration
 
 def _moved(tracks: Tracks | StoredTracks | Any) -> list[str]:
     """Return a warning if tracking found a movement of the cameras."""
-    change = getattr(tracks, "summary", {}).get("rig_change") or {}
+    summary = getattr(tracks, "summary", {})
+    change, cameras = summary.get("rig_change") or {}, summary.get("image_size_px") or {}
     if not change.get("moved"):
         return []
     return [
         f"camera {change['camera']!r} had moved since the calibration with which the run was "
         f"tracked (by {1e3 * change['offset_mm']:+.0f} µm perpendicular to both optical axes), so "
-        "all positions are wrong by this movement. Calibrate again and track again, or smooth with "
-        "--refine-rig"
+        "all positions are wrong by this movement. Calibrate again and track again"
+        + ("" if len(cameras) > 2 else ", or smooth with --refine-rig")
     ]
 
 

@@ -150,13 +150,13 @@ class SingleMeasurements:
 
 @dataclass(frozen=True)
 class FrameMeasurements:
-    """Hold the M bubbles of one frame that both cameras saw, and the bubbles seen by only one
+    """Hold the M bubbles of one frame that several cameras saw, and those seen by only one
     camera.
 
     points_mm : (M, 3) positions in the rig frame.
     covariance_mm2 : (M, 3, 3) covariances of the positions.
     d_eq_mm : (M,) equivalent diameters, NaN where unknown.
-    confidence : (M,) confidence in (0, 1] that the pair of detections is one bubble.
+    confidence : (M,) confidence in (0, 1] that the detections are those of one bubble.
     particle : (M,) ids given with the data, -1 where no id is given.
     singles : the bubbles that only one camera saw.
     """
@@ -250,7 +250,7 @@ class FrameIds:
     """Hold the final track ids of one frame's measurements.
 
     frame : number of the frame.
-    particle : (M,) ids of the bubbles that both cameras saw, -1 for no track.
+    particle : (M,) ids of the bubbles that several cameras saw, -1 for no track.
     single : (L,) ids of the bubbles that one camera saw, -1 for no track.
     """
 
@@ -299,7 +299,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Hold what the tracker returns for one frame with M pairs and L single-camera measurements.
+    """Hold what the tracker returns for one frame with M bubbles and L single-camera measurements.
 
     particle, single : (M,) and (L,) ids as known now, -1 for no track. While a conflict or a birth
         is undecided, they are the best guess.

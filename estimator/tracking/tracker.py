@@ -67,7 +67,7 @@ class OpenFrames:
     def begin(self, frame: int, t_s: float, points: int, singles: int) -> None:
         """Add a frame without ids.
 
-        points : number of bubbles that both cameras saw.  singles : number that one camera saw.
+        points : number of bubbles that several cameras saw.  singles : number that one camera saw.
         """
         self._frames[frame] = (t_s, np.full(points, NO_PARTICLE), np.full(singles, NO_PARTICLE))
 
@@ -90,7 +90,7 @@ class OpenFrames:
         self._frames[frame][2][index] = particle
 
     def now(self, frame: int) -> tuple[Ints, Ints]:
-        """Return copies of a frame's ids: of the pairs (M,) and of the single-camera measurements
+        """Return copies of a frame's ids: of the bubbles (M,) and of the single-camera measurements
         (L,).
         """
         _, particle, single = self._frames[frame]
@@ -281,7 +281,7 @@ def continue_alone(
 ) -> list[tuple[Track, int, SeenAlone]]:
     """Update the tracks that were missed by measurements of only one camera.
 
-    missed : tracks without a pair in this frame.
+    missed : tracks that several cameras did not see in this frame.
     cameras : cameras of the rig.
     common_mm2 : (3, 3) covariance of the position error that all bubbles have in common.
 

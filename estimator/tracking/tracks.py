@@ -40,7 +40,7 @@ class Tracks(ShortText):
     name : name of the run.
     detections : table of all bubbles found in the images, with the id of the track in the column
         ``particle``, blank for none.
-    table : table with one row per frame and bubble that both cameras saw, positions in mm in the
+    table : table with one row per frame and bubble that several cameras saw, positions in mm in the
         rig frame; `docs/files.md` describes the columns.
     events : table of births, deaths, gaps, breaks, splits and mergers, each with its reason.
     summary : content of tracking.json.

@@ -830,13 +830,17 @@ REFINE = ", or smooth the run with --refine-rig"
 
 
 def with_change(
-    pairs: Mapping[tuple[int, int], PairModel], change: RigChange | None, calibration: Calibration
+    pairs: Mapping[tuple[int, int], PairModel],
+    change: RigChange | None,
+    calibration: Calibration,
+    misplaced: tuple[int, float, float] | None = None,
 ) -> dict[str, Any]:
     """Return the part ``pairs`` of tracking.json.
 
     pairs : the statistics of each pair of cameras; of more than two cameras the numbers are those
     of the pair with the largest gaps. change : the estimated movement, or None. If a camera has
-    moved, the sentence on this replaces the one on an offset of the calibration.
+    moved, the sentence on this replaces the one on an offset of the calibration. misplaced : as in
+    `RigModel`.
     """
     moved = change is not None and change.moved
     without = [Finding.CALIBRATION_OFFSET] if moved else []
@@ -855,13 +859,22 @@ def with_change(
         )
     if change is not None and change.culprit:
         words.append(f"The other cameras agree, so it is {change.culprit!r} that has moved.")
+    if misplaced is not None:
+        camera, u, v = misplaced
+        words.append(
+            f"This is a calibration problem: the images of camera {names[camera]!r} lie {u:+.2f} "
+            f"px in u and {v:+.2f} px in v from where the other cameras' points are expected in "
+            "them. "
+            "The grouping is not affected, but all positions are: calibrate the rig again."
+        )
+    problem = moved or misplaced is not None
     worst = max(pairs.values(), key=lambda own: own.gap_rms_px)
     return {
         "bias_px": worst.bias_px,
         "scatter_px": worst.scatter_px,
         "frame_px": worst.frame_px,
         "rms_px": worst.rms_px,
-        "calibration_problem": any(m.calibration_problem for m in pairs.values()) or moved,
+        "calibration_problem": problem or any(m.calibration_problem for m in pairs.values()),
         "words": words,
     }
 

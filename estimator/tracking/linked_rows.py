@@ -25,7 +25,7 @@ _TABLES = ("tracks", "detections")
 class Linking:
     """Hold what the tracking of a run tells beside its rows; complete when all rows were read.
 
-    pairs : the model of each pair of cameras, as in `RigModel`.
+    pairs, misplaced : what `RigModel` says of each pair of cameras, and of one of them.
     shapes : what the run tells of its bubbles' shapes.
     events : events of the tracks.
     frames_without : for each camera, how often each reason for a frame without bubbles occurred.
@@ -35,6 +35,7 @@ class Linking:
     shapes: Shapes
     events: list[TrackEvent]
     frames_without: dict[str, dict[str, int]]
+    misplaced: tuple[int, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class LinkedRows:
             Shapes(**content["shapes"]),
             [TrackEvent(**{**e, "particles": tuple(e["particles"])}) for e in content["events"]],
             content["frames_without"],
+            content["misplaced"] and tuple(content["misplaced"]),
         )
 
     def kept(self) -> Iterator[Linked]:

@@ -28,7 +28,7 @@ from telerig.estimator.calibration.result.calibration import (
     Calibration,
     of_run,
 )
-from telerig.estimator.rig_drift import PairCollector, with_change
+from telerig.estimator.rig_drift import LEAST_SEEN_S, PairCollector, with_change
 from telerig.estimator.tracking.backtracking import Tables
 from telerig.estimator.tracking.corrections import Corrections, read_corrections
 from telerig.estimator.tracking.detect_run import (
@@ -166,6 +166,8 @@ class TrackingStream:
                 "--min-diameter",
             )
         change, known = self._pairs.found(), self.calibration.covariance_known
+        # in a shorter time slow shake is no different from it
+        misplaced = self.linking.misplaced if np.ptp(run.t_s) >= LEAST_SEEN_S else None
         content: dict[str, Any] = {
             "schema": 1,
             "kind": "telerig tracks",
@@ -180,7 +182,7 @@ class TrackingStream:
             "detections_without_partner_or_track": self.detections - self.together,
             "frames_without_bubbles": self.linking.frames_without,
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
-            "pairs": with_change(self.linking.pairs, change, self.calibration),
+            "pairs": with_change(self.linking.pairs, change, self.calibration, misplaced),
             "shapes": asdict(self.linking.shapes),
             "covariance": "Of the measurement."
             + known
@@ -314,7 +316,7 @@ def tracking_stream(
         tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
         linker = RowMaker(model, tracker, _shapes(sample, model, up), up)
         without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
-        linking = Linking(model.pairs, linker.shapes, linker.events, without)
+        linking = Linking(model.pairs, linker.shapes, linker.events, without, model.misplaced)
         rows = stored.keep(_linked(run, cameras, batches(), linker, without, stage), linking)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)

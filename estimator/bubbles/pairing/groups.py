@@ -63,6 +63,8 @@ class RigModel:
         point, as coefficients of `bias_basis`. A part that a shift of all points explains has no
         effect. Pairs have their own bias instead.
     origin_mm, reach_mm : (3,) for `bias_basis`.
+    misplaced : if one camera's images lie elsewhere than the calibration says, beyond chance and
+        half a pixel: its index, and by how much in u and v (px).
     """
 
     cameras: tuple[Camera, ...]
@@ -70,6 +72,7 @@ class RigModel:
     offset_px: Array
     origin_mm: Array
     reach_mm: Array
+    misplaced: tuple[int, float, float] | None = None
 
     @staticmethod
     def of(cameras: Sequence[Camera], pairs: dict[tuple[int, int], PairModel]) -> RigModel:

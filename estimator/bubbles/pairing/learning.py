@@ -42,7 +42,7 @@ from telerig.estimator.bubbles.pairing.matching import (
     views_of,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import nearly_parallel
+from telerig.rig.triangulation import nearly_parallel, stacked_jacobian
 from telerig.statistics import robust_sd
 
 MOST_FRAMES = 60
@@ -129,7 +129,24 @@ def _with_offsets(model: RigModel, frames: Sequence[Sequence[pd.DataFrame]]) -> 
             trial, left = _offset_fit(model, groups.take(larger), weight, frame, terms)
             if left < _BETTER**2 * least:
                 best, least = trial, left
-    return best
+    return replace(best, misplaced=_misplaced(best, len(frames)))
+
+
+def _misplaced(model: RigModel, frames: int) -> tuple[int, float, float] | None:
+    """Return `RigModel.misplaced`: the camera whose offset alone explains those of all best."""
+    _, by_point = stacked_jacobian(model.cameras, model.origin_mm[None])
+    kept = np.eye(len(by_point[0])) - by_point[0] @ np.linalg.pinv(by_point[0])
+    left = kept @ model.offset(model.origin_mm).ravel()
+    found = []
+    for c in range(len(model.cameras)):
+        own = kept[:, 2 * c : 2 * c + 2]
+        shift = np.linalg.lstsq(own, left, rcond=None)[0]
+        found.append((float(np.linalg.norm(left - own @ shift)), c, shift))
+    _, camera, shift = min(found, key=lambda one: one[0])
+    chance = model.mean("frame_px") / np.sqrt(frames)
+    if np.linalg.norm(shift) < max(_LEAST_PROBLEM_PX, _SIGNIFICANT * chance):
+        return None
+    return camera, float(shift[0]), float(shift[1])
 
 
 def _joined_frames(found: Sequence[Candidates], counts: Ints) -> Groups:

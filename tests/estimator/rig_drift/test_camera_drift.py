@@ -308,6 +308,9 @@ def test_words_say_it_once() -> None:
     assert "--refine-rig" in said["words"][-1] and "positions are wrong" in said["words"][-1]
     assert with_change(models, still.found(), known)["words"] == model.sentences()
     assert PairCollector(known).found() is None
+    off = with_change(models | {(0, 1): default_model(cameras)}, None, known, (1, 7.0, -4.0))
+    assert off["calibration_problem"] and "+7.00 px in u and -4.00 px in v" in off["words"][-1]
+    assert "'right'" in off["words"][-1]
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])

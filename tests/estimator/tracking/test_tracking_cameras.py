@@ -147,7 +147,7 @@ def test_a_camera_that_is_gone_for_a_while_loses_no_track(
     assert not set(tracks.events["kind"]) & {"break", "gap"}
     known = tracks.table["frame"].between(8, 15)
     middle = tracks.table[[f"middle_{x}" for x in ("u_px", "v_px", "suu_px2", "du_px")]]
-    assert middle[known].isna().all(axis=None) and not middle[~known].isna().all(1).all()
+    assert middle[known].isna().all(axis=None) and not middle[~known].isna().all(axis=1).all()
     others = tracks.table[["left_u_px", "right_u_px", "ray_miss_mm", "x_mm"]]
     assert np.isfinite(others[known].to_numpy()).all()
     joined = tracks.table.merge(whole.table, on=["frame", "particle"], suffixes=("", "_whole"))
@@ -166,7 +166,7 @@ def test_rows_say_which_cameras_see_a_bubble(swarm: tuple[Path, Calibration]) ->
     tracks = telerig.track(load_run(run), calibration)
     names = [camera.name for camera in calibration.cameras]
     seen = tracks.table[[f"{name}_u_px" for name in names]].notna()
-    assert seen.sum(1).min() >= 2 and (seen.sum(1) == 3).mean() > 0.6
+    assert seen.sum(axis=1).min() >= 2 and (seen.sum(axis=1) == 3).mean() > 0.6
     of_tracks = tracks.detections.dropna(subset=["particle"])
     for name in names:
         own = tracks.table.loc[seen[f"{name}_u_px"], ["frame", "particle", f"{name}_u_px"]]

@@ -10,6 +10,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.estimator.physics.frames import AXES
+from telerig.estimator.physics.means import SD, Lasting, mean_of_body
 from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillation
 from telerig.io.results.bubbles import SUMMARY_COLUMNS, WHOLE
 from telerig.rig.bubble_physics import Liquid
@@ -26,6 +27,7 @@ def summary_table(
     up: Array,
     liquid: Liquid | None = None,
     ways: Mapping[tuple[int, int], Array] | None = None,
+    lasting: Lasting | None = None,
 ) -> pd.DataFrame:
     """Return the content of bubble_summary.csv, one row per bubble.
 
@@ -35,11 +37,12 @@ def summary_table(
     ways : by particle and number of its rows, standard deviations (4,) in mm of the displacement
         from the first row to the last one, and of the path's length; other bubbles get an upper
         bound.
+    lasting : what the run tells of errors that all frames of a bubble have; None if nothing.
     """
     groups = frames.groupby("particle", sort=True)
-    known = ways or {}
+    known, common = ways or {}, lasting or Lasting()
     rows = [
-        _row(mine, up, liquid, known.get((int(mine["particle"].iloc[0]), len(mine))))
+        _row(mine, up, liquid, known.get((int(mine["particle"].iloc[0]), len(mine))), common)
         for _, mine in groups
     ]
     table = pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
@@ -47,7 +50,11 @@ def summary_table(
 
 
 def _row(
-    mine: pd.DataFrame, up: Array, liquid: Liquid | None, way_sd_mm: Array | None
+    mine: pd.DataFrame,
+    up: Array,
+    liquid: Liquid | None,
+    way_sd_mm: Array | None,
+    lasting: Lasting,
 ) -> dict[str, Any]:
     t = mine["t_s"].to_numpy(float)
     row: dict[str, Any] = {
@@ -57,8 +64,8 @@ def _row(
         "frames": int((mine["observed"] != 0).sum()),
         "lifetime_s": t[-1] - t[0],
     }
-    for value, sd in (("d_eq_mm", "sd_eq_mm"), ("aspect", "s_aspect"), ("tilt_deg", "s_tilt_deg")):
-        row[value], row[sd] = mean_of_body(mine[value].to_numpy(float), mine[sd].to_numpy(float))
+    for value, sd in SD.items():
+        row[value], row[sd] = mean_of_body(mine, value, lasting)
     row["rise_mm_s"], row["s_rise_mm_s"] = _mean_rise(t, mine, up, way_sd_mm)
     row["slip_mm_s"] = _mean(mine["slip_mm_s"])
     # noise across the motion makes a mean speed too large
@@ -74,39 +81,6 @@ def _row(
         row["shape_hz"], row["s_shape_hz"] = shape.frequency_hz, shape.s_frequency_hz
         row["shape_amplitude"], row["s_shape_amplitude"] = shape.major, shape.s_major
     return row | _numbers(row, mine, liquid)
-
-
-def mean_of_body(values: Array, sd: Array) -> tuple[float, float]:
-    """Return the mean over a bubble's frames of a property of its body, and its standard deviation.
-
-    values, sd : (N,) value and stated standard deviation in each frame.
-    The stated errors do not average out, because the body differs from a spheroid in the same way
-    in all frames. Scatter beyond the stated errors is the body's own motion. It averages out over
-    its correlation time.
-    """
-    good = np.isfinite(values) & np.isfinite(sd)
-    if not good.any():
-        return float("nan"), float("nan")
-    x, variance = values[good], float((sd[good] ** 2).mean())
-    beyond = max(float(x.var()) - variance, 0.0)
-    return float(x.mean()), float(np.sqrt(variance + beyond * _correlated_share(x)))
-
-
-def _correlated_share(x: Array) -> float:
-    """Variance of the mean of a series (N,) over the series' variance, 1/N for white noise.
-
-    By the integral of its autocorrelation to the first zero (Sokal's window is longer; a trend
-    would make both 1).
-    """
-    count = len(x)
-    level = x - x.mean()
-    if count < 3 or not level.any():
-        return 1.0 / count
-    padded = np.fft.rfft(level, 2 * count)
-    correlation = np.fft.irfft(np.abs(padded) ** 2)[:count]
-    correlation = correlation / correlation[0]
-    positive = correlation[: int(np.argmax(correlation <= 0)) or count]
-    return float(min(1.0, (2 * positive.sum() - 1) / count))
 
 
 def _mean(values: pd.Series[Any]) -> float:

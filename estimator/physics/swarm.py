@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
+from telerig.estimator.physics.means import Lasting, mean_of_body
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import nearly_parallel, stacked_jacobian
 
@@ -36,6 +37,7 @@ def swarm_numbers(
     axis: Array,
     up: Array,
     cameras: Sequence[Camera],
+    lasting: Lasting | None = None,
 ) -> dict[str, Any]:
     """Return number density, void fraction, gas flux and mean diameters with standard deviations.
 
@@ -53,7 +55,8 @@ def swarm_numbers(
         return {}
     sight = _Sight(cameras)
     frames, left_out, rows = len(carriage_mm), 0, []
-    means = shapes[["d_eq_mm", "sd_eq_mm", "equator_mm", "polar_mm"]].mean()
+    means = shapes[["equator_mm", "polar_mm"]].mean()
+    sizes = {k: mean_of_body(mine, "d_eq_mm", lasting or Lasting()) for k, mine in shapes}
     poles = {k: mine[["pole_x", "pole_y", "pole_z"]].to_numpy(float) for k, mine in shapes}
     for k, mine in trajectories.groupby("particle"):
         if k not in means.index:
@@ -71,8 +74,8 @@ def swarm_numbers(
         place = place - carriage_mm[mine["frame"].to_numpy(int), None] * axis
         inside = sight.whole(place, extents)
         rise = mine[["vx_mm_s", "vy_mm_s", "vz_mm_s"]].to_numpy(float)[inside] @ up
-        d, weight = body["d_eq_mm"], 1 / (frames * volume)
-        rows.append((d, body["sd_eq_mm"] / d, weight * inside.sum(), weight * rise.sum()))
+        (d, sd), weight = sizes[k], 1 / (frames * volume)
+        rows.append((d, sd / d, weight * inside.sum(), weight * rise.sum()))
     if not sum(number for _, _, number, _ in rows):
         return {}
     return _sums(np.array(rows, float)) | {

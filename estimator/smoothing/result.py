@@ -221,6 +221,7 @@ def bubble_summary(
     bubbles : what `bubble_table` returned for the same fluid; None to compute it.
     fluid : as for `bubble_table`. `docs/bubbles.md` describes the columns.
     """
+    from telerig.estimator.physics.means import Lasting
     from telerig.estimator.physics.summary import summary_table
     from telerig.io.rig_file.fluid import liquid_of
 
@@ -234,7 +235,8 @@ def bubble_summary(
         for particle, mean in smoothing.summary.get("bubble_means", {}).items()
         if "length_sd_mm" in mean
     }
-    return summary_table(frames, up, None if liquid is None else liquid[0], ways)
+    lasting = Lasting.of(smoothing.summary.get("bodies"))
+    return summary_table(frames, up, None if liquid is None else liquid[0], ways, lasting)
 
 
 def _surroundings(smoothing: Smoothing, fluid: Any) -> tuple[Array, float, Any]:

@@ -232,7 +232,7 @@ def smooth(
         words = change_words(change, problem.cameras[0].name)
         summary["rig_change"] = {**change.as_dict(), "words": words}
     described = rig or getattr(stage, "rig", None)
-    summary["bodies"] = dict(getattr(tracks, "summary", {}).get("shapes", {}))
+    summary["bodies"] = _shapes_of(tracks)
     if done.swarm is not None and not getattr(described, "bubbles", None):  # else a part counts
         summary["swarm"] = done.swarm
     fluid = getattr(described, "fluid", None)
@@ -314,6 +314,7 @@ class _Run:
         """Return numbers of the swarm in some frames."""
         if bodies is None:
             return None
+        from telerig.estimator.physics.means import Lasting
         from telerig.estimator.physics.swarm import swarm_numbers
 
         first, problem = span.first + span.own.start, self.problem
@@ -321,7 +322,7 @@ class _Run:
             paths.assign(frame=paths["frame"] - first),
             bodies.assign(frame=bodies["frame"] - first),
             carriage(solution)[0][span.own.start : span.own.stop], problem.axis, problem.up,
-            problem.cameras,
+            problem.cameras, Lasting.of(_shapes_of(self.tracks)),
         )  # fmt: skip
 
     def _solved(self, problem: SmoothingProblem, step: Progress) -> Solution:
@@ -421,6 +422,11 @@ def _beside(paths: pd.DataFrame, bodies: pd.DataFrame | None) -> pd.DataFrame | 
         return None
     keys = ["frame", "particle"]
     return paths[keys].merge(bodies, "left", on=keys).drop(columns=keys)
+
+
+def _shapes_of(tracks: Any) -> dict[str, float]:
+    """Return what tracking told of the shapes of the run's bubbles."""
+    return dict(getattr(tracks, "summary", {}).get("shapes", {}))
 
 
 def _silent(_what: str, _share: float) -> None:

@@ -21,6 +21,7 @@ from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_cr
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.groups import RigModel, candidates_of, match
 from telerig.estimator.bubbles.pairing.learning import learn_rig
+from telerig.estimator.bubbles.shape.lasting import LastingShare
 from telerig.estimator.bubbles.shape.learning import learn_shapes
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
@@ -98,6 +99,7 @@ class TrackingStream:
     covered : for each camera, number of detections and the area that they cover (px^2), so far.
     beyond : number of points beyond the dots of the calibration, so far.
     common_mm2 : (3,) sums over the points of the variances by the calibration's errors, so far.
+    place_mm : (3,) sum of the points, so far.
     names : names of the tracks by number, if the given ids are no whole numbers.
     """
 
@@ -113,12 +115,14 @@ class TrackingStream:
     together: int = 0
     beyond: int = 0
     common_mm2: Array = field(default_factory=lambda: np.zeros(3))
+    place_mm: Array = field(default_factory=lambda: np.zeros(3))
     particles: set[Any] = field(default_factory=set)
     covered: dict[str, tuple[int, float]] = field(default_factory=dict)
     names: Mapping[int, str] | None = None
 
     def __post_init__(self) -> None:
         self._pairs = PairCollector(self.calibration)
+        self._lasting = LastingShare()
 
     @property
     def events(self) -> list[TrackEvent]:
@@ -141,6 +145,8 @@ class TrackingStream:
             self.together += int(measured[names].notna().to_numpy().sum())
             self.particles |= set(part.tracks["particle"])
             self._pairs.add(part.tracks)
+            self._lasting.add(part.tracks)
+            self.place_mm += part.tracks[[*POINT]].sum().to_numpy(float)
             for camera, areas in part.detections.groupby("camera")["area_px2"]:
                 many, area = self.covered.get(str(camera), (0, 0.0))
                 many, area = many + int(areas.notna().sum()), area + float(areas.sum())
@@ -183,7 +189,7 @@ class TrackingStream:
             "frames_without_bubbles": self.linking.frames_without,
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
             "pairs": with_change(self.linking.pairs, change, self.calibration, misplaced),
-            "shapes": asdict(self.linking.shapes),
+            "shapes": asdict(self.linking.shapes) | {"lasting_share": self._lasting.found()},
             "covariance": "Of the measurement."
             + known
             * " The calibration's share, common to all points, is in calibration_sx_mm, "
@@ -198,6 +204,9 @@ class TrackingStream:
         }
         if self.points and np.isfinite(self.common_mm2).all():
             content["calibration_sd_mm"] = np.sqrt(self.common_mm2 / self.points).tolist()
+        if self.points and known:
+            middle = self.place_mm / self.points
+            content["shapes"]["scale_sd"] = self.calibration.scale_sd(middle)
         if self.points and self.calibration.beyond_dots(np.zeros((0, 3))) is not None:
             content["extrapolated"] = self.beyond / self.points
         if change is not None:

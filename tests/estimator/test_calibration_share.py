@@ -75,7 +75,7 @@ def test_shares_scatter_as_calibrations_do(swarm: Swarm) -> None:
     points = rng.uniform(-20, 20, (40, 3))
     pixels = [camera.project(points) for camera in calibration.cameras]
     root = np.linalg.cholesky(calibration.covariance + 1e-18 * np.eye(len(calibration.covariance)))
-    moved = []
+    moved, growth = [], []
     for _ in range(60):
         change = dict(zip(calibration.covariance_names, root @ rng.standard_normal(len(root))))
         left, right = (
@@ -88,9 +88,14 @@ def test_shares_scatter_as_calibrations_do(swarm: Swarm) -> None:
         cameras = (left, replace(right, camera_from_rig=pose.inverse()))
         redrawn = replace(calibration, cameras=cameras)
         moved.append(redrawn.triangulate(*pixels, sigma_px=0.05).points_mm - points)
+        affine = np.linalg.lstsq(np.column_stack([points, np.ones(40)]), moved[-1], rcond=None)[0]
+        growth.append(np.trace(affine[:3]) / 3)
     sd = np.sqrt(np.diagonal(calibration.common_covariance(points), axis1=1, axis2=2))
     ratio = np.mean(np.array(moved) ** 2, axis=(0, 1)) / (sd**2).mean(0)
     assert (ratio > 0.6).all() and (ratio < 1.5).all()
+    stated = calibration.scale_sd(points.mean(0))
+    assert 0.6 < np.mean(np.square(growth)) / stated**2 < 1.5
+    assert swarm.tracks.summary["shapes"]["scale_sd"] == pytest.approx(stated, rel=0.3)
 
 
 def test_beyond_dots_is_outside_their_hull_in_any_camera(swarm: Swarm, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools, Ints, Rows
 from telerig.estimator.bubbles.shape.shapes import DEFAULT_SHAPES, Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings
-from telerig.estimator.bubbles.shape.spheroid import best_shape
+from telerig.estimator.bubbles.shape.spheroid import Shape, best_shape
 from telerig.estimator.bubbles.shape.views import Views, grouped
 from telerig.estimator.bubbles.shape.volume_centre import volume_centre
 from telerig.rig.camera import Camera
@@ -36,6 +36,12 @@ class Bodies(Rows):
     d_eq_mm, aspect : (B,) diameter of the sphere of equal volume; equatorial over polar semi-axis.
     frame : (B, 3, 3) columns: two equatorial axes and the pole, of arbitrary sign.
     shape_covariance : (B, 6, 6) of `spheroid.PARAMETERS`.
+    stretch : (B,) estimated difference of the logarithms of the body's extents along two
+        horizontal axes of the rig, beyond those of a spheroid.
+    noise : (B, 3) part of the variances of log size, log aspect ratio and stretch by the outlines'
+        own noise, independent from frame to frame.
+    fixed : (B, 2) part of the variances of log size and log aspect ratio that all frames of a
+        bubble share.
     chi2 : (B,) misfit of a spheroid with t = 0, with 3 n - 4 degrees of freedom of n views.
     entire : (B,) whether nothing of any of the outlines is missing.
     zonal_probability : (B,) posterior probability of the axisymmetric model of degree 3.
@@ -52,6 +58,9 @@ class Bodies(Rows):
     aspect: Array
     frame: Array
     shape_covariance: Array
+    stretch: Array
+    noise: Array
+    fixed: Array
     chi2: Array
     entire: Bools
     zonal_probability: Array
@@ -66,7 +75,7 @@ class Bodies(Rows):
         return Bodies(
             nan(3), nan(3, 3), nan(3), nan(3, 3), np.full(count, "none", "<U11"),
             np.zeros((count, cameras, 2)), nan(), nan(), nan(), nan(3, 3), nan(6, 6), nan(),
-            np.zeros(count, bool), nan(),
+            nan(3), nan(2), nan(), np.zeros(count, bool), nan(),
         )  # fmt: skip
 
     @staticmethod
@@ -125,6 +134,8 @@ def fit_bodies(
             continue
         rows, views = rows[shaped], views.take(shaped)
         shape = best_shape(views, shapes, up)
+        stretch, own = _stretch(shape, cameras[0], up)
+        noise = np.diagonal(shape.noise, axis1=1, axis2=2)[:, :2]
         centre = volume_centre(views, shape, shapes, gap_sigma_px)
         whole = views.sightings.all_whole
         bodies._put(
@@ -133,6 +144,7 @@ def fit_bodies(
             used=np.where(whole, "volume", "silhouettes"), zonal_probability=centre.zonal,
             d_eq_mm=2 * np.exp(shape.value[:, 0]), aspect=np.exp(shape.value[:, 1]),
             frame=shape.frame, shape_covariance=shape.covariance, chi2=shape.chi2,
+            stretch=stretch, noise=np.column_stack([noise, own]), fixed=shape.fixed,
             entire=views.sightings.all_entire,
         )  # fmt: skip
         bodies.shift_px[np.ix_(rows, used)] = np.where(whole[:, None, None], centre.shift_px, 0.0)
@@ -173,9 +185,29 @@ def body_columns(bodies: Bodies, up: Array) -> dict[str, Array]:
         "pole_z": pole[:, 2],
         "r_size_aspect": shared / (size_sd * aspect_sd),
         "spheroid_chi2": bodies.chi2,
+        "noise_eq_mm": bodies.d_eq_mm * np.sqrt(bodies.noise[:, 0]),
+        "fixed_eq_mm": bodies.d_eq_mm * np.sqrt(bodies.fixed[:, 0]),
+        "noise_aspect": bodies.aspect * np.sqrt(bodies.noise[:, 1]),
+        "fixed_aspect": bodies.aspect * np.sqrt(bodies.fixed[:, 1]),
+        "stretch": bodies.stretch,
+        "noise_stretch": np.sqrt(bodies.noise[:, 2]),
     }
     size = {"d_eq_mm": bodies.d_eq_mm, "sd_eq_mm": bodies.sd_eq_mm}
     return size | {name: np.where(bodies.entire, v, np.nan) for name, v in shape.items()}
+
+
+def _stretch(shape: Shape, camera: Camera, up: Array) -> tuple[Array, Array]:
+    """Return `Bodies.stretch` (B,), across a camera's line of sight minus along it, and the part of
+    its variance by the outlines' noise."""
+    sight = camera.unproject(np.array(camera.image_size_px) / 2)[1]
+    across = np.cross(sight, up)
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(up, across)], -1)
+    first, second = np.moveaxis(shape.frame[:, :, :2].mT @ axes, 1, 0)
+    by_t = np.stack([first**2 - second**2, 2 * first * second], -1)  # (B, axis, t)
+    slope = by_t[:, 0] - by_t[:, 1]
+    variance = np.einsum("bi,bij,bj->b", slope, shape.noise[:, 4:, 4:], slope)
+    return (slope * shape.value[:, 2:]).sum(-1), variance
 
 
 def _tilt(bodies: Bodies, up: Array) -> tuple[Array, Array]:

@@ -30,6 +30,9 @@ so that the covariance of first order does not contain it (simulated bodies that
 _PROLATE_COST, _UPRIGHT_RAD, _LOG_ASPECT = 8.0, 0.4, 0.5
 """What decides between bodies with the same outlines: how much more an oblate body is expected (in
 chi-square), and standard deviations of its pole from the vertical and of its log aspect ratio."""
+_IMPROBABLE = 1e-3
+"""Probability below which another local optimum does not count: of a prolate body that is a hundred
+times farther away than the standard deviation, 1 in 50,000 would be most of the variance."""
 _NEAR_SPHERE = 4.0
 """Bias of a log aspect ratio, times itself over its variance: near a sphere the five components of
 its deformation are all noise, and the fit takes the largest for the flattening."""
@@ -49,6 +52,9 @@ class Shape:
 
     frame : (B, 3, 3).  value : (B, 4) log size, log aspect ratio, t.  covariance : (B, 6, 6).
     cost : (B,) twice the negative logarithm of the posterior.  chi2 : (B,) see `Bodies`.
+    noise : (B, 6, 6) part of the covariance by the outlines' own noise.
+    fixed : (B, 2) part of the variances of log size and log aspect ratio by what is the same in all
+        frames of a bubble. Both are 0 before `best_shape`.
     """
 
     frame: Array
@@ -56,6 +62,8 @@ class Shape:
     covariance: Array
     cost: Array
     chi2: Array
+    noise: Array
+    fixed: Array
 
     @property
     def moments(self) -> Array:
@@ -78,6 +86,10 @@ def best_shape(views: Views, shapes: Shapes, up: Array) -> Shape:
     )
     share = np.exp(-(cost - cost[best, rows]) / 2)
     share /= share.sum(0)
+    share = np.where(share < _IMPROBABLE, 0.0, share)
+    slope = views.deviation(_tangents(chosen.frame, chosen.moments))
+    gain = chosen.covariance @ slope.mT @ weight
+    noise = gain @ views.white @ gain.mT
     covariance = chosen.covariance.copy()
     for fit, mine in zip(fits, share):
         sign = np.sign((fit.frame[:, :, 2] * chosen.frame[:, :, 2]).sum(-1, keepdims=True))
@@ -98,9 +110,16 @@ def best_shape(views: Views, shapes: Shapes, up: Array) -> Shape:
     unseen = np.trace(chosen.covariance[:, 4:, 4:], axis1=1, axis2=2)
     wider = np.array([2 / 3, 1.0]) * unseen[:, None]
     covariance[:, :2, :2] += 2 * wider[:, :, None] * wider[:, None, :]
+    # a body that turns shows both numbers t in turn: the mean of their squares
+    # has half the variance
+    fixed = wider**2
+    fixed[:, 0] += excess**2
     moved = np.stack([excess + wider[:, 0], wider[:, 1], 0 * excess, 0 * excess], -1)
     chi2, _ = misfit(views, chosen, weight)
-    return replace(chosen, value=chosen.value - moved, covariance=covariance, chi2=chi2)
+    return replace(
+        chosen, value=chosen.value - moved, covariance=covariance, chi2=chi2, noise=noise,
+        fixed=fixed,
+    )  # fmt: skip
 
 
 def fit_spheroid(
@@ -136,7 +155,9 @@ def fit_spheroid(
             break
     miss = round_ - views.deviation(_moments(frame, value))
     cost = np.einsum("mi,mij,mj->m", miss, weight, miss) + (prior[4:] * value[:, 2:] ** 2).sum(-1)
-    return Shape(frame, value, covariance, cost, cost)
+    return Shape(
+        frame, value, covariance, cost, cost, np.zeros_like(covariance), np.zeros((len(cost), 2))
+    )
 
 
 def starts(views: Views) -> list[tuple[Array, Array, Array]]:

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from telerig.io.results.findings import Finding
 
 _AT_ONCE = 8192
+_SCALE_STEP_MM = 1.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -396,6 +397,20 @@ class Calibration(ShortText):
             shift = point_shift_jacobian(self.cameras, self.free, flat[some], every[some])
             out[some] = shift @ self.covariance @ np.swapaxes(shift, -1, -2)
         return out.reshape(*points.shape, 3)
+
+    def scale_sd(self, point_mm: ArrayLike) -> float:
+        """Return the relative standard deviation of lengths at a point (3,) by the calibration.
+
+        It is that of the cube root of a small volume. 0 where the covariance is not known.
+        """
+        steps = _SCALE_STEP_MM * np.concatenate([np.eye(3), -np.eye(3)])
+        pixels = np.eye(2 * len(self.cameras))
+        shift = point_shift_jacobian(
+            self.cameras, self.free, np.asarray(point_mm, float) + steps,
+            np.broadcast_to(pixels, (6, *pixels.shape)),
+        )  # fmt: skip
+        growth = np.einsum("iip->p", shift[:3] - shift[3:]) / (6 * _SCALE_STEP_MM)
+        return float(np.sqrt(growth @ self.covariance @ growth))
 
     def share_columns(self, points_mm: ArrayLike) -> dict[str, NDArray[Any]]:
         """Return columns of tracks.csv that state the calibration's part of the points' errors.

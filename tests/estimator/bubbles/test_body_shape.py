@@ -8,6 +8,7 @@ import pytest
 
 from telerig.arrays import Array
 from telerig.estimator.bubbles.shape.body import Bodies, fit_bodies
+from telerig.estimator.bubbles.shape.lasting import LastingShare
 from telerig.estimator.bubbles.shape.learning import learn_shapes
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
@@ -219,3 +220,48 @@ def test_missing_and_cut_outlines() -> None:
     assert found.used.tolist() == ["silhouettes"] * 3 + ["none"]
     none, _ = fitted_tables([first[:0], second[:0]], rig)
     assert none.d_eq_mm.shape == (0,)
+
+
+def test_the_noise_of_a_body_is_the_scatter_of_repeated_outlines() -> None:
+    rng, draws = np.random.default_rng(7), 40
+    _, moments = bodies(rng, np.full(40, 1.5), 25.0, 0.01)
+    found, _ = fitted(np.repeat(moments, draws, 0), rng, 0.003, shapes=Shapes(excess=5e-4))
+    values = np.stack([np.log(found.d_eq_mm), np.log(found.aspect), found.stretch])
+    scatter = values.reshape(3, -1, draws).var(-1, ddof=1).mean(-1)
+    assert scatter == pytest.approx(found.noise.mean(0), rel=0.15)
+    own = found.shape_covariance[:, [0, 1], [0, 1]] - found.noise[:, :2] - found.fixed
+    assert own.min() > 0
+
+
+def test_a_body_that_is_as_good_as_impossible_does_not_widen_a_standard_deviation() -> None:
+    """Sharp outlines of upright bodies: the prolate body is a hundred standard deviations away."""
+    rng = np.random.default_rng(8)
+    aspect = rng.uniform(1.15, 1.5, 800)
+    _, moments = bodies(rng, aspect, 10.0, 0.01)
+    found, _ = fitted(moments, rng, 2e-4, shapes=Shapes(triaxial=0.01, excess=1e-5))
+    off = np.log(found.aspect / aspect) / np.sqrt(found.shape_covariance[:, 1, 1])
+    assert 0.7 < np.mean(off**2) < 1.4
+
+
+def test_the_lasting_share_is_that_of_the_variance_of_the_means() -> None:
+    rng, frames, bubbles = np.random.default_rng(9), 80, 200
+    lasting, swing, noise = 0.01, 0.02, 0.03
+    phase = rng.uniform(0, 2 * np.pi, (bubbles, 1)) + 2.5 * np.arange(frames)
+    stretch = lasting * rng.standard_normal((bubbles, 1)) + 2**0.5 * swing * np.cos(phase)
+    stretch = stretch + noise * rng.standard_normal(stretch.shape)
+    rows = pd.DataFrame(
+        {
+            "frame": np.tile(np.arange(frames), bubbles),
+            "particle": np.repeat([f"b{k}" for k in range(bubbles)], frames),
+            "stretch": stretch.ravel(),
+            "noise_stretch": noise,
+        }
+    ).sort_values("frame", kind="stable")
+    found = LastingShare()
+    assert found.found() == 1.0
+    for part in (rows[rows["frame"] < 30], rows[rows["frame"] >= 30]):
+        found.add(part)
+    assert found.found() == pytest.approx(lasting**2 / (lasting**2 + swing**2), rel=0.2)
+    found = LastingShare()
+    found.add(rows[rows["frame"] == 0])
+    assert found.found() == 1.0

@@ -10,8 +10,9 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.physics.bodies import bodies_table
 from telerig.estimator.physics.frames import frames_table, propagated
+from telerig.estimator.physics.means import Lasting, mean_of_body
 from telerig.estimator.physics.oscillation import dominant_oscillation
-from telerig.estimator.physics.summary import mean_of_body, summary_table
+from telerig.estimator.physics.summary import summary_table
 from telerig.io.results.bubbles import BODY_COLUMNS, FRAME_COLUMNS, NUMBERS, SUMMARY_COLUMNS
 from telerig.io.rig_file.fluid import liquid_of
 
@@ -155,15 +156,25 @@ def test_bodies_of_a_table_without_outlines_are_diameters() -> None:
     assert not len(bodies_table(tracks.assign(d_eq_mm=np.nan)))
 
 
-def test_the_mean_of_a_body_averages_only_what_exceeds_its_stated_errors() -> None:
-    rng = np.random.default_rng(2)
-    ratio = []
-    for _ in range(300):
-        common, own = 0.02 * rng.standard_normal(), 0.2 * rng.standard_normal(400)
-        mean, sd = mean_of_body(3.0 + common + own, np.full(400, 0.02))
-        ratio.append((mean - 3.0) / sd)
-    assert np.mean(np.square(ratio)) == pytest.approx(1.0, abs=0.25)
-    assert np.isnan(mean_of_body(np.full(3, np.nan), np.full(3, np.nan))[0])
+def test_the_mean_of_a_body_states_its_error() -> None:
+    """Noise averages out, what is fixed stays, and of the rest the learned share is left."""
+    rng, frames, runs = np.random.default_rng(2), 100, 400
+    noise, fixed, rest, share, scale = 0.05, 0.004, 0.02, 0.2, 0.001
+    rows = body(frames).assign(
+        sd_eq_mm=np.sqrt(noise**2 + fixed**2 + rest**2), noise_eq_mm=noise, fixed_eq_mm=fixed
+    )
+    swing = np.sqrt(2) * np.cos(2 * np.pi * np.arange(frames) / 10)
+    off = []
+    for _ in range(runs):
+        common = fixed, 3 * scale, rest * np.sqrt(share)
+        error = common @ rng.standard_normal(3) + rest * np.sqrt(1 - share) * swing
+        error = error + noise * rng.standard_normal(frames)
+        lasting = Lasting(share, scale)
+        mean, sd = mean_of_body(rows.assign(d_eq_mm=3.0 + error), "d_eq_mm", lasting)
+        off.append((mean - 3.0) / sd)
+    assert np.mean(np.square(off)) == pytest.approx(1.0, abs=0.2)
+    assert mean_of_body(body(9), "aspect", Lasting(0.1, scale))[1] == pytest.approx(0.05)
+    assert np.isnan(mean_of_body(body(3).assign(aspect=np.nan), "aspect", Lasting())[0])
 
 
 def series(

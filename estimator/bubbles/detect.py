@@ -27,15 +27,13 @@ from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
     Rejected,
-    confirmed_halves,
     dark_noise_share,
     find_blobs,
     implausible_parts,
     noise_share,
-    split_at_necks,
     split_blobs,
 )
-from telerig.estimator.bubbles.outline.crowds import resolved_crowd, settled
+from telerig.estimator.bubbles.outline.crowds import WHOLE, around, resolved_crowd, settled
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     DETECTION_COLUMNS,
     HARMONIC_COLUMNS,
@@ -45,13 +43,16 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     points_on,
     rough_distance,
 )
+from telerig.estimator.bubbles.outline.kernels import Outlines
 from telerig.estimator.bubbles.outline.outline_fit import (
-    Outlines,
-    Start,
-    close_pairs,
+    blur_px,
     fit_outlines,
-    widened,
+    joined,
+    radius_px,
+    start_outlines,
+    taken,
 )
+from telerig.estimator.bubbles.outline.rims import Rims
 
 __all__ = [
     "Bubbles",
@@ -70,6 +71,8 @@ _SHARP_SHARE = 0.2
 _SMALL_EDGES = 3.0
 _MOSTLY_SEEN, _KNOWN_COVERAGE = 0.6, 0.3
 _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
+_LEFT_SHARE = 0.15
+"""Share of a region's box that may be left over by the bubbles that its rims show."""
 
 _RIMS_PAY = 0.15
 """Share of an image of a run that bubbles cover, beyond which rims are looked for, too: in sparser
@@ -151,17 +154,15 @@ def find_bubbles(
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
     everywhere: bool = False,
-    crowds: bool = False,
 ) -> Bubbles:
     """Find all bubbles like :func:`detect_bubbles`, and return the rejected shadows as well.
 
     field : (rows, columns) where bubbles are looked for. Without it and without a background, a
         dark surround of the lit screen is found and left out.
-    everywhere : look for the rims of bubbles in the whole image instead of for dark regions. This
-        takes some 2 s for a megapixel, and finds bubbles that touch, overlap, are faint or are in
-        front of others; no row is then ``merged``.
-    crowds : do this if bubbles cover more than 15 % of the image. The bubbles that dark regions
-        show stay as they are, except those of regions that could not be divided.
+    everywhere : look for the rims of bubbles in the whole image, besides dark regions. This takes
+        some 2 s for a megapixel, and finds bubbles that are faint or in front of others. Without
+        it that is done if bubbles cover more than 15 % of the image, and around dark regions that
+        are no single bubble and could not be divided.
 
     The other arguments and the errors are those of :func:`detect_bubbles`.
     """
@@ -181,16 +182,11 @@ def find_bubbles(
         background = screen_of_field(image, field) if background is None else background
         outside = np.minimum(background, image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
-    looked_at = max(image.size if field is None else np.count_nonzero(field), 1)
-    search = partial(_found, image, background, field, min_diameter_px, min_contrast)
-    found = search(everywhere, everywhere)
+    found = _found(image, background, field, min_diameter_px, min_contrast, everywhere)
     area = float(found.accepted["area_px2"].sum())
-    if everywhere:
-        area += sum(cv2.contourArea(line.astype(np.float32)) for line in found.clusters)
-    covered = min(area / looked_at, 1.0)
-    if crowds and is_crowded(covered, len(found.accepted), _RIMS_PAY):
-        found = search(True, False)
-    return replace(found, field=field, covered=covered)
+    area += sum(cv2.contourArea(line.astype(np.float32)) for line in found.clusters)
+    looked_at = max(image.size if field is None else np.count_nonzero(field), 1)
+    return replace(found, field=field, covered=min(area / looked_at, 1.0))
 
 
 def _found(
@@ -199,10 +195,8 @@ def _found(
     field: Bools | None,
     min_diameter_px: float,
     min_contrast: float,
-    rims: bool,
     everywhere: bool,
 ) -> Bubbles:
-    """rims : look for rims, too; everywhere : and trust them more than partly seen outlines."""
     ratio, clipped = normalised(image, background)
     sigma = max(noise_share(ratio, field), 1e-4)
     blobs, rejected = find_blobs(
@@ -211,56 +205,49 @@ def _found(
     parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
     parts, slender = _without_slender(parts)
     rejected += slender
-    clusters = [blobs[part.blob].contour_px for part in parts if part.merged]
-    if not (parts or rims):
-        return _bubbles({}, rejected, sigma, "no shadow dark and large enough")
-    dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
-    outlines, sharp_share, merged = None, 0.0, np.zeros(0, np.bool_)
-    known, ellipses = np.zeros(0, np.intp), np.zeros((0, 5))
-    if parts:
-        start = _start(parts, blobs, sigma, dark_sigma)
-        outlines = fit_outlines(ratio, start, crowded=everywhere)
-        halves = split_at_necks(outlines, parts, blobs, image.shape, min_diameter_px)
-        while halves:
-            split = [new for k, part in enumerate(parts) for new in halves.get(k, [part])]
-            trial = _start(split, blobs, sigma, dark_sigma)
-            fitted = fit_outlines(ratio, trial, crowded=everywhere)
-            confirmed = confirmed_halves(halves, outlines, split, fitted)
-            if len(confirmed) == len(halves):
-                parts, start, outlines = split, trial, fitted
-                break
-            halves = confirmed
-        merged = _merged(outlines, parts)
-        known = np.flatnonzero(~merged & _known(outlines, _KNOWN_COVERAGE if everywhere else 0.0))
-        ellipses = outlines.ellipse[known]
-    if rims:
-        crowd = resolved_crowd(
-            ratio,
-            sigma,
-            blobs,
-            parts,
-            ellipses,
-            min_diameter_px=min_diameter_px,
-            min_contrast=min_contrast,
-        )
-        rejected, clusters = rejected + crowd.rejected, crowd.clusters
-        whole = [*blobs, *crowd.blobs]
-        parts = [*(parts[k] for k in known), *crowd.parts]
-        if not parts:
-            nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
-            return replace(nothing, clusters=clusters)
-        start = _start(parts, whole, sigma, dark_sigma)
-        every = fit_outlines(ratio, start, crowded=True)
-        last = np.arange(len(known), len(parts))
-        every = every.updated(last, settled(every.taken(last), crowd.rims))
-        first = np.arange(len(known))
-        if outlines is not None:
-            every = every.updated(first, outlines.taken(known))
-        wide, merged = widened(every), np.zeros(len(parts), np.bool_)
-        outlines = wide if everywhere else wide.updated(first, every.taken(first))
-        sharp_share = _SHARP_SHARE if everywhere else 0.0
-    assert outlines is not None
-    defocused = _defocused(outlines, sharp_share)
+    clusters: list[Array] = []
+    noise = np.array([sigma, max(dark_noise_share(ratio, blobs, sigma), 1e-4)])
+    start = _start(parts, blobs)
+    outlines = fit_outlines(ratio, start, noise, shadows=everywhere)
+    merged = _merged(outlines, parts)
+    known = ~merged & np.isfinite(outlines.ellipse).all(axis=1)
+    known &= outlines.coverage > _KNOWN_COVERAGE
+    seen = ratio.size if field is None else np.count_nonzero(field)
+    covered = np.pi * float(np.nansum(radius_px(outlines) ** 2)) / max(seen, 1)
+    whole = everywhere or is_crowded(covered, len(blobs), _RIMS_PAY)
+    sure, crowds, kept = outlines.ellipse[known], [], known
+    look = partial(
+        resolved_crowd, ratio, sigma, min_diameter_px=min_diameter_px, min_contrast=min_contrast
+    )
+    if whole:
+        crowds = [look(blobs, parts, sure, WHOLE)]
+        rejected, clusters = rejected + crowds[0].rejected, crowds[0].clusters
+    else:
+        own = np.array([part.blob for part in parts], np.intp)
+        kept = np.ones(len(parts), np.bool_)
+        for k in np.unique(own[merged]).tolist():
+            crowd = look([blobs[k]], [], sure, around(blobs[k], ratio.shape))
+            crowds.append(crowd)
+            sure = np.concatenate([sure, crowd.rims.ellipse])
+            left = sum(cv2.contourArea(line.astype(np.float32)) for line in crowd.clusters)
+            if len(crowd.rims) and left < _LEFT_SHARE * np.prod(blobs[k].box[2:]):
+                kept &= known | (own != k)
+    found = [crowd.rims for crowd in crowds if len(crowd.rims)]
+    if found:
+        every = Rims.concat(found)
+        own_start = start_outlines(every.ellipse, every.blur_px, every.inner)
+        fit = fit_outlines(ratio, joined(taken(start, known), own_start), noise, shadows=True)
+        last = np.arange(np.count_nonzero(known), len(fit.inner))
+        start = joined(taken(start, kept), own_start)
+        outlines = joined(taken(outlines, kept), settled(taken(fit, last), every))
+        merged = np.concatenate([merged[kept], np.zeros(len(last), np.bool_)])
+    elif whole:
+        start, outlines = taken(start, kept), taken(outlines, kept)
+        merged = merged[kept]
+    if not len(start.inner):
+        nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
+        return replace(nothing, clusters=clusters)
+    defocused = _defocused(outlines)
     judged = {"defocus": defocused, "merged": merged}
     columns = _columns(outlines, judged, image.shape, field, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
@@ -338,15 +325,12 @@ def _bubbles(
     return Bubbles(accepted, rejected, noise, reason)
 
 
-def _start(parts: list[Part], blobs: list[Blob], sigma: float, dark_sigma: float) -> Start:
+def _start(parts: list[Part], blobs: list[Blob]) -> Outlines:
     own = [blobs[part.blob] for part in parts]
-    return Start(
-        np.stack([part.ellipse for part in parts]),
-        np.zeros((len(parts), len(HARMONIC_COLUMNS))),
+    return start_outlines(
+        np.array([part.ellipse for part in parts]).reshape(-1, 5),
         np.array([blob.blur_px for blob in own]),
         np.array([blob.inner for blob in own]),
-        np.full(len(parts), sigma),
-        np.full(len(parts), dark_sigma),
     )
 
 
@@ -357,7 +341,7 @@ def _columns(
     field: Bools | None,
     clipped: bool,
 ) -> dict[str, Any]:
-    ellipse, covariance = outlines.ellipse, outlines.centre_covariance_px2
+    ellipse, covariance = outlines.ellipse, outlines.covariance_px2
     area, _ = outline_moments(ellipse, outlines.harmonics)
     columns: dict[str, Any] = {
         "u_px": ellipse[:, 0],
@@ -371,14 +355,15 @@ def _columns(
         "area_px2": area,
         "d_eq_px": 2.0 * np.sqrt(area / np.pi),
         "contrast": (outlines.outer - outlines.inner) / outlines.outer,
-        "edge_px": outlines.blur_px,
+        "edge_px": blur_px(outlines),
         "chi2_dof": outlines.chi2_dof,
-        "sigma_outline_px": np.where(outlines.resolved, outlines.sigma_outline_px, np.nan),
+        "sigma_outline_px": outlines.sigma_outline_px,
         "flags": _flags(outlines, judged, shape, field, clipped),
     }
     # A half turn of the axes changes the sign of the odd orders.
     turned = np.cos(ellipse[:, 4] - columns["angle_rad"]) < 0.0
-    harmonics = np.where(outlines.resolved[:, None], outlines.harmonics, np.nan)
+    resolved = np.isfinite(outlines.sigma_outline_px)[:, None]
+    harmonics = np.where(resolved, outlines.harmonics, np.nan)
     for index, name in enumerate(HARMONIC_COLUMNS):
         odd = name[1] in "35"
         columns[name] = harmonics[:, index] * np.where(turned & odd, -1.0, 1.0)
@@ -394,7 +379,8 @@ def _flags(
 ) -> NDArray[np.object_]:
     ellipse = outlines.ellipse
     rim = points_on(ellipse, outlines.harmonics, np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False))
-    reach = outlines.blur_px[:, None]
+    blur = blur_px(outlines)
+    reach = blur[:, None]
     beyond = (rim[..., 0] < reach - 0.5) | (rim[..., 0] > shape[1] - 0.5 - reach)
     beyond |= (rim[..., 1] < reach - 0.5) | (rim[..., 1] > shape[0] - 0.5 - reach)
     if field is not None:
@@ -402,17 +388,15 @@ def _flags(
         within = cv2.erode(field.astype(np.uint8), np.ones((5, 5), np.uint8))
         beyond |= within[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)] == 0
     border = np.any(beyond, axis=1)
-    hidden = np.zeros(len(ellipse), dtype=np.bool_)
-    blur, own = outlines.blur_px, np.arange(len(ellipse))
-    for index, other in close_pairs(ellipse, ellipse, blur, blur, own):
-        gap = rough_distance(ellipse[other], rim[index, :, 0], rim[index, :, 1])
-        hidden[index] |= bool(np.any(gap < 0.0))
+    gap = rough_distance(ellipse[:, None, None], rim[None, ..., 0], rim[None, ..., 1])
+    gap[np.arange(len(gap)), np.arange(len(gap))] = np.inf
+    hidden = np.any(gap < 0.0, axis=(0, 2))
     words = {
         "border": border,
         "defocus": judged["defocus"],
         "overlap": hidden,
         "merged": judged["merged"],
-        "small": ellipse[:, 3] < _SMALL_EDGES * np.hypot(outlines.blur_px, 0.29),
+        "small": ellipse[:, 3] < _SMALL_EDGES * np.hypot(blur, 0.29),
         "saturated": np.full(len(ellipse), clipped),
     }
     flags = ["|".join(word for word, on in words.items() if on[i]) for i in range(len(ellipse))]
@@ -425,42 +409,37 @@ def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
     This is so for blobs that could not be split and for implausible parts. If one part of a blob is
     implausible, then so are all parts of it of which less than 60 % of the outline is visible.
     """
-    merged: Bools = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
+    merged: Bools = np.array([part.merged for part in parts], np.bool_) | implausible_parts(
+        outlines, parts
+    )
     blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
-    suspect = np.array([part.blob in blobs for part in parts])
+    suspect = np.array([part.blob in blobs for part in parts], np.bool_)
     return merged | (suspect & (outlines.coverage < _MOSTLY_SEEN))
 
 
-def _known(outlines: Outlines, coverage: float) -> Bools:
-    """Return (B,) which fits are finite and saw enough to be kept in a crowd."""
-    finite = np.isfinite(outlines.ellipse).all(axis=1)
-    return np.asarray(finite & (outlines.coverage > coverage))
-
-
-def _defocused(outlines: Outlines, sharp_share: float) -> Bools:
-    """Return which outlines are out of focus; sharp_share : blur over radius of a sharp edge."""
-    sharp = float(np.quantile(outlines.blur_px, 0.25))
-    least = max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX)
-    radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
-    return np.asarray(outlines.blur_px > np.maximum(least, sharp_share * radius))
+def _defocused(outlines: Outlines) -> Bools:
+    """Return which outlines (B,) are out of focus, compared with the sharp ones of the image."""
+    blur = blur_px(outlines)
+    least = max(_DEFOCUS_FACTOR * float(np.quantile(blur, 0.25)), _DEFOCUS_FLOOR_PX)
+    return np.asarray(blur > np.maximum(least, _SHARP_SHARE * radius_px(outlines)))
 
 
 def _reasons(
     outlines: Outlines,
     columns: dict[str, Any],
-    start: Start,
+    start: Outlines,
     min_diameter_px: float,
     min_contrast: float,
 ) -> list[str]:
     """Return for each fitted outline why it is no bubble; an empty text means that it is one."""
-    ellipse, covariance = outlines.ellipse, outlines.centre_covariance_px2
+    ellipse, covariance = outlines.ellipse, outlines.covariance_px2
     every = np.concatenate([ellipse, covariance.reshape(-1, 4)], axis=1)
     finite: Bools = np.asarray(np.isfinite(every).all(1))
     determinant = np.linalg.det(np.where(finite[:, None, None], covariance, 0.0))
     known: Bools = finite & (determinant > 0.0) & (covariance[:, 0, 0] > 0.0)
     d_eq, contrast, (a, b) = columns["d_eq_px"], columns["contrast"], ellipse[:, 2:4].T
     typical = float(np.median(contrast))
-    smudge: Bools = (outlines.blur_px > _SMUDGE_BLUR * b) & (contrast < _SMUDGE * typical)
+    smudge: Bools = (blur_px(outlines) > _SMUDGE_BLUR * b) & (contrast < _SMUDGE * typical)
     jump: Array = np.linalg.norm(ellipse[:, :2] - start.ellipse[:, :2], axis=1)
     unseen = (jump > 0.3 * a + 2.0) | (outlines.coverage < 0.12)
     reasons = [""] * len(a)

@@ -363,7 +363,7 @@ def _detect(scene: Scene, camera: str, frame: int) -> tuple[pd.DataFrame, pd.Dat
         try:
             bubbles = find_bubbles(
                 image, background=level, field=scene.fields.get(camera),
-                min_diameter_px=scene.min_diameter_px, crowds=True,
+                min_diameter_px=scene.min_diameter_px,
             )  # fmt: skip
         except InputError as error:
             raise InputError(

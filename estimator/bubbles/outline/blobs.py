@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
-    deepest_concavity,
-    outline_curvature,
     rough_distance,
 )
-from telerig.estimator.bubbles.outline.kernels import disc_counts, fitted_arcs
-from telerig.estimator.bubbles.outline.outline_fit import Outlines
+from telerig.estimator.bubbles.outline.kernels import Outlines, disc_counts, fitted_arcs
+from telerig.estimator.bubbles.outline.outline_fit import radius_px, shape_oddity
 from telerig.estimator.images.noise import clipped_sigma, high_pass
 
 _NOISE_SAMPLES = 40_000
@@ -350,15 +348,6 @@ def _cut_closed(contour: Array, sense: float) -> list[Array]:
     return _trimmed(points, bounds)
 
 
-def _arcs_between(contour: Array, cuts: Array) -> list[Array]:
-    """Return the arcs of a closed outline (n, 2) between its points nearest to ``cuts`` (m, 2)."""
-    points = _spaced(contour, closed=True)
-    gap = np.hypot(*(points[:, None] - cuts[None]).transpose(2, 0, 1))
-    bounds = np.sort(np.argmin(gap, axis=0)).tolist()
-    points = np.roll(points, -bounds[0], axis=0)
-    return _trimmed(points, [k - bounds[0] for k in bounds] + [len(points)])
-
-
 def _cut_open(contour: Array, sense: float) -> list[Array]:
     if len(contour) < _SHORTEST_ARC:
         return []
@@ -398,15 +387,10 @@ _CANVAS_MARGIN_PX = 2
 """Outline points on the image's edge are left out, which narrows the blob by this much: its rows
 and columns are continued so far beyond its bounding box."""
 
-_NECKS = ((0.03, 2.5), (0.3, 1.3), (1.5, 0.0))
-"""Depth of a concavity and the chi2_dof above which it counts as a neck: strong shape modes have
-concavities too, but then the outline's harmonics describe them."""
 _MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
+_ODD, _BAD_FIT = 4.0, 2.0
+"""Standard deviations of the shapes of an image, and chi2_dof, beyond which it is no bubble."""
 _LARGEST_GROWTH, _LONG = 1.6, 2.3
-_SHARPEST_ORDER, _WHOLE = 35.0, 0.9
-_FLAT, _BETTER = 0.35, 0.6
-"""Curvature (times the radius) of a neck's narrowest places, and the share of the whole's chi2_dof
-below which both halves have to be."""
 
 
 @dataclass(frozen=True)
@@ -594,15 +578,11 @@ def _covered(ellipses: Array, contour: Array) -> float:
 def implausible_outlines(outlines: Outlines) -> Bools:
     """Return which outlines (B,) cannot belong to a single bubble.
 
-    They miss the rim, or have a neck. A slight neck counts only if the outline's harmonics describe
-    the rim badly. Outlines that are partly hidden are not tested for necks.
+    They miss the rim, or they fit badly and have a shape that is unlike the others of the image.
     """
-    depth = deepest_concavity(outlines.ellipse, outlines.harmonics)
-    radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
-    sure = depth > 3.0 * _SHARPEST_ORDER * outlines.sigma_outline_px / radius
-    neck = np.any([(depth > least) & (outlines.chi2_dof > fit) for least, fit in _NECKS], axis=0)
-    neck &= sure & (outlines.coverage > _WHOLE)
-    return np.asarray(neck | (outlines.misfit_px > _MISFIT_PX + _MISFIT_SHARE * radius))
+    radius = radius_px(outlines)
+    odd = (shape_oddity(outlines) > _ODD) & (outlines.chi2_dof > _BAD_FIT)
+    return np.asarray(odd | (outlines.misfit_px > _MISFIT_PX + _MISFIT_SHARE * radius))
 
 
 def implausible_parts(outlines: Outlines, parts: list[Part]) -> Bools:
@@ -611,57 +591,11 @@ def implausible_parts(outlines: Outlines, parts: list[Part]) -> Bools:
     They have an implausible outline (`implausible_outlines`), or their fit ended far from its
     start, because the region was divided wrongly.
     """
-    began = np.stack([part.ellipse for part in parts])
+    began = np.array([part.ellipse for part in parts]).reshape(-1, 5)
     ended = outlines.ellipse
     growth = np.sqrt(ended[:, 2] * ended[:, 3] / (began[:, 2] * began[:, 3]))
     jump = np.hypot(ended[:, 0] - began[:, 0], ended[:, 1] - began[:, 1])
     moved = np.maximum(growth, 1.0 / growth) > _LARGEST_GROWTH
     moved |= (jump > 0.3 * began[:, 3] + 1.0) | (ended[:, 2] > _LONG * ended[:, 3])
-    moved &= np.array([part.shared for part in parts])
-    return implausible_outlines(outlines) | moved
-
-
-def split_at_necks(
-    outlines: Outlines,
-    parts: list[Part],
-    blobs: list[Blob],
-    shape: tuple[int, ...],
-    min_diameter_px: float,
-) -> dict[int, list[Part]]:
-    """Return, by index of the part, the two halves of parts that are a whole region with a neck.
-
-    The fitted outline shows a neck where blur hides the notch in the region's raw outline.
-    """
-    alone = np.bincount([part.blob for part in parts]) == 1
-    necked = implausible_outlines(outlines) & (outlines.coverage > _WHOLE)
-    points, curvature = outline_curvature(outlines.ellipse, outlines.harmonics)
-    turn = curvature * np.sqrt(outlines.ellipse[:, 2:3] * outlines.ellipse[:, 3:4])
-    low = (turn < _FLAT) & (turn <= np.roll(turn, 1, axis=1)) & (turn < np.roll(turn, -1, axis=1))
-    halves = {}
-    for index in np.flatnonzero(necked & (np.count_nonzero(low, axis=1) == 2)).tolist():
-        blob = blobs[parts[index].blob]
-        if not alone[parts[index].blob] or blob.touches_border:
-            continue
-        arcs = _arcs_between(blob.contour_px, points[index][low[index]])
-        found = _explained(arcs, _in_image(blob), shape, min_diameter_px)
-        if len(found) == 2:
-            halves[index] = [Part(e, parts[index].blob, shared=True) for e in found]
-    return halves
-
-
-def confirmed_halves(
-    halves: dict[int, list[Part]], before: Outlines, parts: list[Part], after: Outlines
-) -> dict[int, list[Part]]:
-    """Return those halves of `split_at_necks` that both fit far better than the whole did.
-
-    before : outlines of the parts before they were split.
-    parts, after : all parts after that, and their outlines.
-    """
-    sound = ~implausible_parts(after, parts)
-    better = {}
-    for index, found in halves.items():
-        own = [k for k, part in enumerate(parts) if part.blob == found[0].blob]
-        limit = _BETTER * before.chi2_dof[index]
-        if all(sound[k] and after.chi2_dof[k] < limit for k in own):
-            better[index] = found
-    return better
+    moved &= np.array([part.shared for part in parts], dtype=np.bool_)
+    return np.asarray(implausible_outlines(outlines) | moved)

@@ -6,7 +6,7 @@ the outlines of dark regions that could not be divided.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,7 +20,13 @@ from telerig.estimator.bubbles.outline.blobs import (
     implausible_outlines,
 )
 from telerig.estimator.bubbles.outline.ellipse_geometry import rough_distance
-from telerig.estimator.bubbles.outline.outline_fit import Outlines
+from telerig.estimator.bubbles.outline.kernels import Outlines
+from telerig.estimator.bubbles.outline.outline_fit import (
+    radius_px,
+    start_outlines,
+    taken,
+    updated,
+)
 from telerig.estimator.bubbles.outline.rims import (
     Rims,
     are_bubbles,
@@ -34,6 +40,7 @@ from telerig.estimator.bubbles.outline.rims import (
 
 _LARGEST_SHARE = 6.0
 """The image is so many times as wide as the largest radius of a bubble in a crowd."""
+_AROUND_PX = 10
 _OPENED, _LEFT_AREA = 0.75, 0.5
 _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
@@ -43,17 +50,19 @@ _DISAGREE = 1.0
 _UNLIKE = "its rim is unlike those of the sharp bubbles"
 
 
+Window = tuple[slice, slice]
+WHOLE: Window = (slice(None), slice(None))
+
+
 @dataclass(frozen=True)
 class Crowd:
     """Hold the bubbles of an image that were found by their rims.
 
-    blobs, parts, rims : one of each for every bubble.
+    rims : of the bubbles.
     clusters : outlines (n, 2) in px of dark regions that could not be divided.
     rejected : single dark regions that show no rim like those of the bubbles.
     """
 
-    blobs: list[Blob]
-    parts: list[Part]
     rims: Rims
     clusters: list[Array]
     rejected: list[Rejected]
@@ -65,36 +74,41 @@ def resolved_crowd(
     blobs: list[Blob],
     parts: list[Part],
     known: Array,
+    window: Window,
     *,
     min_diameter_px: float,
     min_contrast: float,
 ) -> Crowd:
-    """Look for rims in the whole image; dark regions that show none are clusters, unless single.
+    """Look for rims in a window of the image; dark regions that show none are clusters, unless
+    single.
 
     ratio : (rows, columns) grey levels divided by the background
     sigma : noise of a pixel.
     blobs, parts : the dark regions, and what their outlines tell of the bubbles in them.
     known : (K, 5) ellipses of bubbles that are sure. Their rims belong to them; they are not among
-        the bubbles that are returned, the blobs of which follow ``blobs``.
+        the bubbles that are returned.
+    window : (rows, columns) of the image, such as `around` gives them.
     """
-    largest = min(ratio.shape) / _LARGEST_SHARE
-    rims = find_rims(ratio, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
+    part = ratio[window]
+    largest = min(min(ratio.shape) / _LARGEST_SHARE, min(part.shape) / 2.0)
+    rims = find_rims(part, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
+    rims = rims.moved(window[1].start or 0, window[0].start or 0)
     single = {part.blob: part.ellipse for part in parts if not (part.merged or part.shared)}
     large = [ellipse for ellipse in single.values() if ellipse[2] * ellipse[3] > largest**2]
     sure = rims_along(ratio, sigma, known.reshape(-1, 5))
     if large:
-        rims = rims.and_also(rims_along(ratio, sigma, np.stack(large)))
-    every = sure.and_also(rims)
+        rims = Rims.concat([rims, rims_along(ratio, sigma, np.stack(large))])
+    every = Rims.concat([sure, rims])
     owners = sole_owners(every, every.agreement, len(sure))
-    heart = typical_heart(every[owners], min_diameter_px)
+    heart = typical_heart(every.take(owners), min_diameter_px)
     kept, evidence = are_bubbles(every, heart, min_contrast)
     kept[: len(sure)] = True
-    every = every[kept]
-    every = every[np.sort(sole_owners(every, evidence[kept], len(sure)))]
+    every = every.take(kept)
+    every = every.take(np.sort(sole_owners(every, evidence[kept], len(sure))))
     several = _over_several(every.ellipse)
     several[: len(sure)] = False
-    every = refitted(every[~several])
-    sure, rims = every[: len(sure)], every[len(sure) :]
+    every = refitted(every.take(~several))
+    rims = every.take(slice(len(sure), None))
     clusters, rejected, explained = [], [], _explained(ratio.shape, every.ellipse)
     for index, blob in enumerate(blobs):
         if index not in single or np.any(_within(blob, every)):
@@ -102,9 +116,7 @@ def resolved_crowd(
         else:
             u, v, a, b, _ = single[index].tolist()
             rejected.append(Rejected(u, v, (a * b) ** 0.5, _UNLIKE))
-    own = [_blob(rims, k) for k in range(len(rims))]
-    found = [Part(ellipse, len(blobs) + k) for k, ellipse in enumerate(rims.ellipse)]
-    return Crowd(own, found, rims, clusters, rejected)
+    return Crowd(rims, clusters, rejected)
 
 
 def _over_several(ellipse: Array) -> Bools:
@@ -134,12 +146,13 @@ def _drawn(contour: Array) -> NDArray[np.float32]:
     return np.ascontiguousarray(known[:, None], np.float32)
 
 
-def _blob(rims: Rims, k: int) -> Blob:
-    points = rims.points[k][rims.used[k]]
-    low = np.maximum(np.floor(points.min(axis=0)), 0.0).astype(int)
-    width, height = (np.ceil(points.max(axis=0)).astype(int) - low + 1).tolist()
-    box = (int(low[0]), int(low[1]), width, height)
-    return Blob(points, float(rims.inner[k]), float(rims.blur_px[k]), box, False)
+def around(blob: Blob, shape: tuple[int, ...]) -> Window:
+    """Return the window of an image in which a blob and the surroundings of its rim are."""
+    x, y, width, height = blob.box
+    return (
+        slice(max(y - _AROUND_PX, 0), min(y + height + _AROUND_PX, shape[0])),
+        slice(max(x - _AROUND_PX, 0), min(x + width + _AROUND_PX, shape[1])),
+    )
 
 
 def _explained(shape: tuple[int, ...], ellipses: Array) -> NDArray[np.uint8]:
@@ -186,35 +199,18 @@ def settled(fitted: Outlines, rims: Rims) -> Outlines:
     """
     radius = np.sqrt(rims.ellipse[:, 2] * rims.ellipse[:, 3])
     away = fitted.ellipse[:, :2] - rims.ellipse[:, :2]
-    growth = np.sqrt(np.abs(fitted.ellipse[:, 2] * fitted.ellipse[:, 3])) / radius
     with np.errstate(divide="ignore", invalid="ignore"):
         near = np.hypot(away[:, 0], away[:, 1]) < _NEAR_SHARE * radius + _NEAR_PX
-        near &= np.abs(np.log(growth)) < _GROWTH
+        near &= np.abs(np.log(radius_px(fitted) / radius)) < _GROWTH
     covariance = rim_covariance(rims)
     sound = near & (fitted.coverage > _LEAST_COVERAGE) & ~implausible_outlines(fitted)
     distance = np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away)
     apart = np.where((distance > _DISAGREE)[:, None, None], away[:, :, None] * away[:, None], 0.0)
-    many, missing = len(rims), np.full(len(rims), np.nan)
-    along = Outlines(
-        ellipse=rims.ellipse,
-        harmonics=np.zeros_like(fitted.harmonics),
-        resolved=np.zeros(many, np.bool_),
-        sigma_px=np.hypot(rims.blur_px, np.sqrt(1.0 / 12.0)),
+    along = start_outlines(rims.ellipse, rims.blur_px, rims.inner)._replace(
         outer=rims.outer,
-        inner=rims.inner,
-        centre_covariance_px2=covariance,
-        misled_px2=np.zeros_like(covariance),
-        sigma_outline_px=missing,
-        chi2_dof=missing,
+        covariance_px2=covariance,
+        chi2_dof=np.full(len(rims), np.nan),
         coverage=np.mean(rims.used, axis=1),
-        misfit_px=np.zeros(many),
-        shift_px=np.zeros(many),
     )
-    result = {}
-    for field in fields(Outlines):
-        old, new = getattr(fitted, field.name), getattr(along, field.name)
-        if field.name == "centre_covariance_px2":
-            old = old + apart
-        keep = sound.reshape(-1, *(1,) * (old.ndim - 1))
-        result[field.name] = np.where(keep, old, new)
-    return Outlines(**result)
+    fitted = fitted._replace(covariance_px2=fitted.covariance_px2 + apart)
+    return updated(fitted, ~sound, taken(along, ~sound))

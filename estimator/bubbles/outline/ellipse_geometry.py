@@ -18,7 +18,6 @@ from telerig.arrays import Array
 
 Floats = NDArray[np.floating[Any]]
 Index = NDArray[np.intp]
-Complex = NDArray[np.complex128]
 
 HARMONICS = (3, 4, 5, 6)
 """Orders of an outline's normal displacement about its ellipse, see `outline_fit`."""
@@ -58,41 +57,6 @@ def harmonic_basis(cos: Floats, sin: Floats) -> Floats:
     return basis
 
 
-def moved(ellipse: Array, step: Array) -> tuple[Array, Array]:
-    """Apply displacements to ellipses.
-
-    ellipse : (B, 5) ellipses.
-    step : (B, 5) displacements (px): of the centre along the major and the minor axis, of a, of b,
-        and the shear between the axes.
-
-    Returns the new ellipses (B, 5), with a >= b > 0, and the angles (B,) in rad by which their
-    major axes have turned.
-    """
-    cos, sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
-    u = ellipse[:, 0] + cos * step[:, 0] - sin * step[:, 1]
-    v = ellipse[:, 1] + sin * step[:, 0] + cos * step[:, 1]
-    a, b = ellipse[:, 2] + step[:, 2], ellipse[:, 3] + step[:, 3]
-    half_sum, half_gap = (a + b) / 2.0, (a - b) / 2.0
-    spread = np.hypot(half_gap, step[:, 4])
-    turn = 0.5 * np.arctan2(step[:, 4], half_gap)
-    minor = np.maximum(half_sum - spread, 0.3)
-    major = np.maximum(half_sum + spread, minor)
-    return np.stack([u, v, major, minor, ellipse[:, 4] + turn], axis=1), turn
-
-
-def turned_harmonics(harmonics: Array, turn: Array) -> Array:
-    """Return the coefficients (B, 8) of the harmonics after the major axes have turned.
-
-    harmonics : (B, 8) coefficients before (px); turn : (B,) angles in rad.
-    """
-    angle = turn[:, None] * np.array(HARMONICS)
-    cos, sin = np.cos(angle), np.sin(angle)
-    c, s = harmonics[:, 0::2], harmonics[:, 1::2]
-    result = np.empty_like(harmonics)
-    result[:, 0::2], result[:, 1::2] = c * cos + s * sin, s * cos - c * sin
-    return result
-
-
 def points_on(ellipse: Array, harmonics: Array, phi: Array) -> Array:
     """Return points on outlines.
 
@@ -115,54 +79,21 @@ def points_on(ellipse: Array, harmonics: Array, phi: Array) -> Array:
     return np.stack([u, v], axis=-1)
 
 
-def _sampled(ellipse: Array, harmonics: Array) -> tuple[Complex, Complex, Complex]:
-    """Return 64 points of each outline as complex numbers u + i v, and their derivatives.
-
-    The points (B, 64) are relative to the ellipse's centre (px). The first and second derivatives
-    (B, 64) are by the eccentric anomaly; a Fourier transform gives them without truncation error.
-    """
-    phi = np.linspace(0.0, 2.0 * np.pi, _SAMPLES, endpoint=False)
-    points = points_on(ellipse * [0.0, 0.0, 1.0, 1.0, 1.0], harmonics, phi)
-    place = points[..., 0] + 1j * points[..., 1]
-    turn = 1j * np.fft.fftfreq(_SAMPLES, 1.0 / _SAMPLES)
-    waves = np.fft.fft(place, axis=1) * turn
-    return place, np.fft.ifft(waves, axis=1), np.fft.ifft(waves * turn, axis=1)
-
-
 def outline_moments(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
     """Return the areas (B,) in px^2 and the centroids (B, 2) in px of what outlines enclose.
 
     ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px), see `points_on`.
     """
-    place, slope, _ = _sampled(ellipse, harmonics)
-    step = np.pi / _SAMPLES
+    phi = np.linspace(0.0, 2.0 * np.pi, _SAMPLES, endpoint=False)
+    points = points_on(ellipse * [0.0, 0.0, 1.0, 1.0, 1.0], harmonics, phi)
+    place, step = points[..., 0] + 1j * points[..., 1], np.pi / _SAMPLES
+    # The derivative by the anomaly, without truncation error.
+    turn = 1j * np.fft.fftfreq(_SAMPLES, 1.0 / _SAMPLES)
+    slope = np.fft.ifft(np.fft.fft(place, axis=1) * turn, axis=1)
     area = step * np.sum((np.conj(place) * slope).imag, axis=1)
     u = step * np.sum(place.real**2 * slope.imag, axis=1) / area
     v = -step * np.sum(place.imag**2 * slope.real, axis=1) / area
     return area, ellipse[:, :2] + np.stack([u, v], axis=1)
-
-
-def outline_curvature(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
-    """Return 64 points (B, 64, 2) in px on each outline, and the curvature (B, 64) there in 1/px.
-
-    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px), see `points_on`. The curvature
-    is positive where the outline is convex.
-    """
-    place, slope, bend = _sampled(ellipse, harmonics)
-    curvature = (np.conj(slope) * bend).imag / np.abs(slope) ** 3
-    return ellipse[:, None, :2] + np.stack([place.real, place.imag], axis=-1), curvature
-
-
-def deepest_concavity(ellipse: Array, harmonics: Array) -> Array:
-    """Return how strongly each outline is curved inwards at most.
-
-    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px), see `points_on`.
-
-    Returns (B,) curvatures multiplied by the mean radius (no unit); 0 for a convex outline.
-    """
-    _, curvature = outline_curvature(ellipse, harmonics)
-    radius = np.sqrt(ellipse[:, 2] * ellipse[:, 3])
-    return np.asarray(np.maximum(-np.min(curvature, axis=1) * radius, 0.0))
 
 
 CENTRE_COLUMNS = ["u_px", "v_px"]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.compiled import compiled
+from telerig.estimator.bubbles.outline import ellipse_geometry
 from telerig.statistics import NORMAL_FROM_MEDIAN
 
 ELLIPSE = 5
@@ -29,118 +30,102 @@ OUTLINE = ELLIPSE + PARAMETERS - FIRST_HARMONIC
 
 DISTANCE_LIMIT, DISTANCE_STEP = 5.5, 0.05
 CURVATURE_LIMIT, CURVATURE_STEP = 1.4, 0.02
-HELD = 1e-7
-"""Prior standard deviation, as a share of the radius, of harmonics that are not fitted."""
+"""Range and step of the profile's table, in units of the blur; its error is below 1e-3."""
 
-MIN_SIGMA_PX = 0.3
-_SECTORS, _CLEAR_SIGMA, _FEW_CLEAR = 16, 2.2, 2
-_OCTANTS, _LAST_RING = 8, 1000
-_UNLIKE_SHARE, _UNLIKE_SIGMA, _UNLIKE_FROM, _MARGIN_SIGMA = 0.015, 3.0, 1.3, 0.9
-_REACH_SIGMA, _REACH_PX = 3.2, 1.2
+RESOLVED_BLURS = 3.0
+"""An outline has harmonics if its minor semi-axis is so many times the blur."""
+PIXEL_VARIANCE_PX2 = 1.0 / 12.0
+
+_LEAST_SIGMA_PX = 0.3
+"""Half of a pixel's width: no image has a sharper edge."""
+_OCTANTS, _SECTORS = 8, 16
+_HALF_OCTANT = np.tan(np.pi / 8.0)
+_UNLIKE_SHARE, _UNLIKE_FROM, _MARGIN_SIGMA = 0.015, 1.3, 0.9
+"""A ring of pixels is unlike a rim beyond this share of the contrast, outside so many blurs; what
+lies so much nearer is left out, too."""
+_BEYOND_CHANCE = 3.0
+"""Standard deviations beyond which a mean is no chance."""
 _THIN_ABOVE_PX = 10.0
+"""Semi-axis above which the first look takes every second row and column."""
 _BENDING_FROM, _MAX_RETREAT = 0.2, 0.3
+"""Blur times a over b squared below which the change of curvature has no effect, and the retreat,
+in blurs, up to which the series holds."""
 _WINDOW_SIGMA, _WINDOW_PX = 3.0, 0.5
-_HIDING_SIGMA = 3.0
-_OUTLIER_SIGMA, _FEW = 4.5, 8
+"""The window of the fit: what lies within three blurs and half a pixel shows the edge."""
+_OUTLIER_SIGMA = 4.5
+_FIRST_STEPS = 2
 _LEVEL_SPREAD = 0.3
+"""Prior standard deviation of both grey levels: the screen's is 1."""
 _CONVERGED_PX = 0.01
+_TILE = 4
+"""Rows whose products are summed at once, so that each value is read once for four of them."""
 _BINS = 32
 _FOOT_ROUNDS = 2
 _OFF_CENTRE = 1e-9
 """The centre of a circle is nearest to no point of it: that much beside it, in units of a."""
+_RIDGE = 1e-7
+"""Added to the equilibrated normal equations, so that they can always be solved."""
+_MEAN_SLOPE = 0.35
+"""RMS of the unit normal density within one sigma."""
+_UNEVEN_LIGHT = np.pi / 4.0
+"""Light that is uneven by a share of the contrast moves a rim by sqrt(pi / 2) times that and the
+blur, and the centre by half of the variance (found on rendered swarms)."""
 
 _POINT_SIGMA_PX, _FAR_PX = 0.2, 0.6
-_ROUND_SHARE, _ARC_ROUNDS, _ARC_CONVERGED_PX = 0.12, 8, 0.01
-_TILE = 4
+"""Scatter of an arc's points, and the distance at which the weight of one is halved."""
+_ROUND_SHARE, _ARC_ROUNDS = 0.12, 8
+"""Prior standard deviation of a - b as a share of the radius: arcs of half an ellipse are usual."""
 
 
-class Rims(NamedTuple):
-    """Hold the outlines of B bubbles, and what is known of them before the fit.
+class Outlines(NamedTuple):
+    """Hold the outlines of B bubbles.
 
-    ellipse : (B, 5) ellipses
-    harmonics : (B, 8) coefficients (px).
-    sigma : (B,) standard deviation of the edges' blur, including the pixel (px).
-    outer, inner : (B,) grey levels outside and inside the bubble, as shares of the background.
-    expected_inner : (B,) prior mean of the grey level inside.
-    noise_outer, noise_inner : (B,) standard deviation of a pixel's noise outside and inside.
-    spread : (B,) prior standard deviation of the harmonics, as a share of the radius; at most
-        ``HELD`` if they are not to be fitted.
-    flattening : (B, 2) prior mean of (a - b) / (a + b) times cosine and sine of twice the angle.
-    flattening_spread : (B,) its prior standard deviation; infinite for none.
+    ellipse : (B, 5) ellipses.
+    harmonics : (B, 8) coefficients (px); 0 where they are not resolved.
+    sigma_px : (B,) standard deviation of the blur of optics and pixel together (px).
+    outer, inner : (B,) grey levels outside and inside, as shares of the background.
+
+    What a fit has shown of them:
+    covariance_px2 : (B, 2, 2) covariance of the ellipse's centre (px^2).
+    sigma_outline_px : (B,) standard deviation of a harmonic's coefficient (px), NaN if the bubble
+        is too small for its blur to have harmonics.
+    chi2_dof : (B,) chi-square per degree of freedom.
+    coverage : (B,) share of the outline that is visible, 0 to 1.
+    misfit_px : (B,) RMS distance between the rim in the image and the outline, beyond the noise.
+    shift_px : (B,) largest displacement since the linearisation (px).
     """
 
     ellipse: Array
     harmonics: Array
-    sigma: Array
+    sigma_px: Array
     outer: Array
     inner: Array
-    expected_inner: Array
-    noise_outer: Array
-    noise_inner: Array
-    spread: Array
+    covariance_px2: Array
+    sigma_outline_px: Array
+    chi2_dof: Array
+    coverage: Array
+    misfit_px: Array
+    shift_px: Array
+
+
+class Prior(NamedTuple):
+    """Hold what is known of B outlines before the fit.
+
+    inner : (B,) mean of the grey level inside.
+    harmonics : (B, 4) standard deviation of the coefficients of each order, as a share of the
+        radius.
+    flattening : (B, 2) mean of (a - b) / (a + b) times cosine and sine of twice the angle.
+    flattening_spread : (B,) standard deviation of both; infinite for none.
+    """
+
+    inner: Array
+    harmonics: Array
     flattening: Array
     flattening_spread: Array
 
 
-class Fits(NamedTuple):
-    """Hold the result of Gauss-Newton steps for B outlines.
-
-    shifts : (B, 13) displacements since the linearisation (px), those of the harmonics included.
-    sigma, outer, inner : (B,) blur (px) and grey levels.
-    covariance : (B, 16, 16) covariance of the parameters.
-    moved_px : (B,) largest of the displacements (px).
-    used : (B,) number of pixels
-    chi2 : (B,) sum of their squared residuals over their variances.
-    coverage : (B,) share of the outline at which pixels of the edge were used.
-    near, near_square : (B,) number of the pixels within one sigma of the outline that no other
-        bubble hides, outliers included, and the sum of their squared residuals.
-    clustered : (B,) factor by which the errors of the pixels, which sectors of the outline have in
-        common, make the centre's variance larger than that of independent errors.
-    light : (B,) variance along the outline of the grey level just outside the edge, beyond its
-        noise, over the square of the contrast.
-    """
-
-    shifts: Array
-    sigma: Array
-    outer: Array
-    inner: Array
-    covariance: Array
-    moved_px: Array
-    used: Ints
-    chi2: Array
-    coverage: Array
-    near: Ints
-    near_square: Array
-    clustered: Array
-    light: Array
-
-
-@compiled
-def _cholesky(matrix: Array) -> None:
-    """Replace a positive definite matrix (n, n) by its Cholesky factor, in the lower triangle."""
-    for j in range(matrix.shape[0]):
-        for i in range(j, matrix.shape[0]):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                matrix[j, j] = np.sqrt(max(total, 1e-300))
-            else:
-                matrix[i, j] = total / matrix[j, j]
-
-
-@compiled
-def _substituted(root: Array, right: Array) -> None:
-    """Replace the right-hand side (n,) by the solution; root : factor of `_cholesky`."""
-    n = root.shape[0]
-    for i in range(n):
-        for k in range(i):
-            right[i] -= root[i, k] * right[k]
-        right[i] /= root[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            right[i] -= root[k, i] * right[k]
-        right[i] /= root[i, i]
+rough_distance = compiled(ellipse_geometry.rough_distance)
+harmonic_basis = compiled(ellipse_geometry.harmonic_basis)
 
 
 @compiled
@@ -229,21 +214,14 @@ def ellipse_basis(foot: Array, out: Array) -> None:
 
 
 @compiled
-def _harmonics(foot: Array, square: float, out: Array) -> None:
-    """Write into ``out`` (8, N) cosine and sine of the orders 3 to 6 at the feet, damped.
+def _damped(basis: Array, square: float) -> None:
+    """Damp cosine and sine (8, N) of the orders 3 to 6 by the blur; square : sigma^2 / R^2.
 
     Blur damps a wave of order k against a shift (k = 1) by I_k / I_1 of Bessel's functions, nearly
-    exp(-(k^2 - 1) sigma^2 / (2 R^2)). square : sigma^2 / R^2.
+    exp(-(k^2 - 1) sigma^2 / (2 R^2)).
     """
-    gain = np.empty(4)
     for order in range(4):
-        gain[order] = np.exp((1.0 - (order + 3.0) * (order + 3.0)) * square / 2.0)
-    for k in range(foot.shape[1]):
-        cos, sin = foot[0, k], foot[1, k]
-        real, imaginary = cos * cos - sin * sin, 2.0 * sin * cos
-        for order in range(4):
-            real, imaginary = real * cos - imaginary * sin, real * sin + imaginary * cos
-            out[2 * order, k], out[2 * order + 1, k] = gain[order] * real, gain[order] * imaginary
+        basis[2 * order : 2 * order + 2] *= np.exp((1.0 - (order + 3.0) ** 2) * square / 2.0)
 
 
 @compiled
@@ -297,28 +275,19 @@ def _gathered(image: Float32, ellipse: Array, reach_px: float, step: int) -> Arr
 
 
 @compiled
-def _hidden(pixels: Array, own: int, ellipse: Array, everyone: Array, sigma: Array) -> Bools:
+def _hidden(pixels: Array, own: int, ellipse: Array, sigma: Array) -> Bools:
     """Return (N,) whether each pixel lies inside or near the ellipse of another bubble.
 
-    own : position of the bubble among all; ellipse : (5,) its ellipse.
-    everyone : (A, 5) ellipses of all bubbles; sigma : (A,) blur of their edges (px).
+    own : position of the bubble among all; ellipse : (A, 5) ellipses of all bubbles; sigma : (A,)
+    blur of their edges (px).
     """
     hidden = np.zeros(pixels.shape[1], dtype=np.bool_)
-    size = ellipse[2] + 2.0 * _HIDING_SIGMA * sigma[own]
-    for other in range(everyone.shape[0]):
-        du, dv = ellipse[0] - everyone[other, 0], ellipse[1] - everyone[other, 1]
-        reach = _HIDING_SIGMA * sigma[other]
-        far = size + everyone[other, 2] + 2.0 * reach
-        if other == own or du * du + dv * dv >= far * far:
-            continue
-        cos, sin = np.cos(everyone[other, 4]), np.sin(everyone[other, 4])
-        per_a, per_b = 1.0 / everyone[other, 2], 1.0 / everyone[other, 3]
-        for k in range(hidden.size):
-            du, dv = pixels[0, k] - everyone[other, 0], pixels[1, k] - everyone[other, 1]
-            x, y = (du * cos + dv * sin) * per_a, (dv * cos - du * sin) * per_b
-            level = np.sqrt(x * x + y * y) + 1e-12
-            slope = np.sqrt((x * per_a) ** 2 + (y * per_b) ** 2) + 1e-12
-            hidden[k] |= (level - 1.0) * level < reach * slope
+    reach = _WINDOW_SIGMA * sigma
+    size = ellipse[:, 2] + 2.0 * reach
+    for other in range(ellipse.shape[0]):
+        du, dv = ellipse[own, 0] - ellipse[other, 0], ellipse[own, 1] - ellipse[other, 1]
+        if other != own and np.sqrt(du * du + dv * dv) < size[own] + size[other]:
+            hidden |= rough_distance(ellipse[other], pixels[0], pixels[1]) < reach[other]
     return hidden
 
 
@@ -346,7 +315,7 @@ def _retreat(ellipse: Array, sigma: float, foot: Array) -> Array:
 
 
 @compiled
-def _profile(table: Array, distance: float, curvature: float) -> tuple[float, float, float]:
+def profile(table: Array, distance: float, curvature: float) -> tuple[float, float, float]:
     """Share of the disc's level, and its derivatives by distance and by curvature.
 
     table : (curvatures, distances), interpolated bilinearly; the error is at most 1e-3 of the
@@ -369,19 +338,9 @@ def _profile(table: Array, distance: float, curvature: float) -> tuple[float, fl
 
 
 @compiled
-def profiles(table: Array, distance: Array, curvature: Array) -> Array:
-    """Return (3, N): the profile of a blurred disc at N places, its derivative with respect to the
-    distance from the outline, and that with respect to the curvature; see `_profile`."""
-    out = np.empty((3, distance.size))
-    for k in range(distance.size):
-        out[0, k], out[1, k], out[2, k] = _profile(table, distance[k], curvature[k])
-    return out
-
-
-@compiled
 def _ring(distance: float) -> int:
     """Return the number of a ring of 1 px; NaN and what is very far share the last one."""
-    return int(abs(distance)) if abs(distance) < _LAST_RING else _LAST_RING
+    return int(abs(distance)) if abs(distance) < 1000 else 1000
 
 
 @compiled
@@ -419,7 +378,7 @@ def _unlike_rim(
         for ring in range(int(np.ceil(_UNLIKE_FROM * sigma)), rings):
             many = count[part, ring]
             mean = sign * total[part, ring] / max(many, 1.0)
-            strong = mean > _UNLIKE_SHARE * contrast and mean * np.sqrt(many) > _UNLIKE_SIGMA
+            strong = mean > _UNLIKE_SHARE * contrast and mean * np.sqrt(many) > _BEYOND_CHANCE
             if strong and many > 1.0:
                 cut[part] = ring
                 break
@@ -430,28 +389,6 @@ def _unlike_rim(
 
 
 @compiled
-def _middle(values: Array, many: int) -> float:
-    """Return the median of the first ``many`` values; changes their order (Hoare's selection)."""
-    low, high, place = 0, many - 1, many // 2
-    while low < high:
-        pivot, i, j = values[place], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < place:
-            low = i
-        if place < i:
-            high = j
-    return float(values[place])
-
-
-@compiled
 def _window(
     table: Array,
     pixels: Array,
@@ -459,20 +396,22 @@ def _window(
     distance: Array,
     retreat: Array,
     hidden: Bools,
-    rims: Rims,
-    b: int,
+    levels: Array,
+    noise: Array,
 ) -> Array:
-    """Return the weights (N,): inverse variances of the pixels, 0 for those that are left out."""
-    outside, sigma = rims.noise_outer[b] ** 2, rims.sigma[b]
-    change = rims.noise_inner[b] ** 2 - outside
-    contrast = rims.outer[b] - rims.inner[b]
+    """Return the weights (N,): inverse variances of the pixels, 0 for those that are left out.
+
+    levels : blur (px), outer and inner level. noise : outside and inside.
+    """
+    sigma, outer, contrast = levels[0], levels[1], levels[1] - levels[2]
+    outside, change = noise[0] ** 2, noise[1] ** 2 - noise[0] ** 2
     inverse, residual = np.empty(distance.size), np.empty(distance.size)
     for k in range(distance.size):
-        covered = _profile(table, (distance[k] + retreat[k]) / sigma, foot[4, k] * sigma)[0]
+        covered = profile(table, (distance[k] + retreat[k]) / sigma, foot[4, k] * sigma)[0]
         inverse[k] = 1.0 / (outside + change * covered)
-        left = pixels[2, k] - rims.outer[b] + contrast * covered
+        left = pixels[2, k] - outer + contrast * covered
         residual[k] = left * np.sqrt(inverse[k])
-    unlike = _unlike_rim(foot, distance, residual, sigma, contrast / rims.noise_outer[b])
+    unlike = _unlike_rim(foot, distance, residual, sigma, contrast / noise[0])
     reach = _WINDOW_SIGMA * sigma + _WINDOW_PX
     sizes, many = np.empty(distance.size), 0
     for k in range(distance.size):
@@ -482,7 +421,7 @@ def _window(
             many += 1
         else:
             inverse[k] = 0.0
-    typical = NORMAL_FROM_MEDIAN * _middle(sizes, many) if many > _FEW else 1.0
+    typical = NORMAL_FROM_MEDIAN * np.median(sizes[:many]) if many > 0 else 1.0
     limit = _OUTLIER_SIGMA * max(typical, 1.0)
     for k in range(distance.size):
         if not abs(residual[k]) < limit:
@@ -519,7 +458,7 @@ def _derivatives(
             pixels[1, k] * sigma,
             pixels[4, k],
         )
-        covered, by_distance, by_curvature = _profile(table, away, curvature)
+        covered, by_distance, by_curvature = profile(table, away, curvature)
         slope = contrast / sigma * root
         rows[BLUR, k] = slope * (curvature * by_curvature - by_distance * away)
         rows[OUTER, k], rows[INNER, k] = root * (1.0 - covered), root * covered
@@ -532,24 +471,25 @@ def _derivatives(
 
 
 @compiled
-def _with_prior(total: Array, rims: Rims, b: int, levels: Array, shifts: Array) -> None:
+def _with_prior(
+    total: Array, prior: Prior, b: int, ellipse: Array, levels: Array, shifts: Array
+) -> None:
     """Add the prior of a bubble to its normal equations; their right-hand side is the last row."""
     last, level = total.shape[0] - 1, 1.0 / _LEVEL_SPREAD**2
     total[OUTER, OUTER] += level
     total[INNER, INNER] += level
     total[last, OUTER] -= level * (levels[1] - 1.0)
-    total[last, INNER] -= level * (levels[2] - rims.expected_inner[b])
-    if last > FIRST_HARMONIC:
-        weight = 1.0 / (rims.spread[b] ** 2 * rims.ellipse[b, 2] * rims.ellipse[b, 3])
-        for i in range(FIRST_HARMONIC, last):
-            total[i, i] += weight
-            total[last, i] -= weight * shifts[i + ELLIPSE - FIRST_HARMONIC]
-    radius = np.sqrt(rims.ellipse[b, 2] * rims.ellipse[b, 3])
-    weight = 1.0 / (rims.flattening_spread[b] * radius) ** 2
-    cos, sin = np.cos(2.0 * rims.ellipse[b, 4]), np.sin(2.0 * rims.ellipse[b, 4])
-    along = rims.flattening[b, 0] * cos + rims.flattening[b, 1] * sin
-    across = rims.flattening[b, 1] * cos - rims.flattening[b, 0] * sin
-    half = (rims.ellipse[b, 2] + shifts[2] - rims.ellipse[b, 3] - shifts[3]) / 2.0
+    total[last, INNER] -= level * (levels[2] - prior.inner[b])
+    radius = np.sqrt(ellipse[2] * ellipse[3])
+    for i in range(FIRST_HARMONIC, last):
+        weight = 1.0 / (prior.harmonics[b, (i - FIRST_HARMONIC) // 2] * radius) ** 2
+        total[i, i] += weight
+        total[last, i] -= weight * shifts[i + ELLIPSE - FIRST_HARMONIC]
+    weight = 1.0 / (prior.flattening_spread[b] * radius) ** 2
+    cos, sin = np.cos(2.0 * ellipse[4]), np.sin(2.0 * ellipse[4])
+    along = prior.flattening[b, 0] * cos + prior.flattening[b, 1] * sin
+    across = prior.flattening[b, 1] * cos - prior.flattening[b, 0] * sin
+    half = (ellipse[2] + shifts[2] - ellipse[3] - shifts[3]) / 2.0
     miss = weight * (half - radius * along) / 2.0
     total[2, 2] += weight / 4.0
     total[3, 3] += weight / 4.0
@@ -561,27 +501,27 @@ def _with_prior(total: Array, rims: Rims, b: int, levels: Array, shifts: Array) 
 
 
 @compiled
-def _solved(total: Array, step: Array, covariance: Array) -> None:
-    """Solve normal equations (lower triangle, right-hand side as last row) for step and
-    covariance."""
-    many = step.size
-    scale, root = np.empty(many), np.empty((many, many))
+def _solved(total: Array, covariance: Array) -> Array:
+    """Solve normal equations (lower triangle, right-hand side as last row).
+
+    Returns the solution (n,), NaN if there is none; writes the inverse into ``covariance``.
+    """
+    many = total.shape[0] - 1
+    whole = np.empty((many, many))
+    scale = np.empty(many)
     for i in range(many):
         scale[i] = 1.0 / np.sqrt(max(total[i, i], 1e-12))
         for j in range(i + 1):
-            root[i, j] = total[i, j] * scale[i] * scale[j]
-        root[i, i] += 1e-7
-        step[i] = scale[i] * total[many, i]
-    _cholesky(root)
-    _substituted(root, step)
-    right = np.empty(many)
+            whole[i, j] = whole[j, i] = total[i, j] * scale[i] * scale[j]
+        whole[i, i] += _RIDGE
+    if not (_reach(whole.ravel()) < np.inf and _reach(total[many, :many]) < np.inf):
+        covariance[:] = 0.0
+        return np.full(many, np.nan)
+    inverse = np.linalg.inv(whole)
     for i in range(many):
-        step[i] *= scale[i]
         for j in range(many):
-            right[j] = scale[i] if i == j else 0.0
-        _substituted(root, right)
-        for j in range(many):
-            covariance[i, j] = scale[j] * right[j]
+            covariance[i, j] = scale[i] * inverse[i, j] * scale[j]
+    return covariance @ total[many, :many]
 
 
 @compiled
@@ -617,151 +557,188 @@ def _judged(
     hidden: Bools,
     weight: Array,
     levels: Array,
-    b: int,
-    fits: Fits,
-) -> None:
-    """Write into ``fits`` how well a fitted outline agrees with its pixels."""
+    noise: Array,
+) -> tuple[float, float, float]:
+    """Return the sum of squared weighted residuals of a fitted outline, its coverage, and its
+    misfit (px), which includes outliers."""
     sigma, outer, contrast = levels[0], levels[1], levels[2] - levels[1]
-    seen = np.zeros(_BINS)
+    seen, chi2, many, square = np.zeros(_BINS), 0.0, 0, 0.0
     for k in range(distance.size):
         near = abs(distance[k]) < sigma and not hidden[k]
         if not near and weight[k] == 0.0:
             continue
-        away = (distance[k] + retreat[k]) / sigma
-        covered = _profile(table, away, foot[4, k] * sigma)[0]
-        square = (pixels[2, k] - outer - contrast * covered) ** 2
+        covered = profile(table, (distance[k] + retreat[k]) / sigma, foot[4, k] * sigma)[0]
+        residual = pixels[2, k] - outer - contrast * covered
         if near:
-            fits.near[b] += 1
-            fits.near_square[b] += square
+            many += 1
+            square += residual * residual
         if weight[k] > 0.0:
-            fits.used[b] += 1
-            fits.chi2[b] += weight[k] * square
+            chi2 += weight[k] * residual * residual
             if abs(distance[k]) < 1.2 * sigma + 0.3:
                 angle = np.arctan2(foot[1, k], foot[0, k]) + np.pi
                 seen[int(angle * (_BINS / (2.0 * np.pi))) % _BINS] = 1.0
-    for k in range(_BINS):
-        fits.coverage[b] += seen[k] / _BINS
+    excess = max(square / max(many, 1) - noise[0] ** 2, 0.0)
+    slope = max(_MEAN_SLOPE * abs(contrast) / sigma, 1e-9)
+    return chi2, float(np.mean(seen)), float(np.sqrt(excess)) / slope
 
 
 @compiled
-def _sector(cos: float, sin: float) -> int:
-    return int((np.arctan2(sin, cos) / (2.0 * np.pi) + 0.5) * _SECTORS) % _SECTORS
+def _sectors(foot: Array) -> Ints:
+    """Return which sixteenth of the outline (N,) the feet are in, in no order."""
+    out = np.empty(foot.shape[1], dtype=np.int64)
+    for k in range(out.size):
+        cos, sin = abs(foot[0, k]), abs(foot[1, k])
+        octant = 4 * (foot[0, k] > 0.0) + 2 * (foot[1, k] > 0.0) + (cos > sin)
+        out[k] = 2 * octant + (min(cos, sin) > _HALF_OCTANT * max(cos, sin))
+    return out
 
 
 @compiled
-def _clustered(foot: Array, used: Ints, rows: Array, covariance: Array) -> float:
+def _clustered(first: Ints, rows: Array, step: Array, covariance: Array) -> float:
     """Return the variance of the centre with errors that pixels of a sector share, over that with
-    independent errors (the sandwich estimator for clusters, less what the fit absorbs).
+    independent errors (the sandwich estimator for clusters, less what the fit absorbs); 1 if that
+    may be chance.
 
-    foot : (7, N) of `feet`; used : (M,) the pixels of the fit. rows : (n + 1, M) whitened
-    derivatives and residuals; covariance : (n, n) or larger, of the parameters.
+    first : (17,) where the pixels of the sectors begin. rows : (n + 1, M) whitened derivatives and
+    residuals before the last step (n,); covariance : (n, n), of the parameters.
     """
     many = rows.shape[0] - 1
-    shared = expected = 0.0
+    shared = expected = chance = 0.0
+    pull, gain = np.empty(rows.shape[1]), np.empty(many)
     for axis in range(2):
-        shift, own = np.zeros(_SECTORS), np.zeros(_SECTORS)
-        gain = np.zeros((_SECTORS, many))
-        for k in range(used.size):
-            pull = 0.0
-            for i in range(many):
-                pull += covariance[axis, i] * rows[i, k]
-            sector = _sector(foot[0, used[k]], foot[1, used[k]])
-            shift[sector] += pull * rows[many, k]
-            own[sector] += pull * pull
-            for i in range(many):
-                gain[sector, i] += pull * rows[i, k]
+        pull[:] = 0.0
+        for i in range(many):
+            for k in range(pull.size):
+                pull[k] += covariance[axis, i] * rows[i, k]
         for sector in range(_SECTORS):
+            low, high = first[sector], first[sector + 1]
+            shift = own = 0.0
+            for k in range(low, high):
+                shift += pull[k] * rows[many, k]
+                own += pull[k] * pull[k]
             for i in range(many):
-                for j in range(many):
-                    own[sector] -= gain[sector, i] * covariance[i, j] * gain[sector, j]
-        shared += np.sum(shift**2) / covariance[axis, axis]
-        expected += np.sum(own) / covariance[axis, axis]
+                gain[i] = 0.0
+                for k in range(low, high):
+                    gain[i] += pull[k] * rows[i, k]
+            shift -= np.sum(gain * step)
+            own -= np.sum(gain * (covariance @ gain))
+            shared += shift * shift / covariance[axis, axis]
+            expected += own / covariance[axis, axis]
+            chance += 2.0 * (own / covariance[axis, axis]) ** 2
+    if shared < expected + _BEYOND_CHANCE * np.sqrt(chance):
+        return 1.0
     return float(shared / max(expected, 1e-9))
 
 
 @compiled
 def _light(
-    foot: Array, distance: Array, values: Array, hidden: Bools, sigma: float, noise: float
+    sector: Ints, distance: Array, values: Array, hidden: Bools, sigma: float, noise: float
 ) -> float:
-    """Return the variance along an outline of the level (1) just outside its edge, less its noise.
+    """Return the variance along an outline of the level just outside its edge, less its noise;
+    0 if that may be chance.
 
     distance, values, hidden : (N,) distances of the pixels from the outline (px), grey levels, and
     whether another bubble hides them; sigma : blur (px); noise : standard deviation of a pixel.
     """
     count, level = np.zeros(_SECTORS), np.zeros(_SECTORS)
     for k in range(distance.size):
-        if distance[k] > _CLEAR_SIGMA * sigma and not hidden[k]:
-            sector = _sector(foot[0, k], foot[1, k])
-            count[sector] += 1.0
-            level[sector] += values[k]
-    seen = count > _FEW_CLEAR
+        if distance[k] > 2.2 * sigma and not hidden[k]:
+            count[sector[k]] += 1.0
+            level[sector[k]] += values[k]
+    seen = count > 2
     if np.sum(seen) < _SECTORS // 4:
         return 0.0
     count, level = count[seen], level[seen] / count[seen]
-    # Twice the noise: the median has some, too, and the rest is to be no chance.
-    chance = 2.0 * noise * noise * float(np.mean(1.0 / count))
-    return max(float(np.mean((level - np.median(level)) ** 2)) - chance, 0.0)
+    variance, own = float(np.mean((level - np.median(level)) ** 2)), noise * noise / count
+    expected, chance = float(np.mean(own)), np.sqrt(2.0 * np.sum(own**2)) / count.size
+    return variance - expected if variance > expected + _BEYOND_CHANCE * chance else 0.0
 
 
 @compiled
-def _no_fits(many: int) -> Fits:
-    return Fits(
-        np.zeros((many, OUTLINE)),
-        np.zeros(many),
-        np.zeros(many),
-        np.zeros(many),
-        np.zeros((many, PARAMETERS, PARAMETERS)),
-        np.zeros(many),
-        np.zeros(many, dtype=np.int64),
-        np.zeros(many),
-        np.zeros(many),
-        np.zeros(many, dtype=np.int64),
-        np.zeros(many),
-        np.zeros(many),
-        np.zeros(many),
-    )
+def _move(ellipse: Array, step: Array) -> float:
+    """Apply displacements (5,) to an ellipse; return the angle (rad) by which it has turned."""
+    cos, sin = np.cos(ellipse[4]), np.sin(ellipse[4])
+    ellipse[0] += cos * step[0] - sin * step[1]
+    ellipse[1] += sin * step[0] + cos * step[1]
+    a, b = ellipse[2] + step[2], ellipse[3] + step[3]
+    half_gap = (a - b) / 2.0
+    apart = np.sqrt(half_gap * half_gap + step[4] * step[4])
+    ellipse[3] = max((a + b) / 2.0 - apart, 0.3)
+    ellipse[2] = max((a + b) / 2.0 + apart, ellipse[3])
+    turn: float = 0.5 * np.arctan2(step[4], half_gap)
+    ellipse[4] += turn
+    return turn
 
 
-STEPS = 3
+@compiled
+def _turned(harmonics: Array, turn: float) -> None:
+    """Turn the coefficients (8,) of the harmonics after the major axis has turned (rad)."""
+    for order in range(4):
+        cos, sin = np.cos((order + 3) * turn), np.sin((order + 3) * turn)
+        c, s = harmonics[2 * order], harmonics[2 * order + 1]
+        harmonics[2 * order], harmonics[2 * order + 1] = c * cos + s * sin, s * cos - c * sin
+
+
+@compiled
+def _misled(
+    sector: Ints, distance: Array, pixels: Array, hidden: Bools, levels: Array, noise: Array,
+    first: Ints, rows: Array, step: Array, covariance: Array, out: Array,
+) -> None:  # fmt: skip
+    """Add to a centre's covariance ``out`` (2, 2) what pixels that err together, beyond chance, and
+    uneven light make of it."""
+    out *= _clustered(first, rows, step, covariance)
+    light = _light(sector, distance, pixels[2], hidden, levels[0], noise[0])
+    light *= (levels[0] / max(levels[1] - levels[2], 1e-3)) ** 2
+    out[0, 0] += _UNEVEN_LIGHT * light
+    out[1, 1] += _UNEVEN_LIGHT * light
+
+
+@compiled
+def _copied(outlines: Outlines, own: Ints) -> Outlines:
+    many = own.size
+    return Outlines(
+        outlines.ellipse[own], outlines.harmonics[own], outlines.sigma_px[own],
+        outlines.outer[own], outlines.inner[own], np.zeros((many, 2, 2)), np.full(many, np.nan),
+        np.zeros(many), np.zeros(many), np.zeros(many), np.zeros(many),
+    )  # fmt: skip
 
 
 @compiled
 def fitted(
     image: Float32,
     table: Array,
-    rims: Rims,
+    noise: Array,
+    outlines: Outlines,
     own: Ints,
-    everyone: Array,
-    everyone_sigma: Array,
+    prior: Prior,
     steps: int,
-    crowded: bool,
-) -> Fits:
-    """Fit B outlines by Gauss-Newton steps, the nearest points on the ellipses held fixed.
+    misled_below: float,
+) -> Outlines:
+    """Fit outlines by Gauss-Newton steps, the nearest points on the ellipses held fixed.
 
     image : (rows, columns) grey levels divided by the background.
-    table : profile of a blurred disc, see `profiles`.
-    rims : the outlines at the start
-    own : (B,) their positions among all bubbles of the image.
-    everyone, everyone_sigma : (A, 5) ellipses and (A,) blurs of all bubbles. Pixels inside or near
-        another bubble are left out.
-    steps : largest number of steps. With ``STEPS`` all pixels at the rim are used, except glare,
-        dirt and outliers; with less, some in a narrow band.
-    crowded : whether to measure what neighbours and shadows do, `Fits.clustered` and `Fits.light`.
+    table : profile of a blurred disc (curvatures, distances), see `profile`.
+    noise : (2,) standard deviation of a pixel outside and inside the bubbles.
+    outlines : all outlines of the image; pixels inside or near another one are left out.
+    own : (B,) those that are fitted; prior : of all.
+    steps : largest number of steps; none is a first look, at some pixels in a narrow band, that
+        finds the ellipse, blur and levels.
+    misled_below : coverage of an outline below which its centre's covariance has what misleads its
+        fit (`_misled`).
     """
-    fits = _no_fits(rims.sigma.size)
-    for b in range(rims.sigma.size):
-        ellipse, sigma, first_look = rims.ellipse[b], rims.sigma[b], steps < STEPS
-        fits.sigma[b], fits.outer[b], fits.inner[b] = sigma, rims.outer[b], rims.inner[b]
+    fit = _copied(outlines, own)
+    for b in range(own.size):
+        ellipse, harmonics, sigma = fit.ellipse[b], fit.harmonics[b], fit.sigma_px[b]
         if not (_reach(ellipse) < np.inf and abs(sigma) < np.inf):
             continue
-        held = rims.spread[b] <= HELD
-        shifts, levels = fits.shifts[b], np.empty(3)
-        levels[0], levels[1], levels[2] = sigma, rims.outer[b], rims.inner[b]
-        reach = _REACH_SIGMA * sigma + _REACH_PX
+        first_look = steps == 0
+        held = first_look or ellipse[3] <= RESOLVED_BLURS * sigma
+        levels = np.array([sigma, fit.outer[b], fit.inner[b]])
+        shifts = np.zeros(OUTLINE)
+        reach = _WINDOW_SIGMA * sigma + _WINDOW_PX + 0.2 * sigma + 0.7
         if not held:
-            for i in range(OUTLINE - ELLIPSE):
-                shifts[ELLIPSE + i] = rims.harmonics[b, i]
-                reach += abs(rims.harmonics[b, i])
+            shifts[ELLIPSE:] = harmonics
+            reach += np.sum(np.abs(harmonics))
         thin = first_look and ellipse[3] > _THIN_ABOVE_PX
         pixels = _gathered(image, ellipse, reach, 2 if thin else 1)
         many = pixels.shape[1]
@@ -769,27 +746,28 @@ def fitted(
         feet(ellipse, pixels[0], pixels[1], foot)
         ellipse_basis(foot, shape[:ELLIPSE])
         if not held:
-            square = sigma * sigma / (ellipse[2] * ellipse[3])
-            _harmonics(foot, square, shape[ELLIPSE:])
+            shape[ELLIPSE:] = harmonic_basis(foot[0], foot[1])
+            _damped(shape[ELLIPSE:], sigma * sigma / (ellipse[2] * ellipse[3]))
         retreat = _retreat(ellipse, sigma, foot)
-        hidden = _hidden(pixels, own[b], ellipse, everyone, everyone_sigma)
+        hidden = _hidden(pixels, own[b], outlines.ellipse, outlines.sigma_px)
         distance = np.empty(many)
         _distances(shape, foot, shifts, distance)
         if first_look:
             lowest = -min(2.0 * sigma + 0.5, 0.45 * ellipse[3])
-            weight = np.empty(many)
-            for k in range(many):
-                inside = lowest < distance[k] < 2.5 * sigma + 1.0 and not hidden[k]
-                weight[k] = 1.0 / rims.noise_outer[b] ** 2 if inside else 0.0
+            inside = (lowest < distance) & (distance < 2.5 * sigma + 1.0) & ~hidden
+            weight = np.where(inside, 1.0 / noise[0] ** 2, 0.0)
         else:
-            weight = _window(table, pixels, foot, distance, retreat, hidden, rims, b)
-        used = np.empty(many, dtype=np.int64)
-        count = 0
-        for k in range(many):
-            if weight[k] > 0.0:
-                used[count] = k
-                count += 1
-        used = used[:count]
+            weight = _window(table, pixels, foot, distance, retreat, hidden, levels, noise)
+        sector, used = _sectors(foot), np.empty(many, dtype=np.int64)
+        first = np.zeros(_SECTORS + 1, dtype=np.int64)
+        for part in range(_SECTORS):
+            count = first[part]
+            for k in range(many):
+                if sector[k] == part and weight[k] > 0.0:
+                    used[count] = k
+                    count += 1
+            first[part + 1] = count
+        used = used[: first[_SECTORS]]
         taken, bent = np.empty((5, used.size)), np.empty((shape.shape[0], used.size))
         start = np.empty((3, used.size))
         for k in range(used.size):
@@ -799,42 +777,53 @@ def fitted(
         for i in range(shape.shape[0]):
             for k in range(used.size):
                 bent[i, k] = shape[i, used[k]]
-        fitted_ones = FIRST_HARMONIC if held else PARAMETERS
-        rows = np.empty((fitted_ones + 1, used.size))
-        total, step = np.empty((fitted_ones + 1, fitted_ones + 1)), np.empty(fitted_ones)
-        covariance, away = fits.covariance[b], np.empty(used.size)
-        began = shifts.copy()
-        for _ in range(steps):
+        free = FIRST_HARMONIC if held else PARAMETERS
+        rows, total = np.empty((free + 1, used.size)), np.empty((free + 1, free + 1))
+        covariance, away, began = np.zeros((free, free)), np.empty(used.size), shifts.copy()
+        step = np.zeros(free)
+        for _ in range(max(steps, _FIRST_STEPS)):
             _distances(bent, start, shifts, away)
             _derivatives(table, taken, bent, away, levels, rows)
             products(rows, used.size, total)
-            _with_prior(total, rims, b, levels, shifts)
-            _solved(total, step, covariance)
+            _with_prior(total, prior, own[b], ellipse, levels, shifts)
+            step = _solved(total, covariance)
             if not _reach(step) < np.inf:
-                covariance[:] = 0.0
                 break
             reach = _limited(step, ellipse[3], levels[0])
             for i in range(shape.shape[0]):
                 shifts[i] += step[i if i < ELLIPSE else i + FIRST_HARMONIC - ELLIPSE]
-            levels[0] = max(levels[0] + step[BLUR], MIN_SIGMA_PX)
+            levels[0] = max(levels[0] + step[BLUR], _LEAST_SIGMA_PX)
             levels[1] += step[OUTER]
             levels[2] += step[INNER]
             if reach < _CONVERGED_PX:
                 break
-        fits.sigma[b], fits.outer[b], fits.inner[b] = levels[0], levels[1], levels[2]
-        for i in range(OUTLINE):
-            fits.moved_px[b] = max(fits.moved_px[b], abs(shifts[i] - began[i]))
+        fit.sigma_px[b], fit.outer[b], fit.inner[b] = levels
+        fit.shift_px[b] = np.max(np.abs(shifts - began))
         if not first_look:
             _distances(shape, foot, shifts, distance)
-            _judged(table, pixels, foot, distance, retreat, hidden, weight, levels, b, fits)
-            if not crowded:
-                continue
-            _distances(bent, start, shifts, away)
-            _derivatives(table, taken, bent, away, levels, rows)
-            fits.clustered[b] = _clustered(foot, used, rows, covariance)
-            light = _light(foot, distance, pixels[2], hidden, levels[0], rims.noise_outer[b])
-            fits.light[b] = light / max(levels[1] - levels[2], 1e-3) ** 2
-    return fits
+            chi2, fit.coverage[b], fit.misfit_px[b] = _judged(
+                table, pixels, foot, distance, retreat, hidden, weight, levels, noise
+            )
+            dof = max(used.size - free, 1.0)
+            fit.chi2_dof[b] = chi2 / dof
+            if chi2 / dof > 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / dof):
+                covariance *= chi2 / dof
+            centre = fit.covariance_px2[b]
+            centre[:] = covariance[:2, :2]
+            if fit.coverage[b] < misled_below and used.size > free:
+                _misled(
+                    sector, distance, pixels, hidden, levels, noise,
+                    first, rows, step, covariance, centre,
+                )  # fmt: skip
+            cos, sin = np.cos(ellipse[4]), np.sin(ellipse[4])
+            turn = np.array([[cos, -sin], [sin, cos]])
+            centre[:] = turn @ np.ascontiguousarray(centre) @ turn.T
+            if not held:
+                variances = np.diag(covariance)[FIRST_HARMONIC:]
+                fit.sigma_outline_px[b] = np.sqrt(max(float(np.mean(variances)), 0.0))
+        harmonics[:] = shifts[ELLIPSE:]
+        _turned(harmonics, _move(ellipse, shifts[:ELLIPSE]))
+    return fit
 
 
 @compiled
@@ -849,28 +838,14 @@ def _circle(u: Array, v: Array, out: Array) -> None:
         right[0] += u[k] * square
         right[1] += v[k] * square
         right[2] += square
+    total[0, 1] = total[1, 0]
     # The sums of u and of v are 0: the origin is the points' mean.
     total[0, 0] += 1e-9
     total[1, 1] += 1e-9
     total[2, 2] = u.size + 1e-9
-    _cholesky(total)
-    _substituted(total, right)
-    radius = np.sqrt(max(right[2] + (right[0] * right[0] + right[1] * right[1]) / 4.0, 0.5))
-    out[0], out[1], out[2], out[3], out[4] = right[0] / 2.0, right[1] / 2.0, radius, radius, 0.0
-
-
-@compiled
-def _move(ellipse: Array, step: Array) -> None:
-    """Apply displacements (5,) to an ellipse, see `ellipse_geometry.moved`."""
-    cos, sin = np.cos(ellipse[4]), np.sin(ellipse[4])
-    ellipse[0] += cos * step[0] - sin * step[1]
-    ellipse[1] += sin * step[0] + cos * step[1]
-    a, b = ellipse[2] + step[2], ellipse[3] + step[3]
-    half_gap = (a - b) / 2.0
-    apart = np.sqrt(half_gap * half_gap + step[4] * step[4])
-    ellipse[3] = max((a + b) / 2.0 - apart, 0.3)
-    ellipse[2] = max((a + b) / 2.0 + apart, ellipse[3])
-    ellipse[4] += 0.5 * np.arctan2(step[4], half_gap)
+    u0, v0, rest = np.linalg.solve(total, right)
+    radius = np.sqrt(max(rest + (u0 * u0 + v0 * v0) / 4.0, 0.5))
+    out[0], out[1], out[2], out[3], out[4] = u0 / 2.0, v0 / 2.0, radius, radius, 0.0
 
 
 @compiled
@@ -900,7 +875,7 @@ def fitted_arcs(points: Array, sizes: Ints) -> tuple[Array, Array]:
     Returns the ellipses (B, 5) and the RMS distances (B,) of their points (px).
     """
     ellipses, rms = np.empty((sizes.size, ELLIPSE)), np.empty(sizes.size)
-    total, step = np.empty((ELLIPSE + 1, ELLIPSE + 1)), np.empty(ELLIPSE)
+    total, covariance = np.empty((ELLIPSE + 1, ELLIPSE + 1)), np.empty((ELLIPSE, ELLIPSE))
     first = 0
     for arc in range(sizes.size):
         many, ellipse = sizes[arc], ellipses[arc]
@@ -928,16 +903,10 @@ def fitted_arcs(points: Array, sizes: Ints) -> tuple[Array, Array]:
                 rows[ELLIPSE, k] = foot[2, k] * root
             products(rows, many, total)
             _roundness(total, ellipse, _ROUND_SHARE * radius)
-            _cholesky(total[:ELLIPSE, :ELLIPSE])
-            for i in range(ELLIPSE):
-                step[i] = total[ELLIPSE, i]
-            _substituted(total[:ELLIPSE, :ELLIPSE], step)
+            step = _solved(total, covariance)
             reach = _reach(step)
-            share = min(1.0, 0.4 * ellipse[3] / (reach + 1e-12))
-            for i in range(ELLIPSE):
-                step[i] *= share
-            _move(ellipse, step)
-            if not reach >= _ARC_CONVERGED_PX:
+            _move(ellipse, step * min(1.0, 0.4 * ellipse[3] / (reach + 1e-12)))
+            if not reach >= _CONVERGED_PX:
                 feet(ellipse, u, v, foot)
                 break
         square = 0.0

@@ -15,38 +15,17 @@ part is hidden it does, and the harmonics of the frame's whole outlines serve as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
 
 from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.bubbles.outline import kernels
-from telerig.estimator.bubbles.outline.ellipse_geometry import Index, moved, turned_harmonics
+from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS, Index
+from telerig.estimator.bubbles.outline.kernels import Outlines, Prior
 from telerig.statistics import robust_sd
 
 _NODES = 96
-
-
-def close_pairs(
-    ellipse: Array, everyone: Array, reach_px: Array, reach_everyone_px: Array, own: Index
-) -> list[tuple[int, int]]:
-    """Find pairs of ellipses that may be near each other.
-
-    ellipse : (B, 5) ellipses
-    everyone : (A, 5) ellipses with which they are compared.
-    reach_px, reach_everyone_px : (B,), (A,) widths (px) of the surroundings of each ellipse.
-    own : (B,) positions of the B ellipses in ``everyone``; these pairs are left out.
-
-    Returns pairs (position in ``ellipse``, position in ``everyone``).
-    """
-    size, other_size = ellipse[:, 2] + 2.0 * reach_px, everyone[:, 2] + 2.0 * reach_everyone_px
-    gap = np.hypot(
-        ellipse[:, None, 0] - everyone[None, :, 0], ellipse[:, None, 1] - everyone[None, :, 1]
-    )
-    near = gap < size[:, None] + other_size[None, :]
-    near[np.arange(own.size), own] = False
-    return [(int(i), int(j)) for i, j in np.argwhere(near)]
 
 
 def blurred_disc(distance: Array, radius: Array) -> Array:
@@ -84,337 +63,147 @@ def profile_table() -> Array:
     return np.stack([ndtr(-t), *(blurred_disc(t, np.full(1, 1.0 / value)) for value in q)])
 
 
-_FREE, _UNLEARNT, _LEAST = 0.25, 0.02, 0.002
+_FREE, _UNLEARNT, _LEAST = 0.25, 0.02, 0.001
 """Prior standard deviations of the harmonics' coefficients, as shares of the radius. The first is
 so wide that it does not affect whole outlines. The second holds if there are no whole outlines to
 learn from. The third is the least value that is learnt."""
-
-_WIDENED = 1.5
-_ENOUGH_WHOLE = 4
-
-
 _UNLEARNT_FLATTENING, _LEAST_FLATTENING = 0.08, 0.01
 """The same two for the flattening (a - b) / (a + b)."""
+_WIDENED = 1.5
+"""What is learnt from a few outlines holds for others within so much."""
+_MEDIAN_OF_TWO = 0.693
+"""Median of the mean of two squares of unit variance."""
+_ENOUGH_WHOLE = 4
+_WHOLE = 0.9
+_FAR_SHIFT_PX = 0.25
+_STEPS = 3
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Hold what is known of B outlines before the fit.
+def start_outlines(ellipse: Array, blur_px: Array, inner: Array) -> Outlines:
+    """Return outlines (B,) before the fit: ellipses (B, 5), blur of the optics (B,) in px, and grey
+    level inside (B,), as a share of the background."""
+    many, zero = len(ellipse), np.zeros(len(ellipse))
+    sigma = np.sqrt(blur_px**2 + kernels.PIXEL_VARIANCE_PX2)
+    return Outlines(
+        ellipse.astype(np.float64), np.zeros((many, 2 * len(HARMONICS))), sigma, np.ones(many),
+        inner.astype(np.float64), np.full((many, 2, 2), np.nan), np.full(many, np.nan),
+        zero, zero, zero, zero,
+    )  # fmt: skip
 
-    harmonics : (B,) standard deviation of the harmonics' coefficients, as a share of the radius.
-    flattening : (B, 2) mean of (a - b) / (a + b) times cosine and sine of twice the angle.
-    flattening_spread : (B,) standard deviation of both; infinite for none.
+
+def taken(outlines: Outlines, index: Index | Bools) -> Outlines:
+    """Return the outlines at the positions ``index``."""
+    return Outlines(*(values[index] for values in outlines))
+
+
+def joined(first: Outlines, last: Outlines) -> Outlines:
+    """Return the outlines of both."""
+    return Outlines(*(np.concatenate(both) for both in zip(first, last, strict=True)))
+
+
+def updated(outlines: Outlines, index: Index | Bools, other: Outlines) -> Outlines:
+    """Return a copy with the outlines at the positions ``index`` replaced by ``other``."""
+    copy = Outlines(*(values.copy() for values in outlines))
+    for values, new in zip(copy, other, strict=True):
+        values[index] = new
+    return copy
+
+
+def blur_px(outlines: Outlines) -> Array:
+    """Return the blur (B,) of the optics alone (standard deviation, px)."""
+    return np.asarray(np.sqrt(np.maximum(outlines.sigma_px**2 - kernels.PIXEL_VARIANCE_PX2, 0.0)))
+
+
+def radius_px(outlines: Outlines) -> Array:
+    """Return the radius (B,) of the circle of an ellipse's area (px)."""
+    return np.asarray(np.sqrt(np.abs(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])))
+
+
+def _whole(outlines: Outlines) -> Bools:
+    return np.asarray((outlines.coverage >= _WHOLE) & np.isfinite(outlines.sigma_outline_px))
+
+
+def shape_spread(outlines: Outlines) -> Array | None:
+    """Return the standard deviation (4,) of the coefficients of each order over the whole outlines
+    of an image, as shares of the radius; None if these are too few.
     """
-
-    harmonics: Array
-    flattening: Array
-    flattening_spread: Array
-
-    @staticmethod
-    def weak(harmonics: Array) -> Prior:
-        """Return the prior without information on the flattening."""
-        count = len(harmonics)
-        return Prior(harmonics, np.zeros((count, 2)), np.full(count, np.inf))
-
-    def taken(self, index: Index) -> Prior:
-        """Return that of the outlines at the positions ``index``."""
-        return Prior(*(getattr(self, field.name)[index] for field in fields(self)))
+    whole = taken(outlines, _whole(outlines))
+    if len(whole.chi2_dof) < _ENOUGH_WHOLE:
+        return None
+    square = np.median(_power(whole), axis=0) / _MEDIAN_OF_TWO
+    return np.maximum(np.sqrt(square), _LEAST)
 
 
-def learnt_prior(outlines: Outlines, partial: Bools, *, flattening: bool) -> Prior:
+def _power(outlines: Outlines) -> Array:
+    """Return the mean squares (B, 4) of both coefficients of each order, as shares of the radius's
+    square."""
+    share = (outlines.harmonics / radius_px(outlines)[:, None]).reshape(-1, len(HARMONICS), 2)
+    return np.asarray(np.mean(share**2, axis=2))
+
+
+def shape_oddity(outlines: Outlines) -> Array:
+    """Return how many standard deviations (B,) a whole outline's coefficients of any order are off
+    those of the others of the image; 0 where that is not known."""
+    learnt, whole = shape_spread(outlines), _whole(outlines)
+    spread = np.full(len(HARMONICS), _UNLEARNT) if learnt is None else learnt
+    own = (outlines.sigma_outline_px / radius_px(outlines))[:, None]
+    odd = np.max(np.sqrt(_power(outlines) / (spread**2 + own**2)), axis=1)
+    return np.where(whole, odd, 0.0)
+
+
+def learnt_prior(outlines: Outlines, inner: Array) -> Prior:
     """Return a prior of each outline's shape.
 
-    That of partly hidden outlines is estimated from the whole outlines of the same frame. All
-    others get a weak prior, and all do if too few outlines are whole.
+    That of outlines that are partly hidden is learnt from the whole ones of the same image, order
+    by order, because the coefficients fall with the order. All others have a weak prior.
 
-    partial : (B,) True for outlines that are partly hidden.
-    flattening : whether the flattening is estimated from the whole outlines, too.
+    inner : (B,) prior mean of the grey level inside.
     """
-    prior = Prior.weak(np.where(partial, learnt_spread(outlines), _FREE))
-    if flattening:
-        middle, spread = np.zeros(2), _UNLEARNT_FLATTENING
-        a, b, angle = outlines.ellipse[outlines.resolved & ~partial, 2:].T
-        if len(a) >= _ENOUGH_WHOLE:
-            share = ((a - b) / (a + b))[:, None]
-            own = share * np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], axis=1)
-            middle = np.median(own, axis=0)
-            spread = max(_WIDENED * float(robust_sd(own - middle)), _LEAST_FLATTENING)
-        prior.flattening[partial], prior.flattening_spread[partial] = middle, spread
+    many, partial = len(inner), outlines.coverage < _WHOLE
+    prior = Prior(
+        inner, np.full((many, len(HARMONICS)), _FREE), np.zeros((many, 2)), np.full(many, np.inf)
+    )
+    prior.harmonics[partial], prior.flattening_spread[partial] = _UNLEARNT, _UNLEARNT_FLATTENING
+    spread = shape_spread(outlines)
+    if spread is not None:
+        prior.harmonics[partial] = _WIDENED * spread
+        a, b, angle = outlines.ellipse[_whole(outlines), 2:].T
+        own = np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], 1) * ((a - b) / (a + b))[:, None]
+        middle = np.median(own, axis=0)
+        sd = max(_WIDENED * float(robust_sd(own - middle)), _LEAST_FLATTENING)
+        prior.flattening[partial], prior.flattening_spread[partial] = middle, sd
     return prior
 
 
-def learnt_spread(outlines: Outlines) -> float:
-    """Return the prior standard deviation of partly hidden outlines' harmonics, in radii.
-
-    It is learnt from the frame's whole outlines. The prior of these has no effect.
-    """
-    whole = outlines.resolved & (outlines.coverage >= _WHOLE)
-    if np.count_nonzero(whole) < _ENOUGH_WHOLE:
-        return _UNLEARNT
-    radius = np.sqrt(outlines.ellipse[whole, 2] * outlines.ellipse[whole, 3])
-    typical = np.median(np.mean((outlines.harmonics[whole] / radius[:, None]) ** 2, axis=1))
-    return max(_WIDENED * float(np.sqrt(typical)), _LEAST)
-
-
-_PIXEL_VARIANCE_PX2 = 1.0 / 12.0
-_RESOLVED_BLURS = 3.0
-_WHOLE = 0.9
-_FIRST_STEPS = 2
-_FAR_SHIFT_PX = 0.25
-_CHANCE = 1.75
-"""Three standard deviations above 1 of the mean of 32 squares: two coordinates, 16 sectors."""
-_UNEVEN_LIGHT = np.pi / 4.0
-_SHAPE_TO_CENTRE = 8.0
-_MEAN_SLOPE = 0.35
-"""RMS of the unit normal density within one sigma."""
-
-
-@dataclass(frozen=True)
-class Start:
-    """Hold the start values of the fits of B outlines.
-
-    ellipse : (B, 5) ellipses
-    harmonics : (B, 8) coefficients (px).
-    blur_px : (B,) standard deviation of the optical blur (px).
-    inner : (B,) grey level inside the bubble, as a share of the background.
-    sigma_outer, sigma_inner : (B,) standard deviation of a pixel's noise outside and inside the
-        bubble, as shares of the background.
-    """
-
-    ellipse: Array
-    harmonics: Array
-    blur_px: Array
-    inner: Array
-    sigma_outer: Array
-    sigma_inner: Array
-
-    def __len__(self) -> int:
-        return int(self.ellipse.shape[0])
-
-    def __getitem__(self, index: Index) -> Start:
-        return Start(*(getattr(self, field.name)[index] for field in fields(self)))
-
-
-@dataclass(frozen=True)
-class RimState:
-    """Hold the outlines of B bubbles during a fit.
-
-    ellipse : (B, 5) ellipses
-    harmonics : (B, 8) coefficients (px).
-    sigma : (B,) standard deviation of the edges' blur, including the pixel (px).
-    outer, inner : (B,) grey levels outside and inside the bubble, as shares of the background.
-    """
-
-    ellipse: Array
-    harmonics: Array
-    sigma: Array
-    outer: Array
-    inner: Array
-
-    def rims(self, start: Start, prior: Prior) -> kernels.Rims:
-        """Return the outlines as the fit takes them."""
-        every = (
-            *(getattr(self, field.name) for field in fields(self)),
-            *(start.inner, start.sigma_outer, start.sigma_inner),
-            *(prior.harmonics, prior.flattening, prior.flattening_spread),
-        )
-        return kernels.Rims(*(np.ascontiguousarray(values, np.float64) for values in every))
-
-
-@dataclass(frozen=True)
-class Outlines:
-    """Hold the fitted outlines of B bubbles.
-
-    ellipse : (B, 5) ellipses.
-    harmonics : (B, 8) coefficients (px); they are 0 where ``resolved`` is False.
-    resolved : (B,) whether the bubble is large enough, compared with its blur, to fit harmonics.
-    sigma_px : (B,) standard deviation of the blur of optics and pixel together (px).
-    outer, inner : (B,) grey levels outside and inside, as shares of the background.
-    centre_covariance_px2 : (B, 2, 2) covariance of the ellipse's centre (px^2).
-    misled_px2 : (B, 2, 2) what pixels that err together and uneven light add to it (px^2).
-    sigma_outline_px : (B,) standard deviation of a harmonic's coefficient (px).
-    chi2_dof : (B,) chi-square per degree of freedom.
-    coverage : (B,) share of the outline that is visible, 0 to 1.
-    misfit_px : (B,) RMS distance between the rim in the image and the outline, beyond the noise
-        (px).
-    shift_px : (B,) largest displacement since the linearisation (px).
-    """
-
-    ellipse: Array
-    harmonics: Array
-    resolved: Bools
-    sigma_px: Array
-    outer: Array
-    inner: Array
-    centre_covariance_px2: Array
-    misled_px2: Array
-    sigma_outline_px: Array
-    chi2_dof: Array
-    coverage: Array
-    misfit_px: Array
-    shift_px: Array
-
-    @property
-    def blur_px(self) -> Array:
-        """Return the blur (B,) of the optics alone (standard deviation, px)."""
-        return np.asarray(np.sqrt(np.maximum(self.sigma_px**2 - _PIXEL_VARIANCE_PX2, 0.0)))
-
-    def state(self, index: Index) -> RimState:
-        """Return the outlines at the positions ``index`` as the state from which a fit goes on."""
-        every = (self.ellipse, self.harmonics, self.sigma_px, self.outer, self.inner)
-        return RimState(*(values[index] for values in every))
-
-    def taken(self, index: Index) -> Outlines:
-        """Return the outlines at the positions ``index``."""
-        return Outlines(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    def updated(self, index: Index, other: Outlines) -> Outlines:
-        """Return a copy with the outlines at the positions ``index`` replaced by ``other``."""
-        changed = {}
-        for field in fields(self):
-            changed[field.name] = getattr(self, field.name).copy()
-            changed[field.name][index] = getattr(other, field.name)
-        return Outlines(**changed)
-
-
-def fit_outlines(ratio: Float32, start: Start, *, crowded: bool = False) -> Outlines:
+def fit_outlines(
+    ratio: Float32, start: Outlines, noise: Array, *, shadows: bool = False
+) -> Outlines:
     """Fit the outlines of B bubbles to an image.
 
     ratio : (rows, columns) grey levels divided by the background.
-    start : start values of the B outlines.
-    crowded : whether to measure what misleads fits in a crowd; without it ``misled_px2`` is 0.
+    start : see `start_outlines`.
+    noise : (2,) standard deviation of a pixel outside and inside, as shares of the background.
+    shadows : whether the image has shadows of bubbles out of focus or behind others, so that the
+        covariance of whole outlines has that, too.
 
     Pixels inside or near another bubble of ``start`` are left out, and so are glare, dirt and other
     pixels that do not look like a rim. A first fit to some of the pixels yields blur and levels.
-    The fit to all pixels is repeated for outlines that moved far or are partly hidden.
+    The fit to all pixels is repeated for outlines that moved far or are partly hidden. The
+    covariance of the latter has what their residuals show of neighbours that mislead them.
     """
-    ratio = np.ascontiguousarray(ratio, np.float32)
-    everyone = np.arange(len(start))
-    state = RimState(
-        start.ellipse,
-        start.harmonics,
-        np.sqrt(start.blur_px**2 + _PIXEL_VARIANCE_PX2),
-        np.ones(len(start)),
-        start.inner,
-    )
-    state = _first_look(ratio, state, start)
-    prior = Prior.weak(np.full(len(start), _FREE))
-    fit = _refined(ratio, state, start, state, everyone, prior, crowded)
-    partial = fit.coverage < _WHOLE
-    again = np.flatnonzero(partial | (fit.shift_px > _FAR_SHIFT_PX))
+    image, table = np.ascontiguousarray(ratio, np.float32), profile_table()
+    own, below = np.arange(len(start.inner)), 2.0 if shadows else _WHOLE
+    whole = start._replace(coverage=np.ones(own.size))
+    prior = learnt_prior(whole, start.inner)
+    fit = kernels.fitted(image, table, noise, start, own, prior, 0, below)
+    fit = kernels.fitted(image, table, noise, fit, own, prior, _STEPS, below)
+    again = (fit.coverage < _WHOLE) | (fit.shift_px > _FAR_SHIFT_PX)
     for _ in range(2):
-        if again.size == 0:
+        own = np.flatnonzero(again)
+        if own.size == 0:
             break
-        prior = learnt_prior(fit, partial, flattening=not crowded).taken(again)
-        near = _refined(
-            ratio, fit.state(again), start[again], fit.state(everyone), again, prior, crowded
-        )
-        fit = fit.updated(again, near)
-        again = again[near.shift_px > _FAR_SHIFT_PX]
+        prior = learnt_prior(fit, start.inner)
+        near = kernels.fitted(image, table, noise, fit, own, prior, _STEPS, below)
+        fit = updated(fit, own, near)
+        again = fit.shift_px > _FAR_SHIFT_PX
     return fit
-
-
-def widened(fit: Outlines) -> Outlines:
-    """Add to the centres' covariances what misleads fits in a crowd.
-
-    Besides ``misled_px2``: what bends an outline in the orders 3 to 6 shifts its centre, too,
-    unless it is the bubble's own shape. The variance of the coefficients beyond noise and
-    `learnt_spread` is added, times a factor found on rendered swarms: the variance falls with the
-    order.
-    """
-    radius = np.sqrt(np.abs(fit.ellipse[:, 2] * fit.ellipse[:, 3]))
-    own = learnt_spread(fit) * radius
-    excess = np.mean(fit.harmonics**2, axis=1) - 2.0 * fit.sigma_outline_px**2 - own**2
-    excess = _SHAPE_TO_CENTRE * np.where(fit.resolved, np.maximum(excess, 0.0), 0.0)
-    covariance = fit.centre_covariance_px2 + fit.misled_px2 + excess[:, None, None] * np.eye(2)
-    return replace(fit, centre_covariance_px2=covariance)
-
-
-def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
-    """Fit ellipse, blur and levels to some of the pixels in a narrow band at the rim."""
-    everyone = np.arange(len(start))
-    rims = state.rims(start, Prior.weak(np.zeros(len(start))))
-    found = kernels.fitted(
-        ratio, profile_table(), rims, everyone, rims.ellipse, rims.sigma, _FIRST_STEPS, False
-    )
-    return _moved(state, found)
-
-
-def _refined(
-    ratio: Float32,
-    state: RimState,
-    start: Start,
-    everyone: RimState,
-    own: Index,
-    prior: Prior,
-    crowded: bool,
-) -> Outlines:
-    """Fit the outlines of some bubbles with one linearisation.
-
-    state, start : the bubbles to fit; own : their positions in ``everyone``.
-    everyone : the outlines of all bubbles in the image.
-    """
-    resolved = state.ellipse[:, 3] > _RESOLVED_BLURS * state.sigma
-    rims = state.rims(start, replace(prior, harmonics=np.where(resolved, prior.harmonics, 0.0)))
-    table = profile_table()
-    found = kernels.fitted(
-        ratio, table, rims, own, everyone.ellipse, everyone.sigma, kernels.STEPS, crowded
-    )
-    return _result(_moved(state, found), found, state, start, resolved)
-
-
-def _moved(state: RimState, found: kernels.Fits) -> RimState:
-    shifts = found.shifts
-    ellipse, turn = moved(state.ellipse, shifts[:, : kernels.ELLIPSE])
-    harmonics = turned_harmonics(shifts[:, kernels.ELLIPSE :], turn)
-    return RimState(ellipse, harmonics, found.sigma, found.outer, found.inner)
-
-
-def _misfit(state: RimState, found: kernels.Fits, start: Start) -> Array:
-    """Return the RMS distance (B,) between the rim in the image and the outline (px).
-
-    It is the RMS of the grey residuals near the steepest part of the edge, divided by the edge's
-    slope. Outliers are included; the variance of the noise is subtracted.
-    """
-    excess = found.near_square / np.maximum(found.near, 1) - start.sigma_outer**2
-    slope = _MEAN_SLOPE * (state.outer - state.inner) / state.sigma
-    return np.asarray(np.sqrt(np.maximum(excess, 0.0)) / np.maximum(slope, 1e-9))
-
-
-def _result(
-    state: RimState, found: kernels.Fits, before: RimState, start: Start, resolved: Bools
-) -> Outlines:
-    """Make the public result of the fits.
-
-    Covariances are multiplied by chi2_dof if this exceeds 1 by 3 standard deviations. What
-    misleads multiplies that of the centre by `kernels.Fits.clustered`, if that is no chance, and
-    uneven light moves a piece of rim by sqrt(pi / 2) sigma times its share of the contrast, and the
-    centre by half of the variance (found on rendered swarms).
-    """
-    fitted = np.where(resolved, kernels.PARAMETERS, kernels.FIRST_HARMONIC)
-    dof = np.maximum(found.used - fitted, 1.0)
-    chi2_dof = found.chi2 / dof
-    misfit = np.where(chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / dof), chi2_dof, 1.0)
-    covariance = found.covariance * misfit[:, None, None]
-    angle = before.ellipse[:, 4]
-    cos, sin = np.cos(angle), np.sin(angle)
-    turn = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
-    shared = np.where(found.clustered > _CHANCE, found.clustered, 1.0)
-    misled = covariance[:, :2, :2] * (shared - 1.0)[:, None, None]
-    misled += (_UNEVEN_LIGHT * found.light * state.sigma**2)[:, None, None] * np.eye(2)
-    variances = np.einsum("bii->bi", covariance)[:, kernels.FIRST_HARMONIC :]
-    return Outlines(
-        state.ellipse,
-        state.harmonics,
-        resolved,
-        state.sigma,
-        state.outer,
-        state.inner,
-        turn @ covariance[:, :2, :2] @ np.swapaxes(turn, 1, 2),
-        turn @ misled @ np.swapaxes(turn, 1, 2),
-        np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0)),
-        chi2_dof,
-        found.coverage,
-        _misfit(state, found, start),
-        found.moved_px,
-    )

@@ -14,13 +14,13 @@ owned by them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from scipy import fft, ndimage, special
 
-from telerig.arrays import Array, Bools, Float32
+from telerig.arrays import Array, Bools, Float32, Rows
 from telerig.estimator.bubbles.outline import rim_kernels
 from telerig.estimator.bubbles.outline.ellipse_geometry import Index, rough_distance
 from telerig.estimator.bubbles.outline.kernels import fitted_arcs
@@ -44,7 +44,7 @@ _LEAST_VARIANCE_PX2 = 0.01**2
 
 
 @dataclass(frozen=True)
-class Rims:
+class Rims(Rows):
     """Hold N candidate bubbles with what is seen of their rims.
 
     ellipse : (N, 5) ellipses.
@@ -78,13 +78,11 @@ class Rims:
     def __len__(self) -> int:
         return int(self.ellipse.shape[0])
 
-    def __getitem__(self, index: Index | Bools | slice) -> Rims:
-        return Rims(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    def and_also(self, other: Rims) -> Rims:
-        """Return the candidates of both."""
-        names = [field.name for field in fields(Rims)]
-        return Rims(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+    def moved(self, u_px: float, v_px: float) -> Rims:
+        """Return the same candidates as they are in an image of which this one is a part."""
+        by = np.array([u_px, v_px])
+        ellipse = self.ellipse + [u_px, v_px, 0.0, 0.0, 0.0]
+        return replace(self, ellipse=ellipse, points=self.points + by, places=self.places + by)
 
 
 def find_rims(
@@ -113,6 +111,7 @@ def find_rims(
     calm = [_blurred(image, _CALM_CELLS) for image in levels]
     ellipse = np.column_stack([circle[:, :3], circle[:, 2], np.zeros(len(circle))])
     points, used, alive = _followed(calm, floors, ellipse, octave)
+    alive &= ellipse[:, 2] * ellipse[:, 3] < largest_radius_px**2
     return measured_rims(calm[0], sigma, ellipse[alive], points[alive], used[alive])
 
 
@@ -232,7 +231,7 @@ def typical_heart(rims: Rims, min_diameter_px: float) -> float:
     are out of focus and have none.
     """
     radius = np.sqrt(rims.ellipse[:, 2] * rims.ellipse[:, 3])
-    large = rims[radius > _LARGE_SHARE * min_diameter_px]
+    large = rims.take(radius > _LARGE_SHARE * min_diameter_px)
     if not len(large):
         return 0.0
     sure = large.agreement >= min(float(np.quantile(large.agreement, _SURE_SHARE)), _SURE)

@@ -5,11 +5,17 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from telerig import compiled
 from telerig.estimator.bubbles.outline import kernels
-from telerig.estimator.bubbles.outline.outline_fit import blurred_disc, profile_table
+from telerig.estimator.bubbles.outline.outline_fit import (
+    blurred_disc,
+    learnt_prior,
+    profile_table,
+    start_outlines,
+)
 
 
 @pytest.mark.parametrize("many", [9, 17])
@@ -54,34 +60,35 @@ def test_the_centre_of_a_circle_has_a_foot() -> None:
     np.testing.assert_allclose(foot[2:5, 0], [-3.0, 3.0, 1 / 3], rtol=1e-6)
 
 
+def profiles(distance: NDArray[np.float64], curvature: NDArray[np.float64]) -> NDArray[np.float64]:
+    table = profile_table()
+    return np.array([kernels.profile(table, d, c) for d, c in zip(distance, curvature)]).T
+
+
 def test_profile_is_that_of_a_blurred_disc_and_survives_nan() -> None:
     rng = np.random.default_rng(7)
     distance, curvature = rng.uniform(-4.0, 4.0, 300), rng.uniform(0.02, 1.3, 300)
-    value, by_distance, by_curvature = kernels.profiles(profile_table(), distance, curvature)
+    value, by_distance, by_curvature = profiles(distance, curvature)
     np.testing.assert_allclose(value, blurred_disc(distance, 1.0 / curvature), atol=1e-3)
     step = 0.3
     ends = (blurred_disc(distance + d, 1.0 / curvature) for d in (step / 2, -step / 2))
     np.testing.assert_allclose(by_distance, np.subtract(*ends) / step, atol=0.02)
-    straight = kernels.profiles(profile_table(), distance, np.zeros(300))[0]
+    straight = profiles(distance, np.zeros(300))[0]
     np.testing.assert_allclose(straight, ndtr(-distance), atol=1e-4)
     assert np.isfinite(by_curvature).all()
-    assert kernels.profiles(profile_table(), np.full(3, np.nan), np.full(3, np.nan)).shape == (3, 3)
+    assert len(kernels.profile(profile_table(), np.nan, np.nan)) == 3
 
 
 def test_impossible_starts_end_without_a_covariance() -> None:
     starts = np.array(
         [[np.nan] * 5, [50.0, 50, 1e9, 1e-3, 0], [1e15, 0, 5, 5, 0], [50, 50, 9, 8, 0]]
     )
-    ones = np.ones(4)
-    rims = kernels.Rims(
-        starts, np.zeros((4, 8)), np.array([1.0, 1, 1, np.nan]), ones, ones, ones, ones, ones,
-        np.full(4, 0.2), np.zeros((4, 2)), np.full(4, np.inf),
-    )  # fmt: skip
-    image = np.ones((100, 100), np.float32)
-    found = kernels.fitted(
-        image, profile_table(), rims, np.arange(4), rims.ellipse, rims.sigma, kernels.STEPS, True
-    )
-    assert not found.covariance[[0, 3]].any() and not found.coverage[[0, 2, 3]].any()
+    start = start_outlines(starts, np.array([1.0, 1, 1, np.nan]), np.ones(4))
+    prior = learnt_prior(start._replace(coverage=np.ones(4)), start.inner)
+    image, noise = np.ones((100, 100), np.float32), np.ones(2)
+    found = kernels.fitted(image, profile_table(), noise, start, np.arange(4), prior, 3, 1.0)
+    assert not found.coverage[[0, 2, 3]].any()
+    assert not found.covariance_px2[[0, 3]].any()
 
 
 def test_ellipses_along_arcs_are_found_again() -> None:

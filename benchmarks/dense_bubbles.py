@@ -37,9 +37,10 @@ from skimage.filters import threshold_otsu
 from skimage.measure import label, regionprops
 from skimage.segmentation import watershed
 
+from telerig.estimator.bubbles.background.screen import screen_level
 from telerig.estimator.bubbles.detect import find_bubbles
 from telerig.estimator.bubbles.field import lit_field
-from telerig.estimator.bubbles.flat_field import normalised, screen_of_field
+from telerig.estimator.bubbles.flat_field import normalised
 
 Array = NDArray[np.float64]
 Peer = Callable[..., Array]
@@ -51,7 +52,7 @@ COVERED = (0.1, 0.2, 0.3, 0.4)
 def prepared(image: NDArray[np.generic]) -> Array:
     """Grey over the level of the screen; what is not the lit field is 1."""
     field = lit_field(image)
-    background = None if field is None else screen_of_field(image, field)
+    background = None if field is None else screen_level(image, field)
     seen = image if field is None else np.where(field, image, background).astype(image.dtype)
     return normalised(seen, background)[0].astype(np.float64)
 

@@ -36,7 +36,7 @@ import pandas as pd
 
 import telerig
 from telerig.arrays import Array
-from telerig.estimator.bubbles.background import methods
+from telerig.estimator.bubbles.background.from_run import Background, estimate_background
 from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.shape.shapes import Shapes
@@ -83,7 +83,7 @@ class Study:
     folder: Path
     cameras: tuple[Camera, Camera]
     images: dict[str, list[Image]]
-    backgrounds: dict[str, methods.RunBackground] = field(default_factory=dict)
+    backgrounds: dict[str, Background] = field(default_factory=dict)
     medians: dict[str, Image] = field(default_factory=dict)
     tables: Tables = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
@@ -129,12 +129,13 @@ def study(folder: Path, images: int) -> Study:
 def background(found: Study) -> None:
     """Level of the screen of one camera, the lab's layer included."""
     run = telerig.load_run(found.folder / "runs" / PRESET)
-    estimate = methods.method(methods.DEFAULT)
     ours = peer = 0.0
     for camera in found.cameras:
         images, name = found.images[camera.name], camera.name
         shift = lab_shift_px(camera, AXIS, run.position_mm, len(images))
-        spent, level = cpu_s(lambda i=images, s=shift: estimate(i.__getitem__, len(i), shift_px=s))
+        spent, level = cpu_s(
+            lambda i=images, s=shift: estimate_background(i.__getitem__, len(i), shift_px=s)
+        )
         ours, found.backgrounds[name] = ours + spent, level
         some = np.stack(images[:: max(1, len(images) // 21)])
         spent, median = cpu_s(lambda s=some: np.quantile(s, 0.8, axis=0).astype(np.uint8))

@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools
+from telerig.estimator.bubbles.background.screen import screen_level
 from telerig.estimator.bubbles.field import lit_field
 from telerig.estimator.bubbles.flat_field import (
     LEAST_BRIGHTNESS,
@@ -21,7 +22,6 @@ from telerig.estimator.bubbles.flat_field import (
     checked_image,
     normalised,
     nothing_to_see,
-    screen_of_field,
 )
 from telerig.estimator.bubbles.outline.blobs import (
     Blob,
@@ -179,7 +179,7 @@ def find_bubbles(
     elif field is None:
         field = lit_field(image)
     if field is not None:
-        background = screen_of_field(image, field) if background is None else background
+        background = screen_level(image, field) if background is None else background
         outside = np.minimum(background, image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
     found = _found(image, background, field, min_diameter_px, min_contrast, everywhere)

@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Bools, Float32
 from telerig.errors import InputError
+from telerig.estimator.bubbles.background.screen import screen_level
 from telerig.estimator.images.noise import check_grey_image
 
 _UNIFORM_SHARE = 0.004
 _CLIPPED_SHARE = 0.5
 _WHITE_SHARE = 0.98
-_SHRINK = 8
-_SCREEN_PASSES = 3
-_OUTSIDE, _LEAST_LEVEL = 0.3, 0.2
 _EVERY_PX = 4
 _LIT_SHARE, _BRIGHTEST = 0.6, 0.95
 LEAST_BRIGHTNESS = 0.25
@@ -77,15 +75,9 @@ def _full_scale(image: NDArray[Any]) -> float:
 
 def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Float32, bool]:
     """Return the image divided by its background, and whether the screen is clipped (saturated)."""
-    if background is None:
-        screen = screen_level(image.astype(np.float32, copy=False))
-        lowest = float(screen.min())
-    else:
-        screen = background.astype(np.float32, copy=False)
-        lowest = float(screen.min())
-    floor = 1e-6 * float(image.max()) + 1e-12
-    if lowest < floor:
-        screen = np.maximum(screen, floor)
+    screen = screen_level(image) if background is None else background
+    floor = np.float32(1e-6 * float(image.max()) + 1e-12)
+    screen = np.maximum(screen.astype(np.float32, copy=False), floor)
     ratio = np.asarray(cv2.divide(_divisible(image), screen, dtype=cv2.CV_32F), np.float32)
     sample = image[::8, ::8]
     clipped = bool(
@@ -117,35 +109,3 @@ def brightness(image: NDArray[Any], background: NDArray[Any], field: Bools | Non
 def _divisible(image: NDArray[Any]) -> NDArray[Any]:
     """Return the image in a type that OpenCV divides without a copy, or in single precision."""
     return image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32, copy=False)
-
-
-def screen_of_field(image: NDArray[Any], field: Bools) -> Float32:
-    """Return `screen_level` of an image that shows the screen in a field (rows, columns) only."""
-    level = float(np.median(image[field]))
-    seen = np.where(field, image, _OUTSIDE * level).astype(np.float32)
-    return np.maximum(screen_level(seen), np.float32(_LEAST_LEVEL * level))
-
-
-def screen_level(image: Float32) -> Float32:
-    """Return the level of the lit screen (rows, columns), from an image with bubbles before it.
-
-    In the image at an eighth of its size, dark things up to a quarter of the image are closed. Then
-    a broad mean over all pixels that are not darker than this is taken. This works if every quarter
-    of the image shows some of the screen.
-    """
-    rows, columns = image.shape
-    small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))
-    small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
-    reach = max(3, min(small_size) // 4 | 1)
-    kernel = np.ones((reach, reach), np.uint8)
-    level = cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REFLECT)
-    width = (2 * (reach // 3) + 1,) * 2
-    for _ in range(_SCREEN_PASSES):
-        lit = (small > 0.93 * level).astype(np.float32)
-        lit = cv2.erode(lit, np.ones((3, 3), np.uint8))
-        weight = cv2.GaussianBlur(lit, width, 0) + 1e-3 * cv2.GaussianBlur(lit, (0, 0), reach)
-        total = cv2.GaussianBlur(lit * small, width, 0)
-        total += 1e-3 * cv2.GaussianBlur(lit * small, (0, 0), reach)
-        level = np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), level).astype(np.float32)
-    screen: Float32 = cv2.resize(level, (columns, rows), interpolation=cv2.INTER_LINEAR)
-    return screen

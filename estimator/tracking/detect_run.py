@@ -26,8 +26,11 @@ from numpy.typing import NDArray
 from telerig import version
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
-from telerig.estimator.bubbles.background import methods
-from telerig.estimator.bubbles.background.from_run import LEAST_FRAMES
+from telerig.estimator.bubbles.background.from_run import (
+    LEAST_FRAMES,
+    Background,
+    estimate_background,
+)
 from telerig.estimator.bubbles.detect import find_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.field import described_field
 from telerig.estimator.bubbles.outline.blobs import Rejected
@@ -67,7 +70,7 @@ class Scene:
     """
 
     run: RunData
-    backgrounds: dict[str, methods.RunBackground]
+    backgrounds: dict[str, Background]
     min_diameter_px: float
     strips: Mapping[str, StripInImages] = field(default_factory=dict)
     fields: Mapping[str, Bools] = field(default_factory=dict)
@@ -86,20 +89,17 @@ def make_scene(
     min_diameter_px: float,
     progress: Progress | None = None,
     strips: Mapping[str, StripInImages] | None = None,
-    method: str = methods.DEFAULT,
 ) -> Scene:
     """Estimate each camera's background from the images of the run.
 
     axis_rig : (3,) unit vector of the stage's travel in the rig frame.
     progress : function that is called with the name of the step, the number done and the total.
     strips : dots to erase, by camera name; None for none.
-    method : a name in `METHODS` of `bubbles.background.methods`.
     """
     fields = described_fields(run)
-    estimator = methods.method(method)
     shifts = {c.name: lab_shift_px(c, axis_rig, run.position_mm, run.frame_count) for c in cameras}
     names = [c.name for c in cameras]
-    estimate = partial(_background, run, estimator, shifts, strips or {})
+    estimate = partial(_background, run, shifts, strips or {})
     backgrounds = {}
     if progress is not None:
         progress("background", 0, len(names))
@@ -144,14 +144,13 @@ def _image(
 
 def _background(
     run: RunData,
-    method: methods.Method,
     shifts: dict[str, Array],
     strips: Mapping[str, StripInImages],
     camera: str,
-) -> methods.RunBackground:
+) -> Background:
     keep_freed_memory()
     images = partial(_image, run, strips, camera)
-    return method(images, run.frame_count, shift_px=shifts[camera])
+    return estimate_background(images, run.frame_count, shift_px=shifts[camera])
 
 
 def lab_shift_px(

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.groups import RigModel, candidates_of, match
@@ -77,12 +76,10 @@ class TrackOptions:
     """Hold the options of tracking.
 
     min_diameter_px : dark spots that are smaller count as dirt.
-    background : method that estimates the background, by its name in `bubbles.background.methods`.
     tracker : settings of the tracker.
     """
 
     min_diameter_px: float = 8.0
-    background: str = methods.DEFAULT
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
 
 
@@ -314,9 +311,7 @@ def tracking_stream(
     else:
         if run.detections is None and store.missing():
             strips = marks.strips if marks is not None else None
-            scene = make_scene(
-                run, cameras, axis, chosen.min_diameter_px, stage, strips, chosen.background
-            )
+            scene = make_scene(run, cameras, axis, chosen.min_diameter_px, stage, strips)
             detect_missing(scene, store, stage, executor)
         if stage is not None:
             stage("pair model", 0, 0)

@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -26,16 +25,18 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.errors import DetectionError, InputError
-from telerig.estimator.bubbles.background.from_one_image import (
-    DARK,
-    bright_surface,
+from telerig.estimator.bubbles.background.screen import (
     compact_things,
     fill_masked,
-    level_of_image,
     log_cells,
+    screen_level,
 )
+from telerig.statistics import robust_sd
 
 _CELL_PX = 2
+
+DARK = 0.05
+"""Relative depth from which on something may be a bubble."""
 
 DEEP = 0.2
 """Depth (of log grey) from which on a dark thing is a bubble, or dirt."""
@@ -61,7 +62,7 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
     log = np.stack(
         [log_cells(image, _CELL_PX) - np.float32(gain) for image, gain in zip(stack, gains)]
     )
-    surface = bright_surface(_linear_quantile(_ordered(log.copy()), 0.8), 4)
+    surface = np.log(screen_level(np.exp(_quantiles(log, (UPPER,))[0])))
     dark = np.stack([compact_things(surface - frame > DEEP) for frame in log])
     keep = dark & ~_still(dark.mean(0), np.ones(dark.shape[1:], bool), 2)
     places = _lab_places(shifts_px, dark.shape)
@@ -90,9 +91,8 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
     never = masks.mean(0) > 1 - 1.5 / len(masks)
     values = np.log(np.maximum(stack[:, never].astype(np.float32), 0.5))
     values -= gains.astype(np.float32)[:, None]
-    _ordered(values)
     steady = ~never
-    low, high = (_linear_quantile(values, share) for share in (0.1, 0.9))
+    low, high = _quantiles(values, (0.1, 0.9))
     steady[never] = np.subtract(high, low) < _CHANGES
     _, labels = cv2.connectedComponents(steady.astype(np.uint8), connectivity=4)
     outside = np.unique(labels[~never])
@@ -139,8 +139,6 @@ STEADY = 0.04
 
 _ROUNDS = 2
 _BLOCK_ROWS = 64
-_AT_ONCE = 32768
-"""Pixels that are put in order at once, so that they stay in the processor's cache."""
 _ENOUGH_OF_LAB = 100_000
 _LEAST_SEEN = 3
 _LEAST_SEEN_LAB = 2
@@ -210,7 +208,7 @@ def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Lay
     layers, marked = _marked(sample, layers, residuals)
     covered, usable = _covered(layers, marked, spread, never)
     if covered.any():
-        layers = _filled(sample, layers, covered, usable)
+        layers = replace(layers, rig=fill_masked(layers.rig, covered, usable))
         layers, marked = _marked(sample, layers, residuals)
     for turn in range(_ROUNDS):
         if turn:
@@ -218,10 +216,10 @@ def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Lay
         layers, seen = _mean_rig(layers, marked, residuals, covered)
         if layers.lab is not None:
             layers = _mean_lab(sample, layers, marked, residuals)
-    noise = float(np.median(_noise(sample, layers, _residuals(sample, layers, residuals))[1]))
+    noise = _noise(sample, _residuals(sample, layers, residuals))
     hidden = covered & (seen < _least_seen(len(stack)))
     if hidden.any():
-        layers = _filled(sample, layers, hidden, usable)
+        layers = replace(layers, rig=fill_masked(layers.rig, hidden, usable))
     return layers, hidden, noise
 
 
@@ -263,7 +261,7 @@ def _first_rig(sample: _Sample, layers: Layers, masks: Bools) -> tuple[Layers, F
     rig[never] = 0
     layers = replace(layers, rig=rig)
     if never.any():
-        layers = _filled(sample, layers, never, ~never)
+        layers = replace(layers, rig=fill_masked(rig, never, ~never))
     return layers, np.nan_to_num(spread), never
 
 
@@ -272,68 +270,14 @@ def _blocks(height: int) -> Iterator[slice]:
 
 
 def _quantiles(values: Float32, shares: tuple[float, ...]) -> Float32:
-    """Return quantiles (Q, H, W) over the first axis without NaN; NaN if fewer than two remain.
-
-    The values are put in order in place.
-    """
-    flat = values.reshape(len(values), -1)
-    unknown = np.isnan(flat)
-    partial = np.flatnonzero(unknown.any(axis=0) | (len(flat) < _LEAST_SEEN_LAB))
-    known = len(flat) - np.count_nonzero(unknown[:, partial], axis=0)
-    flat[unknown] = np.inf
-    _ordered(flat)
-    found = flat[[_nearest(len(flat) - 1, share) for share in shares]]
-    at = np.stack([_nearest(known - 1, share) for share in shares]).clip(0)
-    few = np.take_along_axis(flat[:, partial], at, axis=0)
-    few[:, known < _LEAST_SEEN_LAB] = np.nan
-    found[:, partial] = few
-    return np.asarray(found.reshape(-1, *values.shape[1:]), np.float32)
-
-
-def _nearest(last: int | Ints, share: float) -> Ints:
-    return np.asarray(np.rint(last * np.float64(share)), np.int64)
-
-
-def _ordered(values: Float32) -> Float32:
-    """Put the values (n, ...) in order along the first axis, in place, and return them."""
-    flat = values.reshape(len(values), -1)
-    lower = np.empty(_AT_ONCE, np.float32)
-    for first in range(0, flat.shape[1], _AT_ONCE):
-        part = flat[:, first : first + _AT_ONCE]
-        least = lower[: part.shape[1]]
-        for i, j in _comparisons(len(values)):
-            np.minimum(part[i], part[j], out=least)
-            np.maximum(part[i], part[j], out=part[j])
-            part[i] = least
-    return values
-
-
-def _linear_quantile(ordered: Float32, share: float) -> Float32:
-    """Return the quantile of ordered values (n, ...), linear between two of them."""
-    place = (len(ordered) - 1) * share
-    low = int(place)
-    high = min(low + 1, len(ordered) - 1)
-    step = np.float32(place - low)
-    return np.asarray(ordered[low] + step * (ordered[high] - ordered[low]), np.float32)
-
-
-@lru_cache(maxsize=128)
-def _comparisons(count: int) -> list[tuple[int, int]]:
-    """Return Batcher's odd-even merge sort of so many values: pairs to put in order, in turn.
-
-    Whole images are compared at once, which takes a tenth of the time of a sort of each pixel.
-    """
-    out, width = [], 1
-    while width < count:
-        step = width
-        while step >= 1:
-            for first in range(step % width, count - step, 2 * step):
-                for i in range(first, min(first + step, count - step)):
-                    if i // (2 * width) == (i + step) // (2 * width):
-                        out.append((i, i + step))
-            step //= 2
-        width *= 2
-    return out
+    """Return quantiles (Q, ...) over the first axis without NaN; NaN if fewer than two remain."""
+    ordered = np.ascontiguousarray(np.moveaxis(values, 0, -1))
+    ordered.sort(axis=-1)
+    known = ordered.shape[-1] - np.count_nonzero(np.isnan(ordered), axis=-1)
+    at = np.rint(np.multiply.outer(known - 1, shares)).astype(np.int64).clip(0)
+    found = np.take_along_axis(ordered, at, axis=-1)
+    found[known < _LEAST_SEEN_LAB] = np.nan
+    return np.asarray(np.moveaxis(found, -1, 0))
 
 
 def _first_lab(sample: _Sample, layers: Layers, masks: Bools) -> Layers:
@@ -401,20 +345,12 @@ def _residuals(sample: _Sample, layers: Layers, out: Float32) -> Float32:
     return out
 
 
-def _noise(sample: _Sample, layers: Layers, residuals: Float32) -> tuple[Array, Array]:
-    """Return log levels and the relative noise at each, from the positive residuals."""
+def _noise(sample: _Sample, residuals: Float32) -> float:
+    """Return the relative noise of a pixel, from the positive residuals."""
     step = _step(sample)
     some = residuals[:: max(1, len(residuals) // 8), ::step, ::step]
-    residual = some.ravel()
-    level = np.tile(layers.rig[::step, ::step].ravel(), len(some))
-    edges = np.quantile(level, np.linspace(0, 1, 7))
-    levels, sigmas = [], []
-    for low, high in pairwise(edges):
-        part = residual[(level >= low) & (level <= high)]
-        part = part - np.median(part)
-        sigmas.append(max(0.002, float(np.median(part[part >= 0])) / 0.6745))
-        levels.append(0.5 * (low + high))
-    return np.array(levels), np.array(sigmas)
+    residual = some - np.median(some)
+    return max(0.002, float(robust_sd(residual[residual >= 0])))
 
 
 def _marked(sample: _Sample, layers: Layers, residuals: Float32) -> tuple[Layers, Bools]:
@@ -423,15 +359,14 @@ def _marked(sample: _Sample, layers: Layers, residuals: Float32) -> tuple[Layers
     residuals : (n, H, W) are overwritten by those of the new layers.
     """
     _residuals(sample, layers, residuals)
-    levels, sigmas = _noise(sample, layers, residuals)
-    sigma = np.interp(layers.rig, levels, sigmas).astype(np.float32)
+    sigma = _noise(sample, residuals)
     marked = np.empty(sample.stack.shape, bool)
     gains = layers.gains.copy()
     step = _step(sample)
     for k, residual in enumerate(residuals):
         thin = residual[::step, ::step]
         change = float(np.median(thin))
-        near = np.abs(thin - change) < 3 * sigma[::step, ::step]
+        near = np.abs(thin - change) < 3 * sigma
         change = float(np.mean(thin[near])) if near.any() else change
         residual -= np.float32(change)
         gains[k] += change
@@ -441,11 +376,11 @@ def _marked(sample: _Sample, layers: Layers, residuals: Float32) -> tuple[Layers
     return layers, marked
 
 
-def _outliers(residual: Float32, sigma: Float32) -> Bools:
+def _outliers(residual: Float32, sigma: float) -> Bools:
     """Dark things with their soft edges and bright centres, and bright specks."""
     soft = cv2.blur(residual, (5, 5))
     thin = soft[::8, ::8] - np.median(soft[::8, ::8])
-    spread = float(np.median(thin[thin >= 0])) / 0.6745
+    spread = float(robust_sd(thin[thin >= 0]))
     dark = (residual < -4 * sigma) | (soft < -max(5 * spread, 0.01))
     grown = cv2.dilate(dark.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
     outlines, _ = cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -462,7 +397,7 @@ def _covered(layers: Layers, marked: Bools, spread: Float32, never: Bools) -> tu
     Dirt and a bubble that the rig follows both look dark in the layer, but a bubble's edge
     moves: just outside it the frames differ.
     """
-    dark = (np.log(level_of_image(np.exp(layers.rig))[0]) - layers.rig > DARK).astype(np.uint8)
+    dark = (np.log(screen_level(np.exp(layers.rig))) - layers.rig > DARK).astype(np.uint8)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     share = marked.mean(0, dtype=np.float32)
     usual = float(np.median(share))
@@ -478,19 +413,6 @@ def _covered(layers: Layers, marked: Bools, spread: Float32, never: Bools) -> tu
     hidden = covered.astype(bool) | (edge & (spread > STEADY))
     usable = (cv2.dilate(dark | covered, np.ones((5, 5), np.uint8)) == 0) & ~edge
     return hidden, usable
-
-
-def _filled(sample: _Sample, layers: Layers, hidden: Bools, usable: Bools) -> Layers:
-    """Interpolate the rig layer where it is hidden, along the travel if that is an image axis.
-
-    A pattern that is constant along the travel looks the same in both layers, and what one has of
-    it the other lacks: such stripes must continue through a hole.
-    """
-    spread_u, spread_v = np.ptp(sample.shifts, axis=0)
-    across = (1.0, np.inf) if spread_v > spread_u else (np.inf, 1.0)
-    aslant = min(spread_u, spread_v) > 0.02 * max(spread_u, spread_v)
-    no_axis = layers.lab is None or aslant
-    return replace(layers, rig=fill_masked(layers.rig, hidden, usable, None if no_axis else across))
 
 
 def _least_seen(frames: int) -> int:
@@ -665,7 +587,12 @@ def estimate_background(
     usable = np.flatnonzero(np.isfinite(shifts).all(1))
     frames, stack = _sample(images, usable, max_frames or _enough_frames(images, shifts[usable]))
     if len(frames) < LEAST_FRAMES:
-        return Background(*level_of_image(stack.max(0)), frames=frames, shift_px=shift_px)
+        brightest = stack.max(0).astype(np.float32)
+        level = screen_level(brightest)
+        dark = cv2.dilate(
+            (brightest < (1 - DARK) * level).view(np.uint8), np.ones((9, 9), np.uint8)
+        )
+        return Background(level, dark > 0, frames=frames, shift_px=shift_px)
     travel = shifts[frames]
     moving = bool(np.ptp(travel, axis=0).max() >= LEAST_TRAVEL_PX)
     layers, covered, noise = fit_layers(stack, travel if moving else None)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.bubbles.background.from_run import Background, estimate_background
-from telerig.estimator.bubbles.background.methods import DEFAULT, method
 
 Array = NDArray[np.float64]
 
@@ -242,9 +241,3 @@ def test_large_images_are_fast_enough_to_normalise() -> None:
     for k in range(20):
         background.at((0.0, 100.3 + k))
     assert (time.process_time() - start) / 20 < 0.03
-
-
-def test_a_method_of_the_background_is_chosen_by_its_name() -> None:
-    assert method(DEFAULT) is estimate_background
-    with pytest.raises(InputError, match="no background method 'layer'"):
-        method("layer")

@@ -247,6 +247,9 @@ def _found(
     if not len(start.inner):
         nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
         return replace(nothing, clusters=clusters)
+    # All that is known of a bubble of a merged outline is that it is somewhere in it.
+    within = np.where(merged, radius_px(outlines) ** 2 / 4.0, 0.0)[:, None, None] * np.eye(2)
+    outlines = outlines._replace(covariance_px2=outlines.covariance_px2 + within)
     defocused = _defocused(outlines)
     judged = {"defocus": defocused, "merged": merged}
     columns = _columns(outlines, judged, image.shape, field, clipped)

@@ -18,7 +18,6 @@ from telerig.estimator.bubbles.outline.rim_kernels import RAYS, closed_rims, own
 from telerig.estimator.bubbles.outline.rims import find_rims
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
-import dense_scenes
 from bubble_outline_renderer import Drawn, draw
 from dense_bubbles import ELLIPSE
 from dense_scenes import paired, swarm, whole

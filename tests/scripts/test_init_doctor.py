@@ -83,7 +83,7 @@ def test_init_of_four_cameras(tmp_path):
     rig = read_rig_toml(tmp_path / "tank" / "rig.toml")
     assert list(rig.cameras) == ["a", "b", "c", "d"]
     assert rig.rotvec_from_first_deg == {"b": (0, 40, 0), "c": (0, 80, 0), "d": (0, 120, 0)}
-    assert rig.tracking_cameras == ("a", "b")
+    assert rig.tracking_cameras == ("a", "b", "c", "d")
     assert all((tmp_path / "tank" / "calibration" / name).is_dir() for name in "abcd")
 
 

@@ -46,7 +46,7 @@ def track(
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
-    """Find the bubbles of a run, match them across the two views, and follow them in space.
+    """Find the bubbles of a run, match them across the views, and follow them in space.
 
     Writes detections.csv, tracks.csv, events.csv, tracking.json, run.json and report.html. The
     same command, given again, continues an interrupted run. With --cluster the workers detect the

@@ -38,7 +38,7 @@ import telerig
 from telerig.arrays import Array
 from telerig.estimator.bubbles.background.from_run import Background, estimate_background
 from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
-from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
+from telerig.estimator.bubbles.pairing.learning import learn_rig
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.rig_drift import PairCollector
@@ -196,12 +196,12 @@ def linking(found: Study) -> None:
         )
     )
     calibration = calibration_from_cameras(list(found.cameras), name="truth")
-    model_s, model = cpu_s(lambda: estimate_pair_model(pairs, found.cameras), 2)
+    model_s, model = cpu_s(lambda: learn_rig(pairs, found.cameras), 2)
     parts = []
 
     def ours() -> None:
-        tracker = Tracker(found.cameras, AXIS, TrackerSettings())
-        maker = RowMaker(found.cameras, model, tracker, Shapes(), np.array(AXIS))
+        tracker = Tracker(AXIS, TrackerSettings())
+        maker = RowMaker(model, tracker, Shapes(), AXIS)
         parts.clear()
         for f, (tables, sight) in enumerate(zip(pairs, maker.sights(pairs))):
             parts.append(maker.add(f, float(run.t_s[f]), float(run.position_mm[f]), tables, sight))

@@ -348,6 +348,25 @@ def nearest_to_rays(origins: Array, directions: Array) -> Array:
     return np.asarray(np.linalg.solve(total, right)[..., 0])
 
 
+def on_rays(
+    camera: Camera, uv_px: Array, covariance_px2: Array, near_mm: Array, depth_sd_mm: float
+) -> tuple[Array, Array, Array]:
+    """Return the points of N rays that are nearest to a point, as if one camera measured points.
+
+    uv_px, covariance_px2 : (N, 2), (N, 2, 2) pixels. near_mm : (3,) in the rig frame. depth_sd_mm :
+    standard deviation of the unknown position along the ray.
+
+    Returns points (N, 3) in mm, covariances (N, 3, 3) in mm^2, and the scale (N,) in px/mm.
+    """
+    origin, along = camera.unproject(uv_px)
+    points = origin + ((near_mm - origin) * along).sum(-1, keepdims=True) * along
+    _, by_point = stacked_jacobian((camera,), points)
+    information = by_point.mT @ np.linalg.solve(covariance_px2, by_point)
+    information += along[:, :, None] * along[:, None] / depth_sd_mm**2
+    scale = np.linalg.det(by_point @ by_point.mT) ** 0.25
+    return points, np.linalg.inv(information), np.asarray(scale)
+
+
 def _distance(points: Array, origin: Array, direction: Array) -> Array:
     """Return the distance (N,) of N points (N, 3) from rays with unit directions (N, 3)."""
     return np.asarray(np.linalg.norm(np.cross(points - origin, direction), axis=-1))

@@ -1,9 +1,10 @@
-"""Links the measurements of one frame to the confirmed tracks, and keeps several hypotheses where
-pairings conflict.
+"""Links the measurements of one frame to tracks, and keeps several hypotheses where pairings
+conflict.
 
 A pairing's score is its log-likelihood ratio against "the track was missed and the measurement is
 new": log P_D / (1 - P_D) + log N(innovation) - log(density of new ones) + log ratio of the sizes.
-Measurements are points in space, or pixels of one camera alone.
+It is the same for points that several cameras see, for what one camera alone sees (a point whose
+depth is unknown), and for predictions from smoothed tracks.
 
 Tracks that compete for measurements form a cluster; each of its branches is one way to continue
 all of them, with its log weight relative to the best. Branches with the same recent pairings are
@@ -19,12 +20,13 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.special import chdtri
 
-from telerig.arrays import Array, Bools, Ints
+from telerig.arrays import Array, Bools, Ints, Rows
+from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.filter import (
+    NO_PARTICLE,
     POSITION,
     Common,
     FrameMeasurements,
@@ -33,8 +35,6 @@ from telerig.estimator.tracking.filter import (
     update_tracks,
 )
 from telerig.estimator.tracking.ranked_ways import alternatives
-from telerig.rig.camera import Camera
-from telerig.rig.triangulation import stacked_jacobian
 
 _LOG_2PI = float(np.log(2 * np.pi))
 _SIZE_SPAN_MM = 5.0
@@ -42,9 +42,12 @@ _SHIFT_ROUNDS = 5
 _JOINTLY_SCORED = 10
 """For each hypothesis that is kept, so many ways to continue are scored with the common shift."""
 
+_CERTAIN = 1e12
+"""Score of a pairing by an id that came with the data."""
+
 
 @dataclass(frozen=True)
-class Pairs:
+class Pairs(Rows):
     """Hold E possible pairings of tracks with measurements, all inside the widest gate.
 
     row, column : (E,) index of the track and index of the measurement.
@@ -62,9 +65,6 @@ class Pairs:
     information: Array
     constant: Array
 
-    def __len__(self) -> int:
-        return len(self.row)
-
     def distance2(self, shift_mm: Array) -> Array:
         """Return the squared Mahalanobis distances (E,) without the common shift."""
         left = self.innovation_mm - shift_mm
@@ -80,39 +80,49 @@ def gate2(settings: TrackerSettings, dimensions: int = 3) -> float:
     return float(chdtri(dimensions, 1 - settings.gate_probability))
 
 
+def expected(tracks: Sequence[Track]) -> Prediction:
+    """Return where tracks are expected, without the error that all bubbles have in common."""
+    ids = np.array([t.particle for t in tracks], np.int64)
+    points = np.array([t.x[POSITION] for t in tracks]).reshape(-1, 3)
+    spread = np.array([t.p[POSITION, POSITION] for t in tracks]).reshape(-1, 3, 3)
+    return Prediction(ids, points, spread, np.array([t.d_eq_mm for t in tracks], float))
+
+
 def gated_pairs(
-    tracks: Sequence[Track],
+    predicted: Prediction,
     measured: FrameMeasurements,
-    columns: Ints,
+    allowed: Bools,
     common: Common,
     settings: TrackerSettings,
+    misses: Ints | None = None,
 ) -> Pairs:
-    """Return the pairings of tracks with the measurements ``columns`` inside the gate, for an
-    unknown common shift."""
-    if not len(tracks) or not len(columns):
-        none = np.zeros(0, np.int64)
-        return Pairs(none, none, *(np.zeros((0, 3, 3)[:k]) for k in (2, 3, 3, 1)))
-    x = np.array([t.point_mm for t in tracks])
-    p = np.array([t.point_covariance_mm2 for t in tracks])
-    z, r = measured.points_mm[columns], measured.covariance_mm2[columns]
+    """Return the pairings of tracks with measurements inside the gate, for an unknown common shift.
+
+    allowed : (K, M) which pairings may be made; those with a measurement whose id came with the
+        data are certain.
+    misses : (K,) number of frames for which each track has not been seen; None for 0.
+    """
+    x, p = predicted.points_mm, predicted.covariance_mm2
+    z, r = measured.points_mm, measured.covariance_mm2
+    given = measured.particle != NO_PARTICLE
     between = z[None] - x[:, None]
     spread = np.trace(p, axis1=1, axis2=2)[:, None] + np.trace(r, axis1=1, axis2=2)[None]
     reach2 = gate2(settings) * (spread + np.trace(common.covariance_mm2))
-    row, local = np.nonzero(((between - common.shift_mm) ** 2).sum(-1) <= reach2)
-    innovation, covariance = between[row, local], p[row] + r[local]
+    near = ((between - common.shift_mm) ** 2).sum(-1) <= reach2
+    row, column = np.nonzero(allowed & (near | given))
+    innovation, covariance = between[row, column], p[row] + r[column]
     total = np.linalg.inv(covariance + common.covariance_mm2)
     left = innovation - common.shift_mm
-    near = np.einsum("ei,eij,ej->e", left, total, left) <= gate2(settings)
-    row, local, innovation, covariance = (a[near] for a in (row, local, innovation, covariance))
-    column = columns[local]
+    inside = np.einsum("ei,eij,ej->e", left, total, left) <= gate2(settings)
+    kept = inside | given[column]
+    row, column, innovation, covariance = (a[kept] for a in (row, column, innovation, covariance))
     seen = settings.detection_probability
     density = -1.5 * _LOG_2PI - np.log(np.linalg.det(covariance)) / 2
     base = np.log(seen / (1 - seen) / settings.new_per_mm3)
     sure = np.log(np.clip(measured.confidence[column], 1e-3, 1.0))
-    expected = np.array([t.d_eq_mm for t in tracks])[row]
-    alive = _alive_score(np.array([t.misses for t in tracks]), settings)[row]
-    size = size_score(expected, measured.d_eq_mm[column], settings)
-    constant = base + density + sure + alive + size
+    alive = 0.0 if misses is None else _alive_score(misses, settings)[row]
+    size = _size_score(predicted.d_eq_mm[row], measured.d_eq_mm[column], settings)
+    constant = np.where(given[column], _CERTAIN, base + density + sure + alive + size)
     return Pairs(row, column, innovation, covariance, np.linalg.inv(covariance), constant)
 
 
@@ -124,7 +134,7 @@ def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
     return -np.log1p(misses * settings.end_probability / missed)
 
 
-def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:
+def _size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:
     """Return the log-likelihood ratio of sizes against a uniform density; 0 if unknown."""
     sigma = settings.size_scatter * expected_mm
     off = np.minimum(((measured_mm - expected_mm) / sigma) ** 2 / 2, settings.size_cap_log_ratio)
@@ -171,17 +181,20 @@ def assigned_with_shift(
     return now, chosen
 
 
-def unrivalled(
-    row: Ints, column: Ints, score: Array, chosen: Ints, margin_log_ratio: float
-) -> Ints:
-    """Return (K,) whether no other pairing of a track or its measurement is within the margin."""
-    out = chosen >= 0
-    for r in np.flatnonzero(out):
+def clear_assignment(
+    pairs: Pairs, rows: int, shift_mm: Array, settings: TrackerSettings
+) -> tuple[Ints, Bools]:
+    """Return the best assignment (rows,), -1 for none, and which rows have a measurement and no
+    other pairing of the track or of this measurement that is nearly as likely."""
+    row, column, score = pairs.row, pairs.column, pairs.scores(shift_mm)
+    chosen = best_assignment(rows, row, column, score)
+    clear = chosen >= 0
+    for r in np.flatnonzero(clear):
         mine = (row == r) & (column == chosen[r])
         rival = ((row == r) | (column == chosen[r])) & ~mine
         best_rival = np.max(score[rival], initial=-np.inf)
-        out[r] = best_rival < score[mine].max() - margin_log_ratio
-    return np.asarray(out)
+        clear[r] = best_rival < score[mine].max() - settings.margin_log_ratio
+    return chosen, clear
 
 
 def joint_scores(pairs: Pairs, ways: Sequence[Sequence[int]], common: Common) -> Array:
@@ -201,80 +214,6 @@ def joint_scores(pairs: Pairs, ways: Sequence[Sequence[int]], common: Common) ->
     gained = (pull * moved).sum(-1) / 2
     own = chosen @ pairs.scores(common.shift_mm)[used]
     return np.asarray(own + gained - np.log(np.linalg.det(mixed)) / 2)
-
-
-@dataclass(frozen=True)
-class Projected:
-    """Hold K points as projected into one camera.
-
-    uv_px : (K, 2) pixels.
-    by_point : (K, 2, 3) derivatives of the pixels by the point, in px/mm.
-    covariance_px2 : (K, 2, 2) covariances of the pixels that follow from those of the points.
-    """
-
-    uv_px: Array
-    by_point: Array
-    covariance_px2: Array
-
-
-def projected(camera: Camera, points_mm: Array, covariance_mm2: Array) -> Projected:
-    """Return K points of the rig frame (K, 3) with covariances (K, 3, 3), projected into a
-    camera.
-    """
-    uv, by_point = stacked_jacobian((camera,), points_mm)
-    return Projected(uv, by_point, by_point @ covariance_mm2 @ np.swapaxes(by_point, -1, -2))
-
-
-def px_per_mm(by_point: Array) -> Array:
-    """Return the scale (K,) in px/mm across the line of sight.
-
-    by_point : (K, 2, 3) derivatives of the pixels by the point, in px/mm.
-    """
-    return np.asarray(np.linalg.det(by_point @ np.swapaxes(by_point, -1, -2)) ** 0.25)
-
-
-def pair_pixels(
-    expected: Projected,
-    uv_px: Array,
-    covariance_px2: Array,
-    settings: TrackerSettings,
-    *,
-    size_score: ArrayLike = 0.0,
-    allowed: ArrayLike = True,
-) -> list[int]:
-    """Return for each of K expected tracks the index of the detection that continues it, or -1.
-
-    It is -1 where no detection lies in the gate, and where a second pairing is nearly as likely.
-    uv_px (L, 2), covariance_px2 (L, 2, 2) : the L detections.
-    size_score : log-likelihood ratio of the sizes, broadcast to (K, L).
-    allowed : whether a pairing may be made, broadcast to (K, L).
-    """
-    between = uv_px[None] - expected.uv_px[:, None]
-    covariance = expected.covariance_px2[:, None] + covariance_px2[None]
-    distance2 = np.einsum("kli,klij,klj->kl", between, np.linalg.inv(covariance), between)
-    row, column = np.nonzero((distance2 <= gate2(settings, 2)) & allowed)
-    seen = settings.detection_probability
-    base = np.log(seen / (1 - seen) / settings.new_per_px2) - np.log(2 * np.pi)
-    ratio = base - np.log(np.linalg.det(covariance)) / 2 - distance2 / 2 + size_score
-    score = ratio[row, column]
-    chosen = best_assignment(len(between), row, column, score)
-    safe = unrivalled(row, column, score, chosen, settings.margin_log_ratio)
-    return [int(c) if ok else -1 for c, ok in zip(chosen, safe)]
-
-
-def update_pixels(
-    track: Track, uv_px: Array, covariance_px2: Array, expected_px: Array, by_point: Array
-) -> None:
-    """Update a track's filter in place with its pixel in one camera, by an extended Kalman step.
-
-    uv_px (2,), covariance_px2 (2, 2) : the detection.
-    expected_px (2,), by_point (2, 3) : the predicted pixel, and its derivative (px/mm) with respect
-        to the position.
-    """
-    h = np.zeros((2, len(track.filter.x)))
-    h[:, POSITION] = by_point
-    linear = uv_px - expected_px + h @ track.filter.x
-    track.filter.update(linear.reshape(-1), R=covariance_px2, H=h)
 
 
 _MERGE_FRAMES = 2
@@ -513,15 +452,11 @@ _SLACK_LOG_RATIO = 6.0
 
 @dataclass(frozen=True)
 class Scan:
-    """One frame: its number, its time and its measurements.
-
-    columns : indices of the measurements that have no track yet.
-    """
+    """One frame: its number, its time and its measurements."""
 
     frame: int
     t_s: float
     measured: FrameMeasurements
-    columns: Ints
     settings: TrackerSettings
 
 
@@ -542,7 +477,8 @@ class Child:
 class Association:
     """The possible pairings of tracks and measurements in one frame.
 
-    It also holds the shift of all bubbles that follows from the best pairings.
+    It also holds the shift of all bubbles that follows from the best pairings. A track that has no
+    measurement of several cameras in these may have one of a camera alone.
     """
 
     def __init__(self, clusters: Sequence[Cluster], scan: Scan, common: Common) -> None:
@@ -557,22 +493,28 @@ class Association:
         first = np.array([b == 0 for _, b, _ in rows], bool)
         self.row_of = {id(t): i for i, (_, _, t) in enumerate(rows)}
         self.tracks = [t for _, _, t in rows]
-        pairs = gated_pairs(self.tracks, scan.measured, scan.columns, common, scan.settings)
-        self.common, self.chosen = assigned_with_shift(pairs, len(rows), first, common)
-        self.pairs, self.owner = pairs, self.cluster_of[pairs.row]
-        self.picked = np.flatnonzero(first[pairs.row] & (self.chosen[pairs.row] == pairs.column))
+        measured, where = scan.measured, expected(self.tracks)
+        misses = np.array([t.misses for t in self.tracks], int)
+        ids = [t.particle if t.given else NO_PARTICLE for t in self.tracks]
+        own = np.array(ids, int)[:, None] == measured.particle
+        pairs = gated_pairs(where, measured, own & ~measured.alone, common, scan.settings, misses)
+        self.common, chosen = assigned_with_shift(pairs, len(rows), first, common)
+        self.picked = np.flatnonzero(first[pairs.row] & (chosen[pairs.row] == pairs.column))
+        closed = np.array([not c.open for c in clusters], bool)[self.cluster_of]
+        missed = own & measured.alone & (closed & (chosen < 0))[:, None]
+        alone = gated_pairs(where, measured, missed, self.common, scan.settings, misses)
+        self.pairs = Pairs.concat([pairs, alone])
+        self.owner = self.cluster_of[self.pairs.row]
         self.edges = self._allowed()
 
-    def mean_gain(self, others: Sequence[Array]) -> Array | None:
-        """Return the mean Kalman gain (n, 3) of all bubbles that are updated; None if none is.
-
-        n is the number of states. others : gain (n, 3) of each bubble that was updated already.
-        """
-        gains = list(others)
-        if len(self.picked):
-            p = np.array([self.tracks[i].filter.P for i in self.pairs.row[self.picked].tolist()])
-            gains.extend(p[..., POSITION] @ self.pairs.information[self.picked])
-        return np.mean(gains, axis=0) if gains else None
+    def mean_gain(self) -> Array | None:
+        """Return the mean Kalman gain (12, 3) of all bubbles that several cameras measure; None if
+        there is none."""
+        if not len(self.picked):
+            return None
+        p = np.array([self.tracks[i].p for i in self.pairs.row[self.picked].tolist()])
+        gains = p[..., POSITION] @ self.pairs.information[self.picked]
+        return np.asarray(gains.mean(0))
 
     def _allowed(self) -> Ints:
         """Pairings inside their gate, the common shift estimated from the other clusters alone."""
@@ -590,7 +532,7 @@ class Association:
         total = np.linalg.inv(pairs.covariance_mm2 + outside[owner])
         off = left - shift
         near = np.einsum("ei,eij,ej->e", off, total, off) <= gate2(self.scan.settings)
-        return np.flatnonzero(near)
+        return np.flatnonzero(near | (pairs.constant == _CERTAIN))
 
     def components(self) -> list[tuple[list[int], list[int]]]:
         """Return the groups of tracks that compete for measurements of this frame.
@@ -725,30 +667,33 @@ def continue_tracks(
     update_tracks(tracks, points, covariances, common.shift, mean_gain, common.covariance_mm2)
     for track, column in zip(tracks, columns):
         if column >= 0:
-            track.saw(scan.frame, scan.t_s, float(measured.d_eq_mm[column]))
+            d_eq = float("nan") if measured.alone[column] else float(measured.d_eq_mm[column])
+            track.saw(scan.frame, scan.t_s, d_eq)
 
 
 def advance(
-    clusters: Sequence[Cluster], scan: Scan, common: Common, other_gains: Sequence[Array] = ()
+    clusters: Sequence[Cluster], scan: Scan, common: Common
 ) -> tuple[list[Cluster], Common, Array | None]:
     """Continue all tracks with the measurements of a frame, without deciding conflicts.
 
     Tracks that compete with no other track are updated in place.
 
-    common : what is known of the shift that all bubbles share. other_gains : Kalman gains (n, 3) of
-    the bubbles that were updated already.
+    common : what is known of the shift that all bubbles share.
+
     Returns the groups of tracks after this frame, the shift that all bubbles share, and the mean
     gain (n, 3) or None.
     """
     found = Association(clusters, scan, common)
-    mean_gain = found.mean_gain(other_gains)
+    mean_gain = found.mean_gain()
     gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
+    score = found.pairs.scores(found.common.shift_mm)
     out, alone, columns = [], [], []
     for members, edges in found.components():
         first = clusters[members[0]]
-        if len(members) == 1 and not first.open and len(first.tracks) == 1 and len(edges) < 2:
-            track = first.tracks[0]
-            column = int(found.chosen[found.row_of[id(track)]]) if edges else -1
+        if len(members) == 1 and not first.open and len(edges) < 2:
+            (track,) = first.tracks
+            good = [e for e in edges if score[e] > 0]
+            column = int(found.pairs.column[good[0]]) if good else -1
             alone.append(track)
             columns.append(column)
             out.append(Cluster([Branch(0.0, [track], {track.particle: [(scan.frame, column)]})]))
@@ -758,27 +703,3 @@ def advance(
         out.append(Cluster([grow(found, outside, child, gain) for child in every]))
     continue_tracks(alone, columns, scan, found.common, gain)
     return out, found.common, mean_gain
-
-
-def follow_labelled(
-    tracks: Sequence[Track], scan: Scan, common: Common
-) -> tuple[Common, list[Array], list[int]]:
-    """Update in place tracks whose ids came with the measurements, so that nothing is ambiguous.
-
-    Returns the shift of all bubbles that follows from these tracks, their Kalman gains, and the
-    indices of the measurements that have no track yet.
-    """
-    columns = {int(scan.measured.particle[c]): int(c) for c in scan.columns}
-    at = [columns.pop(t.particle, -1) for t in tracks]
-    seen = [(t, c) for t, c in zip(tracks, at) if c >= 0]
-    fresh = sorted(columns.values())
-    if not seen:
-        return common, [], fresh
-    innovations = np.array([scan.measured.points_mm[c] - t.point_mm for t, c in seen])
-    noise = np.array([scan.measured.covariance_mm2[c] for _, c in seen])
-    p = np.array([t.filter.P[:, POSITION] for t, _ in seen])
-    covariance = p[:, POSITION] + noise
-    common = common.informed(innovations, covariance)
-    gains = p @ np.linalg.inv(covariance)
-    continue_tracks(tracks, at, scan, common, gains.mean(0))
-    return Common(covariance=common.covariance), list(gains), fresh

@@ -5,22 +5,20 @@ The state of a bubble has 12 components in the rig frame: position (mm), velocit
 acceleration (mm/s^2) and drift velocity (mm/s), three components each. The velocity is relative to
 the laboratory once an encoder has given the stage's speed, and relative to the rig before that.
 
-The error of a bubble is its own error plus the common error. `Track.filter` carries the own error,
-which is independent between bubbles; `Common` carries the error that shake and stage give to all
-bubbles alike. Both follow the same equation of motion, so that a prediction keeps this form. The
-Kalman gain is the matrix by which a filter multiplies the measured minus the predicted position to
-correct its state. An update keeps the form if all bubbles have the same gain; a gain that differs
-from the mean adds its share to the own error. Differences between bubbles are free of the common
-error.
+The error of a bubble is its own error plus the common error. `Track.p` is the covariance of the own
+error, which is independent between bubbles; `Common` carries the error that shake and stage give to
+all bubbles alike. Both follow the same equation of motion, so that a prediction keeps this form.
+The Kalman gain is the matrix by which a filter multiplies the measured minus the predicted position
+to correct its state. An update keeps the form if all bubbles have the same gain; a gain that
+differs from the mean adds its share to the own error. Differences between bubbles are free of the
+common error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,14 +30,16 @@ from telerig.factors.state_space import exact_step
 
 NO_PARTICLE = -1
 
+ANYWHERE_MM = 100.0
+"""Standard deviation of a coordinate that nothing has measured: several times the volume's size."""
+
 
 @dataclass(frozen=True)
 class TrackerSettings:
     """Hold the settings of the tracker.
 
     The defaults suit bubbles of 5 mm that rise at 280 mm/s and are recorded at 100 to 1000 Hz.
-    "Along" and "across" refer to the stage's travel axis. Raises InputError for values outside
-    their range.
+    "Along" and "across" refer to the stage's travel axis.
 
     rise_mm_s : mean velocity of a new track along the axis, used if an encoder gives the stage's
         motion; otherwise the mean is 0.
@@ -62,8 +62,7 @@ class TrackerSettings:
         missed again.
     end_probability : probability that a bubble leaves for good in a frame. Because of it, a track
         that was missed for many frames is less likely to be given a measurement.
-    new_per_mm3, new_per_px2 : density of false detections and new bubbles in space (1/mm^3) and in
-        one image (1/px^2).
+    new_per_mm3 : density of false detections and new bubbles in space (1/mm^3).
     gate_probability : probability that the true continuation of a track lies inside its gate.
     margin_log_ratio : smallest log-likelihood ratio between the best and the second-best hypothesis
         for which the best one counts as unambiguous when the window ends; below it, the tracks are
@@ -99,7 +98,6 @@ class TrackerSettings:
     missed_again_probability: float = 0.5
     end_probability: float = 0.002
     new_per_mm3: float = 1e-5
-    new_per_px2: float = 1e-5
     gate_probability: float = 0.9999
     margin_log_ratio: float = 4.6
     prune_log_ratio: float = 9.0
@@ -111,54 +109,18 @@ class TrackerSettings:
     gap_frames: int = 3
     balance_tolerance: float = 0.25
 
-    def __post_init__(self) -> None:
-        probabilities = ("detection_probability", "missed_again_probability", "gate_probability")
-        positive = ("acceleration_time_s", "drift_time_s", "shake_time_s", "size_scatter")
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name in probabilities:
-                good, todo = 0 < value < 1, "give a number between 0 and 1"
-            elif item.name in positive:
-                good, todo = value > 0, "give a positive number"
-            else:
-                good, todo = value >= 0, "give a number of at least 0"
-            if not good:
-                raise InputError(f"{item.name} = {value}", todo=todo)
-        if not 1 <= self.confirm_hits <= self.confirm_frames:
-            raise InputError(
-                f"confirm_hits = {self.confirm_hits}, confirm_frames = {self.confirm_frames}",
-                todo="give confirm_hits from 1 to confirm_frames",
-            )
-
-
-@dataclass(frozen=True)
-class SingleMeasurements:
-    """Hold the L bubbles of one frame that only one camera saw.
-
-    camera : (L,) index of the camera.
-    uv_px : (L, 2) pixel (u, v).
-    covariance_px2 : (L, 2, 2) covariance of the pixel in px^2.
-    """
-
-    camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    uv_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    covariance_px2: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
-
-    def __len__(self) -> int:
-        return len(self.uv_px)
-
 
 @dataclass(frozen=True)
 class FrameMeasurements:
-    """Hold the M bubbles of one frame that several cameras saw, and those seen by only one
-    camera.
+    """Hold the M bubbles of one frame, each of which one camera sees or several do.
 
     points_mm : (M, 3) positions in the rig frame.
-    covariance_mm2 : (M, 3, 3) covariances of the positions.
+    covariance_mm2 : (M, 3, 3) covariances of the positions; of what one camera alone sees the depth
+        is unknown (`on_rays`).
     d_eq_mm : (M,) equivalent diameters, NaN where unknown.
     confidence : (M,) confidence in (0, 1] that the detections are those of one bubble.
     particle : (M,) ids given with the data, -1 where no id is given.
-    singles : the bubbles that only one camera saw.
+    alone : (M,) whether one camera alone sees the bubble.
     """
 
     points_mm: Array
@@ -166,7 +128,7 @@ class FrameMeasurements:
     d_eq_mm: Array
     confidence: Array
     particle: Ints
-    singles: SingleMeasurements
+    alone: Bools
 
     @staticmethod
     def create(
@@ -176,16 +138,14 @@ class FrameMeasurements:
         d_eq_mm: ArrayLike | None = None,
         confidence: ArrayLike | None = None,
         particle: ArrayLike | None = None,
-        singles: SingleMeasurements | None = None,
+        alone: ArrayLike | None = None,
     ) -> FrameMeasurements:
         """Return the measurements of a frame after checking them.
 
         points_mm : (M, 3).
         covariance_mm2 : (M, 3, 3), or one (3, 3) for all points.
-        d_eq_mm : (M,); None if all diameters are unknown.
-        confidence : (M,); None for 1 everywhere.
-        particle : (M,) whole numbers, -1 for no id; None if no ids are given.
-        singles : bubbles seen by only one camera; None for none.
+        d_eq_mm, confidence, particle, alone : (M,); None if all diameters are unknown, for 1
+            everywhere, if no ids are given, and if several cameras see every bubble.
 
         Raises InputError for shapes that do not fit, for points or covariances that are not finite,
         and for an id that occurs twice.
@@ -195,8 +155,10 @@ class FrameMeasurements:
         covariance = np.broadcast_to(np.asarray(covariance_mm2, float), (m, 3, 3))
         size = np.full(m, np.nan) if d_eq_mm is None else np.asarray(d_eq_mm, float)
         sure = np.ones(m) if confidence is None else np.asarray(confidence, float)
-        ids = np.full(m, NO_PARTICLE) if particle is None else np.asarray(particle)
-        for name, values in (("d_eq_mm", size), ("confidence", sure), ("particle", ids)):
+        ids = np.full(m, NO_PARTICLE) if particle is None else np.asarray(particle, np.int64)
+        one = np.zeros(m, bool) if alone is None else np.asarray(alone, bool)
+        every = {"d_eq_mm": size, "confidence": sure, "particle": ids, "alone": one}
+        for name, values in every.items():
             if values.shape != (m,):
                 raise InputError(
                     f"{name} has shape {values.shape} for {m} points", todo="give one per point"
@@ -209,21 +171,10 @@ class FrameMeasurements:
         given = ids[ids != NO_PARTICLE]
         if len(np.unique(given)) < len(given):
             raise InputError("a particle id occurs twice in one frame", todo="give each id once")
-        alone = SingleMeasurements() if singles is None else singles
-        return FrameMeasurements(points, covariance, size, sure, ids.astype(np.int64), alone)
+        return FrameMeasurements(points, covariance, size, sure, ids, one)
 
     def __len__(self) -> int:
         return len(self.points_mm)
-
-    @property
-    def labelled(self) -> Ints:
-        """Indices of the bubbles whose ids were given with the data."""
-        return np.flatnonzero(self.particle != NO_PARTICLE)
-
-    @property
-    def free(self) -> Ints:
-        """Indices of the bubbles without a given id."""
-        return np.flatnonzero(self.particle == NO_PARTICLE)
 
 
 @dataclass(frozen=True)
@@ -247,28 +198,10 @@ class TrackEvent:
 
 @dataclass(frozen=True)
 class FrameIds:
-    """Hold the final track ids of one frame's measurements.
-
-    frame : number of the frame.
-    particle : (M,) ids of the bubbles that several cameras saw, -1 for no track.
-    single : (L,) ids of the bubbles that one camera saw, -1 for no track.
-    """
+    """Hold the final track ids (M,) of the measurements of a frame, -1 for no track."""
 
     frame: int
     particle: Ints
-    single: Ints
-
-
-@dataclass(frozen=True)
-class SeenAlone:
-    """Describe a track after an update by a measurement of only one camera.
-
-    point_mm : (3,) position in the rig frame.
-    d_eq_mm : equivalent diameter, NaN if unknown.
-    """
-
-    point_mm: Array
-    d_eq_mm: float
 
 
 @dataclass(frozen=True)
@@ -299,23 +232,16 @@ class Motion:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Hold what the tracker returns for one frame with M bubbles and L single-camera measurements.
+    """Hold what the tracker returns for one frame.
 
-    particle, single : (M,) and (L,) ids as known now, -1 for no track. While a conflict or a birth
-        is undecided, they are the best guess.
     events : events that became known in this frame.
-    final : ids of earlier frames that are final now, in the order of the frames; this frame is
-        among them if nothing in it is undecided. Write these ids to the tables.
-    alone : tracks that only one camera continued, by index of the single-camera measurement.
+    final : ids of frames that are final now, in the order of the frames; this frame is among them
+        if nothing in it is undecided. Write these ids to the tables.
     motion : motion of the bubbles since the frame before; None in the first frame.
     """
 
-    frame: int
-    particle: Ints
-    single: Ints
     events: tuple[TrackEvent, ...]
     final: tuple[FrameIds, ...]
-    alone: Mapping[int, SeenAlone] = field(default_factory=dict)
     motion: Motion | None = None
 
 
@@ -459,6 +385,8 @@ class StageMotion:
 
 
 _SIZE_GAIN = 0.25
+"""Weight of a new diameter in a track's running mean."""
+
 _IDENTITY = np.eye(STATES)
 
 
@@ -466,8 +394,9 @@ _IDENTITY = np.eye(STATES)
 class Track:
     """Hold the state of one bubble that is followed.
 
-    filter : filterpy KalmanFilter; its state (12,) is described in `motion`.
+    x, p : (12,) state and (12, 12) covariance of its own error; arrays are replaced, never changed.
     particle : id of the track, -1 as long as it has none.
+    given : whether the id came with the data; such a track follows its id alone.
     d_eq_mm : running mean of the equivalent diameter, NaN if unknown.
     d_last_mm : last measured diameter.
     d_before_mm : running mean before the last measurement.
@@ -482,8 +411,10 @@ class Track:
         the track is seen.
     """
 
-    filter: Any
+    x: Array
+    p: Array
     particle: int = NO_PARTICLE
+    given: bool = False
     d_eq_mm: float = float("nan")
     d_last_mm: float = float("nan")
     d_before_mm: float = float("nan")
@@ -498,19 +429,11 @@ class Track:
     @property
     def point_mm(self) -> Array:
         """Position (3,) in the rig frame."""
-        return np.asarray(self.filter.x[POSITION])
-
-    @property
-    def point_covariance_mm2(self) -> Array:
-        """Covariance (3, 3) of the position, without the error that all bubbles have in common."""
-        return np.asarray(self.filter.P[POSITION, POSITION])
+        return self.x[POSITION]
 
     def copy(self) -> Track:
-        """Return a copy that can be changed without changing this track.
-
-        The arrays are shared, because filterpy replaces its arrays and never writes into them.
-        """
-        return replace(self, filter=copy(self.filter), history=list(self.history))
+        """Return a copy that can be changed without changing this track."""
+        return replace(self, history=list(self.history))
 
     def saw(self, frame: int, t_s: float, d_eq_mm: float) -> None:
         """Record that the track was measured in a frame.
@@ -534,10 +457,10 @@ def predict_tracks(tracks: Sequence[Track], step: Transition, control: Array) ->
     """
     if not tracks:
         return
-    x = np.array([t.filter.x for t in tracks]) @ step.matrix.T + control
-    p = step.matrix @ np.array([t.filter.P for t in tracks]) @ step.matrix.T + step.noise
+    x = np.array([t.x for t in tracks]) @ step.matrix.T + control
+    p = step.matrix @ np.array([t.p for t in tracks]) @ step.matrix.T + step.noise
     for track, own_x, own_p in zip(tracks, x, p):
-        track.filter.x, track.filter.P = own_x, own_p
+        track.x, track.p = own_x, own_p
 
 
 def update_tracks(
@@ -557,8 +480,8 @@ def update_tracks(
     """
     if not tracks:
         return
-    x = np.array([t.filter.x for t in tracks]) + shift
-    p = np.array([t.filter.P for t in tracks])
+    x = np.array([t.x for t in tracks]) + shift
+    p = np.array([t.p for t in tracks])
     seen: Bools = np.asarray(np.isfinite(points_mm).all(1))
     gain = np.zeros((len(tracks), STATES, 3))
     own, noise = p[seen], covariances_mm2[seen]
@@ -571,27 +494,12 @@ def update_tracks(
     unequal = mean_gain - gain
     p += unequal @ common_mm2 @ _t(unequal)
     for track, own_x, own_p, measured in zip(tracks, x, p, seen.tolist()):
-        track.filter.x, track.filter.P = own_x, own_p
+        track.x, track.p = own_x, own_p
         track.misses += not measured
 
 
 def _t(matrices: Array) -> Array:
     return np.swapaxes(matrices, -1, -2)
-
-
-def new_filter(x: Array, p: Array) -> Any:
-    """Return a filterpy KalmanFilter that measures the position of a bubble.
-
-    x : (12,) first state.  p : (12, 12) its covariance.
-
-    The matrix R, and H for a measured pixel, are given with each update.
-    """
-    from filterpy.kalman import KalmanFilter
-
-    kalman = KalmanFilter(dim_x=len(x), dim_z=3)
-    kalman.H = np.eye(3, len(x))
-    kalman.x, kalman.P = np.array(x, float), np.array(p, float)
-    return kalman
 
 
 @dataclass(frozen=True)

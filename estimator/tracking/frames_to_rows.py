@@ -36,14 +36,12 @@ from telerig.estimator.tracking.backtracking import (
     SmoothedTracks,
     Tables,
     follow_back,
-    given_ids,
     shared_rows,
 )
 from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
     FrameMeasurements,
     FrameResult,
-    SingleMeasurements,
     TrackEvent,
 )
 from telerig.estimator.tracking.tracker import Tracker
@@ -91,7 +89,7 @@ class RowMaker:
         for c, tables in enumerate(zip(*frames)):
             table = pd.concat(tables, ignore_index=True)
             pixels.append(_pixels(table, self._wander))
-            ids.append(given_ids(table))
+            ids.append(_given_ids(table))
             a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
             joined.append(table)
             flags = ["|".join(words) for words in flag_words(table)]
@@ -185,11 +183,15 @@ class RowMaker:
         bubbles, offset_px = grouped_frame(sight, self.model, predicted)
         late = np.flatnonzero(bubbles.bodies.used == "none")
         self._fit(bubbles, late, tables, np.zeros_like(bubbles.rows))
-        others = tuple(_others(rows, given) for rows, given in zip(bubbles.rows.T, sight.given))
-        measured = _measured(bubbles, others, sight.pixels, offset_px)
+        rays = Bubbles.on_rays(sight, offset_px, self.cameras)
+        bubbles = Bubbles.concat([bubbles, rays.take(_others(rays, bubbles))])
+        measured = FrameMeasurements.create(
+            bubbles.points_mm, bubbles.covariance_mm2, d_eq_mm=bubbles.d_eq_mm,
+            confidence=bubbles.confidence, particle=bubbles.given, alone=bubbles.alone,
+        )  # fmt: skip
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
-            number, t_s, tables, sight, offset_px, bubbles, others, result.alone, result.motion
+            number, t_s, tables, sight, offset_px, rays, bubbles, result.motion
         )
         self._take_final(result)
         enough = self._waiting >= _BUBBLES_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
@@ -211,7 +213,7 @@ class RowMaker:
         self.events.extend(result.events)
         for ids in result.final:
             frame = self._open.pop(ids.frame)
-            frame.take_final(ids)
+            frame.bubbles.particle[:] = ids.particle
             self._closed.append(frame)
             self._waiting += 1 + len(frame.bubbles)
 
@@ -256,15 +258,15 @@ class RowMaker:
         bubbles.bodies.put(some, bodies)
 
     def _tracks(self, frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
-        bubbles = Bubbles.concat([f.bubbles for f in frames])
-        starts = np.repeat(_starts(frames), [len(f.bubbles) for f in frames], 0)
+        every = [f.bubbles.take(~f.bubbles.alone) for f in frames]
+        bubbles, many = Bubbles.concat(every), [*map(len, every)]
+        starts = np.repeat(_starts(frames), many, 0)
         bodies = bubbles.bodies
         self._fit(bubbles, np.flatnonzero(bodies.used == "none"), joined, starts)
         seen = bubbles.rows >= 0
-        many = [len(f.bubbles) for f in frames]
         table: dict[str, Any] = {
             "frame": np.repeat([f.number for f in frames], many),
-            "particle": np.concatenate([f.particle for f in frames]),
+            "particle": bubbles.particle,
             "t_s": np.repeat([f.t_s for f in frames], many),
         }
         table |= dict(zip(["x_mm", "y_mm", "z_mm"], bodies.points_mm.T))
@@ -313,6 +315,13 @@ def _named(ids: Sequence[Ints], frames: Sequence[Ints]) -> tuple[Ints, Ints]:
 def _at(values: Ints, rows: Ints) -> Ints:
     """Return values at rows, -1 where the row is -1."""
     return np.append(values, -1)[rows]
+
+
+def _given_ids(table: pd.DataFrame) -> Ints:
+    """Return the ids (N,) that came with N detections, -1 for none."""
+    if "particle" not in table:
+        return np.full(len(table), NO_PARTICLE)
+    return table["particle"].to_numpy(np.int64)
 
 
 def _starts(frames: Sequence[Frame]) -> Ints:
@@ -366,11 +375,13 @@ def grouped_frame(
     return bubbles, offset
 
 
-def _others(rows: Ints, given: Ints) -> Ints:
-    """Return the rows of detections without a given id that are not among ``rows``."""
-    out = given == NO_PARTICLE
-    out[rows[rows >= 0]] = False
-    return np.flatnonzero(out)
+def _others(rays: Bubbles, bubbles: Bubbles) -> Ints:
+    """Return which detections without a given id are in none of the bubbles."""
+    camera, row = rays.rows.argmax(1), rays.rows.max(1)
+    taken = np.zeros((int(row.max(initial=-1)) + 1, rays.rows.shape[1]), bool)
+    for c, rows in enumerate(bubbles.rows.T):
+        taken[rows[rows >= 0], c] = True
+    return np.flatnonzero((rays.given == NO_PARTICLE) & ~taken[row, camera])
 
 
 def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
@@ -381,33 +392,14 @@ def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
     return table[["u_px", "v_px"]].to_numpy(float), covariance.reshape(-1, 2, 2) + shape
 
 
-def _measured(
-    bubbles: Bubbles, others: Sequence[Ints], pixels: Sequence[Pixels], offset_px: Array
-) -> FrameMeasurements:
-    """Return the tracker's input; others : rows of the detections without a partner."""
-    alone = [(uv[i] - off, noise[i]) for (uv, noise), off, i in zip(pixels, offset_px, others)]
-    uv, noise = map(np.concatenate, zip(*alone))
-    singles = SingleMeasurements(
-        np.repeat(np.arange(len(others)), [len(i) for i in others]), uv, noise
-    )
-    return FrameMeasurements.create(
-        bubbles.points_mm,
-        bubbles.covariance_mm2,
-        d_eq_mm=bubbles.d_eq_mm,
-        confidence=bubbles.confidence,
-        particle=bubbles.given,
-        singles=singles,
-    )
-
-
 def _detections(frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return every detection with the id of its track, blank where it has none."""
-    count = range(len(joined))
-    particle = np.concatenate([frame.owners(c) for c in count for frame in frames])
-    order = [len(joined) * k + c for c in count for k, f in enumerate(frames)
+    particle = np.concatenate([frame.owners() for frame in frames])
+    order = [len(joined) * k + c for c in range(len(joined)) for k, f in enumerate(frames)
              for _ in f.sight.given[c]]  # fmt: skip
-    every = pd.concat(joined, ignore_index=True)
+    every = pd.concat(joined, ignore_index=True).take(np.argsort(order, kind="stable"))
+    every = every.reset_index(drop=True)
     every["particle"] = pd.arrays.IntegerArray(particle, particle == NO_PARTICLE)
     leading = ["frame", "camera", "particle"]
     every = every[leading + [name for name in every if name not in leading]]
-    return every.take(np.argsort(order, kind="stable")).reset_index(drop=True)
+    return every

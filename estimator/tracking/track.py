@@ -317,7 +317,7 @@ def tracking_stream(
             stage("pair model", 0, 0)
         sample = _sample(cameras, batches)
         model = learn_rig(sample, cameras)
-        tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
+        tracker = Tracker(axis, _settings(chosen, run), first_id=first_id)
         linker = RowMaker(model, tracker, _shapes(sample, model, up), up)
         without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
         linking = Linking(model.pairs, linker.shapes, linker.events, without, model.misplaced)

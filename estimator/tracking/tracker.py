@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.association import (
@@ -21,15 +21,11 @@ from telerig.estimator.tracking.association import (
     Scan,
     advance,
     assigned_with_shift,
-    best_assignment,
+    clear_assignment,
     continue_tracks,
     decide,
-    follow_labelled,
+    expected,
     gated_pairs,
-    pair_pixels,
-    projected,
-    unrivalled,
-    update_pixels,
 )
 from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
@@ -41,35 +37,30 @@ from telerig.estimator.tracking.filter import (
     FrameMeasurements,
     FrameResult,
     Motion,
-    SeenAlone,
     StageMotion,
     Track,
     TrackerSettings,
     TrackEvent,
     Transition,
     birth_covariance,
-    new_filter,
     predict_tracks,
     transition,
 )
-from telerig.rig.camera import Camera
 
 _SPARE = 16
+"""Tracks that have ended and are still remembered, beside twice as many as live."""
 
 
 class OpenFrames:
     """Hold the track ids of the undecided frames, and when each track was last seen."""
 
     def __init__(self) -> None:
-        self._frames: dict[int, tuple[float, Ints, Ints]] = {}
+        self._frames: dict[int, tuple[float, Ints]] = {}
         self._seen: dict[int, int] = {}
 
-    def begin(self, frame: int, t_s: float, points: int, singles: int) -> None:
-        """Add a frame without ids.
-
-        points : number of bubbles that several cameras saw.  singles : number that one camera saw.
-        """
-        self._frames[frame] = (t_s, np.full(points, NO_PARTICLE), np.full(singles, NO_PARTICLE))
+    def begin(self, frame: int, t_s: float, count: int) -> None:
+        """Add a frame with so many measurements, without ids."""
+        self._frames[frame] = (t_s, np.full(count, NO_PARTICLE))
 
     def write(self, entries: Iterable[tuple[int, int]], particle: int) -> None:
         """Set the id of a track in some frames; the track's earlier entries in these frames are
@@ -85,17 +76,6 @@ class OpenFrames:
             if column >= 0:
                 ids[column] = particle
 
-    def write_single(self, frame: int, index: int, particle: int) -> None:
-        """Set the id of the single-camera measurement ``index`` of a frame."""
-        self._frames[frame][2][index] = particle
-
-    def now(self, frame: int) -> tuple[Ints, Ints]:
-        """Return copies of a frame's ids: of the bubbles (M,) and of the single-camera measurements
-        (L,).
-        """
-        _, particle, single = self._frames[frame]
-        return particle.copy(), single.copy()
-
     def close(
         self, before_frame: int, alive: set[int]
     ) -> tuple[tuple[FrameIds, ...], list[TrackEvent]]:
@@ -107,9 +87,9 @@ class OpenFrames:
         """
         out, events = [], []
         for frame in [f for f in self._frames if f < before_frame]:
-            t_s, particle, single = self._frames.pop(frame)
-            out.append(FrameIds(frame, particle, single))
-            for p in sorted({*particle.tolist(), *single.tolist()} - {NO_PARTICLE}):
+            t_s, particle = self._frames.pop(frame)
+            out.append(FrameIds(frame, particle))
+            for p in sorted({*particle.tolist()} - {NO_PARTICLE}):
                 missed = frame - self._seen.get(p, frame - 1) - 1
                 self._seen[p] = frame
                 if missed > 0:
@@ -129,26 +109,23 @@ def born(
 ) -> Track:
     """Return a tentative track that starts at a measurement.
 
-    scan : the measurements of the frame.
-    column : index of the measurement.
-    velocity_mm_s : (3,) first velocity.
-    encoder : whether an encoder has given the stage's speed.
+    velocity_mm_s : (3,) first velocity. encoder : whether an encoder has given the stage's speed.
     tracks : confirmed tracks; the nearest one is noted as a possible parent.
     """
     point = scan.measured.points_mm[column]
     covariance = birth_covariance(scan.settings, scan.measured.covariance_mm2[column], encoder)
-    x = np.zeros(len(covariance))
+    x = np.zeros(STATES)
     x[POSITION], x[VELOCITY] = point, velocity_mm_s
-    out = Track(new_filter(x, covariance), born_frame=scan.frame, history=[(scan.frame, column)])
+    out = Track(x, covariance, born_frame=scan.frame, history=[(scan.frame, column)])
     out.saw(scan.frame, scan.t_s, float(scan.measured.d_eq_mm[column]))
     out.parent = Neighbours(tracks).beside(point)
     return out
 
 
 def extend(
-    tentative: Sequence[Track], scan: Scan, common: Common, mean_gain: Array | None
+    tentative: Sequence[Track], scan: Scan, free: Bools, common: Common, mean_gain: Array | None
 ) -> tuple[list[Track], Common, Array | None]:
-    """Continue the tentative tracks with the measurements that no confirmed track uses.
+    """Continue the tentative tracks with the measurements ``free`` (M,), which no other track uses.
 
     Tracks for which two measurements fit almost equally well are given up.
 
@@ -159,23 +136,20 @@ def extend(
     Returns the tracks that continue, the common error, and the mean gain (None if no track was
     measured).
     """
-    if not tentative:
+    many = len(tentative)
+    if not many:
         return [], common, mean_gain
-    pairs = gated_pairs(tentative, scan.measured, scan.columns, common, scan.settings)
+    allowed = np.tile(free, (many, 1))
+    pairs = gated_pairs(expected(tentative), scan.measured, allowed, common, scan.settings)
     if mean_gain is None:
-        everyone = np.ones(len(tentative), bool)
-        common, chosen = assigned_with_shift(pairs, len(tentative), everyone, common)
-    else:
-        score = pairs.scores(common.shift_mm)
-        chosen = best_assignment(len(tentative), pairs.row, pairs.column, score)
-    score = pairs.scores(common.shift_mm)
-    safe = unrivalled(pairs.row, pairs.column, score, chosen, scan.settings.margin_log_ratio)
+        common, _ = assigned_with_shift(pairs, many, np.ones(many, bool), common)
+    chosen, clear = clear_assignment(pairs, many, common.shift_mm, scan.settings)
     picked = np.flatnonzero(chosen[pairs.row] == pairs.column)
     if mean_gain is None and len(picked):
-        p = np.array([tentative[r].filter.P[:, POSITION] for r in pairs.row[picked]])
+        p = np.array([tentative[r].p[:, POSITION] for r in pairs.row[picked]])
         mean_gain = (p @ pairs.information[picked]).mean(0)
-    gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
-    going = np.flatnonzero((chosen < 0) | safe).tolist()
+    gain = np.zeros((STATES, 3)) if mean_gain is None else mean_gain
+    going = np.flatnonzero((chosen < 0) | clear).tolist()
     out, columns = [tentative[i] for i in going], chosen[going].tolist()
     continue_tracks(out, columns, scan, common, gain)
     for track, column in zip(out, columns):
@@ -276,41 +250,9 @@ def _volumes_balance(
     return bool(off <= settings.balance_tolerance * whole_mm**3)
 
 
-def continue_alone(
-    missed: Sequence[Track], scan: Scan, cameras: Sequence[Camera], common_mm2: Array
-) -> list[tuple[Track, int, SeenAlone]]:
-    """Update the tracks that were missed by measurements of only one camera.
-
-    missed : tracks that several cameras did not see in this frame.
-    cameras : cameras of the rig.
-    common_mm2 : (3, 3) covariance of the position error that all bubbles have in common.
-
-    Returns for each updated track: the track, the index of the measurement, and the track's
-    position and diameter after the update.
-    """
-    singles = scan.measured.singles
-    out = []
-    for index, camera in enumerate(cameras):
-        mine = np.flatnonzero(singles.camera == index)
-        if not len(mine) or not len(missed):
-            continue
-        points = np.array([t.point_mm for t in missed])
-        spread = np.array([t.point_covariance_mm2 for t in missed]) + common_mm2
-        expected = projected(camera, points, spread)
-        uv, noise = singles.uv_px[mine], singles.covariance_px2[mine]
-        for k, j in enumerate(pair_pixels(expected, uv, noise, scan.settings)):
-            if j >= 0:
-                track = missed[k]
-                update_pixels(track, uv[j], noise[j], expected.uv_px[k], expected.by_point[k])
-                track.saw(scan.frame, scan.t_s, float("nan"))
-                out.append((track, int(mine[j])))
-    return [(t, single, SeenAlone(t.point_mm, t.d_eq_mm)) for t, single in out]
-
-
 class Tracker:
     """Follow bubbles: take the measurements of one frame after another and return track ids.
 
-    cameras : cameras of the rig; only single-camera measurements need them.
     axis_rig : (3,) the stage's travel direction in the rig frame, along which bubbles also rise. It
         need not have unit length.
     settings : None for the defaults.
@@ -325,7 +267,6 @@ class Tracker:
 
     def __init__(
         self,
-        cameras: Sequence[Camera] = (),
         axis_rig: ArrayLike = (0.0, -1.0, 0.0),
         settings: TrackerSettings | None = None,
         *,
@@ -337,12 +278,10 @@ class Tracker:
                 f"axis_rig = {axis.tolist()}", todo="give a direction of three numbers"
             )
         unit = (axis / np.linalg.norm(axis)).tolist()
-        self.cameras = tuple(cameras)
         self.axis: tuple[float, float, float] = (unit[0], unit[1], unit[2])
         self.settings = TrackerSettings() if settings is None else settings
         self.next_id = first_id
         self.clusters: list[Cluster] = []
-        self.given: list[Track] = []
         self.tentative: list[Track] = []
         self.common = Common()
         self.stage = StageMotion()
@@ -359,19 +298,14 @@ class Tracker:
 
         Raises InputError when t_s is not later than the last frame's time.
         """
-        tracks = self._confirmed()
-        x, spread = np.zeros((0, STATES)), np.zeros((0, 3, 3))
+        tracks = [t.copy() for t in self._confirmed()]
+        common = self.common
         if tracks and self.last is not None:
-            stage = replace(self.stage)
-            step, control, found = self._motion(stage, t_s, position_mm)
-            x = np.array([t.filter.x for t in tracks])
-            x[:, VELOCITY] += found
-            x = x @ step.matrix.T + control
-            total = np.array([t.filter.P for t in tracks]) + self.common.covariance
-            total = step.matrix @ total @ step.matrix.T + step.noise + step.common_noise
-            spread = total[:, POSITION, POSITION]
-        ids = np.array([t.particle for t in tracks], np.int64)
-        return Prediction(ids, x[:, POSITION], spread, np.array([t.d_eq_mm for t in tracks]))
+            step, control, found = self._motion(replace(self.stage), t_s, position_mm)
+            _move(tracks, step, control, found)
+            common = common.predicted(step)
+        now = expected(tracks)
+        return replace(now, covariance_mm2=now.covariance_mm2 + common.covariance_mm2)
 
     def update(
         self,
@@ -380,49 +314,44 @@ class Tracker:
         measured: FrameMeasurements,
         position_mm: float | None = None,
     ) -> FrameResult:
-        """Take in the measurements of one frame and return the track ids.
+        """Take in the measurements of one frame and return what is final.
 
         frame, t_s : number and time of the frame; both have to increase.
         measured : the bubbles of the frame.
         position_mm : encoder position of the stage; None or NaN if there is none.
 
-        Raises InputError when frame or t_s do not increase, or when a single-camera measurement
-        names a camera that the tracker does not have.
+        Raises InputError when frame or t_s do not increase.
         """
-        self._check(frame, t_s, measured)
+        self._check(frame, t_s)
         motion = self._predict_all(t_s, position_mm)
         self.last = (frame, t_s)
-        self.frames.begin(frame, t_s, len(measured), len(measured.singles))
+        self.frames.begin(frame, t_s, len(measured))
         self.events = []
-        gains = self._follow_labelled(Scan(frame, t_s, measured, measured.labelled, self.settings))
-        scan = Scan(frame, t_s, measured, measured.free, self.settings)
-        grown, common, gain = advance(self.clusters, scan, self.common, gains)
+        scan = Scan(frame, t_s, measured, self.settings)
+        grown, common, gain = advance(self.clusters, scan, self.common)
         claimed = self._decide(grown, scan)
         moved = None if motion is None else motion.shifted(common.shift, common.covariance_mm2)
-        alone = self._single(scan, common)
-        self._births(replace(scan, columns=np.setdiff1d(scan.columns, claimed)), common, gain)
+        self._births(scan, claimed, common, gain)
         self._deaths(scan)
-        now = self.frames.now(frame)
         final = self._close(self._open_since(frame))
-        return FrameResult(frame, *now, tuple(self.events), final, alone, moved)
+        return FrameResult(tuple(self.events), final, moved)
 
     def finish(self) -> FrameResult | None:
         """Decide everything that is undecided at the end of the run; conflicts end as if their
         window ended.
 
-        Returns the last result, whose ``final`` holds the remaining frames and whose own ids are
-        empty; None if there was no frame.
+        Returns the last result, whose ``final`` holds the remaining frames; None if there was no
+        frame.
         """
         if self.last is None:
             return None
         self.events = []
         nothing = FrameMeasurements.create(np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        none = nothing.particle
-        scan = Scan(*self.last, nothing, none, self.settings)
+        scan = Scan(*self.last, nothing, self.settings)
         self._decide(self.clusters, scan, at_once=True)
         self.tentative = []
         final = self._close(scan.frame + 1)
-        return FrameResult(scan.frame, none, none, tuple(self.events), final)
+        return FrameResult(tuple(self.events), final)
 
     def _close(self, before_frame: int) -> tuple[FrameIds, ...]:
         final, gaps = self.frames.close(before_frame, {t.particle for t in self._confirmed()})
@@ -430,31 +359,23 @@ class Tracker:
         return final
 
     def _confirmed(self) -> list[Track]:
-        return [*self.given, *(t for c in self.clusters for t in c.tracks)]
+        return [t for c in self.clusters for t in c.tracks]
 
     def _every(self) -> list[Track]:
-        own = [t for c in self.clusters for b in c.branches for t in b.tracks]
-        return [*self.given, *own, *self.tentative]
+        return [*(t for c in self.clusters for b in c.branches for t in b.tracks), *self.tentative]
 
     def _open_since(self, frame: int) -> int:
         starts = [c.since_frame for c in self.clusters if c.open]
         starts += [t.born_frame for t in self.tentative]
         return min([frame + 1, *starts])
 
-    def _check(self, frame: int, t_s: float, measured: FrameMeasurements) -> None:
+    def _check(self, frame: int, t_s: float) -> None:
         if not np.isfinite(t_s):
             raise InputError(f"time {t_s}", where=f"frame {frame}", todo="give a time in s")
         if self.last is not None and not (frame > self.last[0] and t_s > self.last[1]):
             raise InputError(
                 f"frame {frame} at {t_s} s follows frame {self.last[0]} at {self.last[1]} s",
                 todo="give frames in order, with times that increase",
-            )
-        cameras = measured.singles.camera
-        if cameras.size and not (cameras.min() >= 0 and cameras.max() < len(self.cameras)):
-            raise InputError(
-                f"single-camera measurements of camera {cameras.max()}",
-                where=f"frame {frame}",
-                todo=f"the tracker has {len(self.cameras)} cameras, counted from 0",
             )
 
     def _motion(
@@ -481,25 +402,8 @@ class Tracker:
         step, control, found = self._motion(self.stage, t_s, position_mm)
         every = self._every()
         self.common = self.common.predicted(step) if every else Common()
-        if found.any():
-            for track in every:
-                track.filter.x = track.filter.x + np.pad(found, (3, STATES - 6))
-        predict_tracks(every, step, control)
+        _move(every, step, control, found)
         return Motion(step.matrix, step.noise, step.matrix[:, VELOCITY] @ found + control)
-
-    def _follow_labelled(self, scan: Scan) -> list[Array]:
-        """Follow the tracks whose ids came with the measurements; returns their gains."""
-        ids = scan.measured.particle
-        self.common, gains, fresh = follow_labelled(self.given, scan, self.common)
-        for column in scan.columns.tolist():
-            self.frames.write([(scan.frame, column)], int(ids[column]))
-        for column in fresh:
-            track = self._new(scan, column)
-            track.particle = int(ids[column])
-            self.given.append(track)
-            self._event("birth", scan, (track.particle,), "id given with the data")
-        self.next_id = max([self.next_id, *(ids + 1).tolist()])
-        return gains
 
     def _new(self, scan: Scan, column: int) -> Track:
         """Start a track at a measurement, with the mean rise if velocities are the lab's."""
@@ -554,40 +458,48 @@ class Tracker:
         self._event("break", scan, (*old, *(t.particle for t in going_on)), reason)
         return going_on
 
-    def _single(self, scan: Scan, common: Common) -> dict[int, SeenAlone]:
-        """Continue confirmed tracks that were missed in this frame by one camera alone."""
-        closed = [c.tracks[0] for c in self.clusters if not c.open]
-        missed = [t for t in closed if t.seen_frame < scan.frame]
-        found = continue_alone(missed, scan, self.cameras, common.covariance_mm2)
-        for track, single, _ in found:
-            self.frames.write_single(scan.frame, single, track.particle)
-        return {single: alone for _, single, alone in found}
-
-    def _births(self, scan: Scan, common: Common, gain: Array | None) -> None:
+    def _births(self, scan: Scan, claimed: Ints, common: Common, gain: Array | None) -> None:
         """Tentative tracks go on, are confirmed or given up; what is left starts new ones."""
-        going, common, gain = extend(self.tentative, scan, common, gain)
+        measured = scan.measured
+        free = ~measured.alone & (measured.particle == NO_PARTICLE)
+        free[claimed] = False
+        going, common, gain = extend(self.tentative, scan, free, common, gain)
         self.common = common.applied(np.zeros((STATES, 3)) if gain is None else gain)
-        used = [c for t in going for f, c in t.history[-1:] if f == scan.frame]
-        fresh = np.setdiff1d(scan.columns, np.array(used, np.int64)).tolist()
+        free[[c for t in going for f, c in t.history[-1:] if f == scan.frame]] = False
+        fresh = [self._new(scan, column) for column in np.flatnonzero(free).tolist()]
         self.tentative = []
-        for track in [*going, *(self._new(scan, column) for column in fresh)]:
+        for track in [*going, *fresh]:
             if len(track.history) >= self.settings.confirm_hits:
-                self._confirm(track, scan)
+                track.particle = self._take_id()
+                self._confirm(track, scan, f"first seen in frame {track.history[0][0]}")
             elif not hopeless(track, scan.frame, self.settings):
                 self.tentative.append(track)
+        given = {t.particle for t in self._confirmed() if t.given}
+        for column in np.flatnonzero(measured.particle != NO_PARTICLE).tolist():
+            particle = int(measured.particle[column])
+            if particle not in given:
+                track = replace(self._new(scan, column), particle=particle, given=True)
+                self.next_id = max(self.next_id, particle + 1)
+                self._confirm(track, scan, "id given with the data")
 
-    def _confirm(self, track: Track, scan: Scan) -> None:
-        track.particle = self._take_id()
+    def _confirm(self, track: Track, scan: Scan, reason: str) -> None:
         self.frames.write(track.history, track.particle)
-        self._event("birth", scan, (track.particle,), f"first seen in frame {track.history[0][0]}")
+        self._event("birth", scan, (track.particle,), reason)
         self.events += split_off(track, self._confirmed(), scan)
         track.history, track.parent = [], None
         self.clusters.append(Cluster.of(track))
 
     def _deaths(self, scan: Scan) -> None:
-        closed = [c.tracks[0] for c in self.clusters if not c.open] + self.given
+        closed = [c.tracks[0] for c in self.clusters if not c.open]
         dead, found = ended(closed, self._confirmed(), scan)
         self.events += found
         if dead:
             self.clusters = [c for c in self.clusters if c.tracks[0].particle not in dead]
-            self.given = [t for t in self.given if t.particle not in dead]
+
+
+def _move(tracks: Sequence[Track], step: Transition, control: Array, found_mm_s: Array) -> None:
+    """Move tracks to the next frame; see `Tracker._motion` for the arguments."""
+    if found_mm_s.any():
+        for track in tracks:
+            track.x = track.x + np.pad(found_mm_s, (3, STATES - 6))
+    predict_tracks(tracks, step, control)

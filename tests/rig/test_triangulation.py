@@ -13,7 +13,13 @@ from scipy.optimize import least_squares, minimize
 from telerig.errors import GeometryError, InputError
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-from telerig.rig.triangulation import midpoint, stacked_jacobian, triangulate, triangulate_views
+from telerig.rig.triangulation import (
+    midpoint,
+    on_rays,
+    stacked_jacobian,
+    triangulate,
+    triangulate_views,
+)
 
 LENSES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "ideal": ({}, {}),
@@ -318,6 +324,26 @@ def test_views_of_two_cameras_are_the_pair(method: str, shape: tuple[int, ...]) 
     assert np.all(total >= np.abs(pair.ray_miss_mm) - 1e-9)
     if method == "midpoint":
         np.testing.assert_allclose(total, np.abs(pair.ray_miss_mm), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["ideal", "distorted", "tilted"])
+def test_two_points_of_unknown_depth_are_one_of_known_depth(kind: str) -> None:
+    cameras = rig(kind)
+    truth = np.random.default_rng(8).uniform(-9, 9, (6, 3))
+    pixels = [camera.project(truth) for camera in cameras]
+    noise = [np.tile(own, (6, 1, 1)) for own in SIGMA]
+    whole = triangulate_views(cameras, pixels, tuple(noise))
+    rays = [on_rays(c, uv, s, np.ones(3), 1e3) for c, uv, s in zip(cameras, pixels, noise)]
+    weights = [np.linalg.inv(covariance) for _, covariance, _ in rays]
+    pull = sum(w @ points[..., None] for w, (points, _, _) in zip(weights, rays))
+    found = np.linalg.solve(sum(weights), pull)[..., 0]
+    np.testing.assert_allclose(found, truth, atol=1e-4)
+    covariance = np.linalg.inv(sum(weights))
+    np.testing.assert_allclose(covariance, whole.covariance_mm2, rtol=1e-3, atol=1e-7)
+    for camera, (points, _, scale) in zip(cameras, rays):
+        moved = camera.project(points + 0.1 * camera.camera_from_rig.rotation[1])
+        off = np.linalg.norm(moved - camera.project(points), axis=-1)
+        np.testing.assert_allclose(off, 0.1 * scale, rtol=0.1)
 
 
 @pytest.mark.parametrize("method", ["ml", "midpoint"])

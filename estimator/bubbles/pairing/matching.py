@@ -25,7 +25,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 
-from telerig.arrays import Array, Bools, Ints
+from telerig.arrays import Array, Bools, Ints, Rows
 from telerig.errors import InputError
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     AXES_COLUMNS,
@@ -483,7 +483,7 @@ _RARE, _FREEDOM = 2.5, 6.0
 
 
 @dataclass(frozen=True)
-class Prediction:
+class Prediction(Rows):
     """Hold where K tracks are expected in a frame.
 
     ids : (K,) numbers of the tracks.

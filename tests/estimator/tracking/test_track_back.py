@@ -75,7 +75,7 @@ def linked(
     rng = np.random.default_rng(seed)
     truth, shake = paths(rng), rng.normal(0, SHAKE_PX, (FRAMES, 2, 2))
     shapes = Shapes(third=1e-3, fourth=1e-3)
-    linker = RowMaker(MODEL, Tracker(CAMERAS), shapes, np.array([0.0, -1.0, 0.0]))
+    linker = RowMaker(MODEL, Tracker(), shapes, np.array([0.0, -1.0, 0.0]))
     for frame in range(FRAMES):
         tables = []
         for camera in (0, 1):

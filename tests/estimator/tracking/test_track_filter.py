@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracker_runs import SIGMA_MM, STILL, UP, Array, cameras, frame_of
+from tracker_runs import SIGMA_MM, UP, Array, frame_of
 
-from telerig.estimator.tracking.association import projected, update_pixels
 from telerig.estimator.tracking.filter import (
     DRIFT,
     FrameMeasurements,
@@ -63,10 +62,10 @@ def test_two_bubbles_under_shake_are_the_dense_gaussian_posterior() -> None:
         tracker.update(i, t, FrameMeasurements.create(z[i], r, particle=[4, 9]), 0.0)
     mean, covariance = _dense_posterior(settings, times, z, r)
     n = len(mean) // 2
-    first, second = (t.filter for t in tracker.given)
+    first, second = (c.tracks[0] for c in tracker.clusters)
     assert first.x == pytest.approx(mean[:n], rel=1e-6, abs=1e-7)
     assert second.x == pytest.approx(mean[n:], rel=1e-6, abs=1e-7)
-    own, common = first.P, tracker.common.covariance
+    own, common = first.p, tracker.common.covariance
     assert own + common == pytest.approx(covariance[:n, :n], rel=1e-6, abs=1e-6)
     assert common == pytest.approx(covariance[:n, n:], rel=1e-6, abs=1e-6)
 
@@ -120,7 +119,7 @@ def test_steady_state_is_the_riccati_solution() -> None:
     predicted = solve_discrete_are(matrix.T, h.T, noise, r)
     gain = predicted @ h.T @ np.linalg.inv(h @ predicted @ h.T + r)
     steady = predicted - gain @ h @ predicted
-    found = tracker.given[0].filter.P[driven]
+    found = tracker.clusters[0].tracks[0].p[driven]
     assert found == pytest.approx(steady, rel=1e-5, abs=1e-6)
 
 
@@ -153,25 +152,3 @@ def test_predictions_are_as_good_as_they_say_at_irregular_times() -> None:
             tracker.update(i, t, frame_of([z], particle=[0]), 280 * t)
     many = len(distances)
     assert abs(np.mean(distances) - 3) < 4 * np.sqrt(6 / many)
-
-
-def test_pixel_update_equals_the_space_update_that_lacks_one_direction() -> None:
-    """With an affine camera a pixel is the point measured with infinite noise along the ray."""
-    pair = cameras()
-    point, noise = np.array([0.12, 0.03, 0.0]), np.eye(2) * 0.04
-    results = []
-    for alone in (True, False):
-        tracker = Tracker(pair, settings=STILL)
-        for i in range(10):
-            tracker.update(i, i / 500, frame_of([[0.01 * i, 0, 0]]), 0.0)
-        track = tracker.clusters[0].tracks[0]
-        seen = projected(pair[0], track.point_mm[None], track.point_covariance_mm2[None])
-        if alone:
-            uv = pair[0].project(point)
-            update_pixels(track, uv, noise, seen.uv_px[0], seen.by_point[0])
-        else:
-            track.filter.update(point, R=np.diag([4e-4, 4e-4, 1e9]))
-        results.append((track.filter.x, track.filter.P))
-    (x_pixel, p_pixel), (x_point, p_point) = results
-    assert x_pixel == pytest.approx(x_point, abs=1e-6)
-    assert p_pixel == pytest.approx(p_point, rel=1e-5, abs=1e-6)

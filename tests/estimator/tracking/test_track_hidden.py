@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from telerig.estimator.tracking.backtracking import Readings, smooth_points
+from telerig.estimator.tracking.backtracking import smooth_points
 from telerig.estimator.tracking.filter import Motion, TrackerSettings, birth_covariance, transition
 
 Reading = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -39,11 +39,13 @@ def _smoothed(
     readings: list[Reading | None], motions: list[Motion | None]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Beside a second bubble that nobody sees, which must not matter."""
-    table = Readings.none(FRAMES, 2)
+    measured, noise = np.full((FRAMES, 2, 3), np.nan), np.full((FRAMES, 2, 3, 3), np.nan)
     for k, reading in enumerate(readings):
         if reading is not None:
-            table.add(k, 0, *reading)
-    points, covariances = smooth_points(table, motions, SETTINGS)
+            value, own, h = reading
+            noise[k, 0] = h.T @ own @ h + 1e6 * (np.eye(3) - h.T @ h)
+            measured[k, 0] = h.T @ value
+    points, covariances = smooth_points(measured, noise, motions, SETTINGS)
     return points[:, 0], covariances[:, 0]
 
 

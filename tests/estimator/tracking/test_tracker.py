@@ -10,8 +10,9 @@ import pytest
 from tracker_runs import STILL, UP, Array, cameras, frame_of, kinds, run
 
 from telerig.errors import InputError
-from telerig.estimator.tracking.filter import SingleMeasurements, TrackerSettings
+from telerig.estimator.tracking.filter import ANYWHERE_MM, FrameMeasurements, TrackerSettings
 from telerig.estimator.tracking.tracker import Tracker
+from telerig.rig.triangulation import on_rays
 
 # --- association
 
@@ -141,7 +142,7 @@ def test_readings_that_fail_for_a_while_are_bridged() -> None:
     tracker = Tracker()
     ids, events = run(tracker, frames, stage=read)
     assert kinds(events) == ["birth"] * 2 and ids[0].tolist() == ids[-1].tolist()
-    velocity = np.array([track.filter.x[3:6] for c in tracker.clusters for track in c.tracks])
+    velocity = np.array([track.x[3:6] for c in tracker.clusters for track in c.tracks])
     assert velocity.mean(0) == pytest.approx(280 * UP, abs=12)
 
 
@@ -160,20 +161,18 @@ def test_given_ids_pass_unchanged_and_new_ones_keep_clear() -> None:
 
 @pytest.mark.parametrize("seeing", [0, 1])
 def test_one_camera_alone_keeps_a_track_alive(seeing: int) -> None:
-    pair = cameras()
-    tracker = Tracker(pair, settings=STILL)
+    camera, tracker, final = cameras()[seeing], Tracker(settings=STILL), []
     points = np.stack([np.sin(np.arange(150) / 30), 0.01 * np.arange(150), np.zeros(150)], -1)
     for i, point in enumerate(points):
         alone = 30 <= i < 110
-        uv = pair[seeing].project(point[None])
-        singles = SingleMeasurements(np.array([seeing]), uv, np.eye(2)[None] * 0.04)
-        measured = frame_of([] if alone else [point], singles=singles if alone else None)
-        result = tracker.update(i, i / 500, measured, 0.0)
+        uv = camera.project(point[None])
+        seen = on_rays(camera, uv, 0.04 * np.eye(2)[None], np.zeros(3), ANYWHERE_MM)
+        ray = FrameMeasurements.create(*seen[:2], alone=[True])
+        final += tracker.update(i, i / 500, ray if alone else frame_of([point]), 0.0).final
         if alone:
-            assert result.single.tolist() == [0]
-            seen = pair[seeing].project(tracker.predict(i / 500 + 1e-6, 0.0).points_mm)
-            assert seen == pytest.approx(uv, abs=1.0)
-    assert result.particle.tolist() == [0] and tracker.next_id == 1
+            there = tracker.predict(i / 500 + 1e-6, 0.0).points_mm
+            assert camera.project(there) == pytest.approx(uv, abs=1.0)
+    assert [ids.particle.tolist() for ids in final] == [[0]] * 150 and tracker.next_id == 1
 
 
 # --- streaming
@@ -214,31 +213,24 @@ def test_predict_changes_nothing_and_empty_frames_are_fine() -> None:
     assert seen.points_mm[0] == pytest.approx([1, 3, 3], abs=0.05)
     assert pickle.dumps(tracker) == before
     for i in range(5, 60):
-        assert tracker.update(i, i / 500, frame_of([]), None).particle.size == 0
+        assert tracker.update(i, i / 500, frame_of([]), None).final[0].particle.size == 0
 
 
 # --- refusals
 
 
 def test_bad_input_is_refused_in_words() -> None:
-    tracker = Tracker(cameras())
+    tracker = Tracker()
     tracker.update(3, 0.1, frame_of([]), 0.0)
     for frame, t in ((3, 0.2), (4, 0.1), (4, np.nan)):
         with pytest.raises(InputError):
             tracker.update(frame, t, frame_of([]), 0.0)
-    alone = SingleMeasurements(np.array([2]), np.zeros((1, 2)), np.eye(2)[None])
-    with pytest.raises(InputError, match="2 cameras"):
-        tracker.update(5, 0.3, frame_of([], singles=alone), 0.0)
     with pytest.raises(InputError, match="not finite"):
         frame_of([[np.nan, 0, 0]])
     with pytest.raises(InputError, match="twice"):
         frame_of(np.zeros((2, 3)), particle=[1, 1])
     with pytest.raises(InputError, match="d_eq_mm"):
         frame_of(np.zeros((2, 3)), d_eq_mm=[1.0])
-    with pytest.raises(InputError, match="detection_probability"):
-        TrackerSettings(detection_probability=1.0)
-    with pytest.raises(InputError, match="confirm_hits"):
-        TrackerSettings(confirm_hits=5)
     with pytest.raises(InputError, match="axis_rig"):
         Tracker(axis_rig=(0, 0, 0))
 

@@ -7,7 +7,7 @@ finished rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,20 @@ class Correction:
     frame: int
     reason: str
 
+    @property
+    def of(self) -> str:
+        """Id of the track whose rows change."""
+        return self.other if self.action == "join" else self.particle
+
+    @property
+    def new(self) -> str:
+        """The new id of these rows; "" for none."""
+        return {"drop": "", "join": self.particle}.get(self.action, self.other)
+
+    def new_id(self, particle: str, frame: int) -> str:
+        """Return the id that a track has in a frame after the correction."""
+        return self.new if particle == self.of and frame >= self.frame else particle
+
 
 @dataclass
 class Corrections:
@@ -67,14 +81,39 @@ class Corrections:
     used: dict[Correction, tuple[int, float]] = field(default_factory=dict)
     kept: set[Correction] = field(default_factory=set)
 
-    @property
-    def events(self) -> list[TrackEvent]:
-        """Return an event for each correction that changed something."""
-        return [
+    def of_events(self, events: Sequence[TrackEvent]) -> list[TrackEvent]:
+        """Return the events of the corrected tracks, then one for each correction that changed
+        something.
+
+        Ids are those of the corrected rows, and each track has one birth and one death at most.
+        Events of dropped tracks are left out, and so are splits and mergers of one track.
+        """
+        new = (
+            [replace(e, particles=self._ids_at(e)) for e in events] if self.corrections else events
+        )
+        known = [e for e in new if len(e.particles) > (e.kind in ("split", "merge"))]
+        births = {e.particles: e for e in reversed(known) if e.kind == "birth"}
+        deaths = {e.particles: e for e in known if e.kind == "death"}
+        own = [
             TrackEvent("correction", frame, t_s, tuple(p for p in (c.particle, c.other) if p),
                        f"{c.action}: {c.reason}")
             for c, (frame, t_s) in self.used.items()
         ]  # fmt: skip
+        return [
+            e for e in known
+            if {"birth": births, "death": deaths}.get(e.kind, {}).get(e.particles, e) is e
+        ] + own  # fmt: skip
+
+    def _ids_at(self, event: TrackEvent) -> tuple[int | str, ...]:
+        """Return the ids of an event's tracks, each once, without those that are dropped."""
+        out: dict[int | str, None] = {}
+        for particle in event.particles:
+            text = str(particle)
+            for one in self.corrections:
+                text = one.new_id(text, event.frame)
+            if text:
+                out[type(particle)(text)] = None
+        return tuple(out)
 
     @property
     def warnings(self) -> list[str]:
@@ -87,7 +126,7 @@ class Corrections:
         ]
         return alone + [
             f"{CORRECTIONS} row {c.row}: {c.action} changed nothing: there is no track "
-            f"{c.other if c.action == 'join' else c.particle}"
+            f"{c.of}"
             + (f" from frame {c.frame} on" if c.frame else "")
             + ". The ids of the tracks may have changed since the file was written: check the row"
             for c in self.corrections
@@ -123,12 +162,10 @@ class Corrections:
         """Return the table with new ids, NaN for dropped ones."""
         ids, frames = _texts(table["particle"]), table["frame"].to_numpy(np.int64)
         for one in self.corrections:
-            of = one.other if one.action == "join" else one.particle
-            hit = (ids == of) & (frames >= one.frame)
-            new = {"drop": "", "join": one.particle}.get(one.action, one.other)
-            if one.action in ("split", "rename") and (ids == new).any():
+            hit = (ids == one.of) & (frames >= one.frame)
+            if one.action in ("split", "rename") and (ids == one.new).any():
                 raise InputError(
-                    f"there is a track {new} already",
+                    f"there is a track {one.new} already",
                     where=f"{self.file} row {one.row}",
                     todo="give another id, or join the tracks",
                 )
@@ -137,7 +174,7 @@ class Corrections:
             if counts and hit.any():
                 first = table.iloc[int(np.flatnonzero(hit)[0])]
                 self.used.setdefault(one, (int(first["frame"]), float(first["t_s"])))
-            ids = np.where(hit, new, ids)
+            ids = np.where(hit, one.new, ids)
         return table.assign(particle=_ids(ids, table["particle"]))
 
 
@@ -200,8 +237,7 @@ def _effect(one: Correction, found: Tracks, where: Path) -> str:
     if one.action == "join":
         _refuse_overlap(one, found, where)
     rows = f"{counted(len(hit), 'row')} of track {of}, frames {hit.min()} to {hit.max()}"
-    new = one.particle if one.action == "join" else one.other
-    return f"{one.action}: {rows}, " + (f"now track {new}" if new else "dropped")
+    return f"{one.action}: {rows}, " + (f"now track {one.new}" if one.new else "dropped")
 
 
 def _refuse_overlap(one: Correction, found: Tracks, where: Path) -> None:

@@ -129,7 +129,7 @@ class TrackingStream:
             events = [
                 replace(e, particles=tuple(_name(p, names) for p in e.particles)) for e in events
             ]
-        return [*events, *self.corrections.events]
+        return self.corrections.of_events(events)
 
     @property
     def rows(self) -> Iterator[Linked]:

@@ -15,6 +15,7 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.tracking import track as track_module
 from telerig.estimator.tracking.corrections import Corrections, add_correction, read_corrections
+from telerig.estimator.tracking.filter import TrackEvent
 from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.results_folder import WORK
 from telerig.estimator.tracking.tracks import Tracks, events_table
@@ -70,10 +71,30 @@ def test_each_action(tmp_path: Path, rows: str, expected: list[list[int]]) -> No
 def test_what_was_done_and_what_changed_nothing_is_said(tmp_path: Path) -> None:
     corrections = read(tmp_path, "drop,1,,,a speck\njoin,2,8,,gone\nsplit,2,5,40,late\n")
     list(corrections.applied(parts([[1, 2], [1, 2]])))
-    (event,) = corrections.events
+    (event,) = corrections.of_events([])
     assert (event.kind, event.frame, event.reason) == ("correction", 0, "drop: a speck")
     assert ["row 3" in corrections.warnings[0], "no track 8" in corrections.warnings[0]] == [1, 1]
     assert "no track 2 from frame 40 on" in corrections.warnings[1]
+
+
+def test_events_are_those_of_the_corrected_tracks(tmp_path: Path) -> None:
+    rows = "join,1,2,,same\nsplit,1,9,8,two\nrename,3,7,,label\ndrop,4,,,a speck\n"
+    corrections = read(tmp_path, rows)
+    told = [
+        ("birth", 0, (1,)), ("birth", 1, (4,)), ("split", 1, (1, 4)), ("birth", 2, (3,)),
+        ("death", 3, (1,)), ("birth", 5, (2,)), ("split", 5, (1, 2)), ("split", 6, (2, 3)),
+        ("gap", 7, (2,)), ("gap", 8, (2,)), ("death", 9, (2,)), ("death", 9, (3,)),
+        ("break", 9, (3, 4)),
+    ]  # fmt: skip
+    events = [TrackEvent(kind, frame, 0.0, ids, "") for kind, frame, ids in told]
+    found = [(e.kind, e.frame, e.particles) for e in corrections.of_events(events)]
+    assert found == [
+        ("birth", 0, (1,)), ("birth", 2, (7,)), ("death", 3, (1,)), ("split", 6, (1, 7)),
+        ("gap", 7, (1,)), ("gap", 8, (9,)), ("death", 9, (9,)), ("death", 9, (7,)),
+        ("break", 9, (7,)),
+    ]  # fmt: skip
+    names = TrackEvent("birth", 0, 0.0, ("3",), "")
+    assert corrections.of_events([names])[0].particles == ("7",)
 
 
 def test_a_join_with_a_track_that_is_not_there_is_said(tmp_path: Path) -> None:

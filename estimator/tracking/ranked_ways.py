@@ -5,9 +5,8 @@ Rows are tracks, columns measurements, and a table is one hypothesis about the p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from heapq import heappop, heappush
 from itertools import count
 
@@ -15,9 +14,6 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from telerig.arrays import Array, Ints
-
-_ROUNDING = 1e-9
-"""Prices that change by less (log-likelihood ratio) are final."""
 
 Options = Sequence[Sequence[tuple[int, float]]]
 """For each row its possible columns with their scores."""
@@ -38,149 +34,92 @@ def alternatives(
         for each option that these do not use.
 
     The ways are ranked exactly (Murty, Operations Research 16:682, 1968): those that differ from
-    the best way are divided by the first row that differs, and each part has a best way, too. A
-    part is solved when no other one can be better.
+    the best way are divided by the first row that differs, and each part has a best way, too.
     """
-    best = [_Part.of(_Table.of(k, *table)) for k, table in enumerate(tables)]
+    best = [_Part.of_table(k, *table) for k, table in enumerate(tables)]
     worst = min((part.cost for part in best), default=0.0) + within_log_ratio
-    best = [_Part.of(part.narrowed(worst)) for part in best if part.cost <= worst]
-    heap: list[tuple[float, int, _Part, int]] = []
+    heap: list[tuple[float, int, _Part]] = []
     numbers = count()
-
-    def push(cost: float, part: _Part, row: int = -1) -> None:
-        if cost <= worst:
-            heappush(heap, (cost, next(numbers), part, row))
-
     for part in best:
-        push(part.cost, part)
+        heappush(heap, (part.cost, next(numbers), part))
     found: list[_Part] = []
-    while heap and len(found) < most:
-        _, _, part, row = heappop(heap)
-        if row >= 0:
-            solved = part.otherwise(row)
-            push(solved.cost, solved)
-            continue
+    while heap and heap[0][0] <= worst and len(found) < most:
+        part = heappop(heap)[2]
         found.append(part)
-        for row, bound in enumerate(part.bounds()[part.first :].tolist(), part.first):
-            push(bound, part, row)
-    if heap:
+        for other in part.others():
+            heappush(heap, (other.cost, next(numbers), other))
+    if len(found) == most:
         found += _of_each_option(best, found, worst)
-    return [(part.table.number, part.columns, -part.cost) for part in found]
-
-
-@dataclass(frozen=True)
-class _Table:
-    """Hold the costs (negative scores) of a table, without the rows that have no choice.
-
-    number : of the table. names : columns of the P places, -1 for the place none of each row.
-    taken : place of each of the R rows; of the rows that have no choice it is final.
-    rows, places : (K,) and (L,) numbers of the rows that have a choice and of the places that they
-        may take. costs : (K, L), infinite for what is not allowed. base : cost of all other rows.
-    """
-
-    number: int
-    names: Ints
-    taken: Ints
-    rows: Ints
-    places: Ints
-    costs: Array
-    base: float
-
-    @staticmethod
-    def of(number: int, score: float, options: Options) -> _Table:
-        columns = sorted({column for row in options for column, _ in row})
-        place = {column: i for i, column in enumerate(columns)}
-        rows, every = np.arange(len(options)), np.arange(len(columns) + len(options))
-        costs = np.full((len(rows), len(every)), np.inf)
-        costs[rows, len(columns) + rows] = 0.0
-        for row, scores in enumerate(options):
-            for column, own in scores:
-                costs[row, place[column]] = -own
-        names = np.array([*columns, *(-1 for _ in options)], np.int64)
-        return _Table(number, names, np.full(len(rows), -1), rows, every, costs, -score)
+    return [(part.table, part.columns, -part.cost) for part in found]
 
 
 @dataclass(frozen=True)
 class _Part:
     """Hold a part of the ways of a table, and the best of them.
 
-    allowed : (K, L) costs of the table, infinite for what is not allowed in this part.
+    table : its number. names : (P,) columns of the places that rows may take, -1 for none.
+    costs : (R, P) negative scores, infinite for what is not allowed. base : added to them.
     first : number of rows that take the same place in all ways of the part.
-    cost : of the best way; infinite if there is none. taken : (K,) what its rows take: positions in
-        the table's ``places``.
+    cost : of the best way; infinite if there is none. taken : (R,) the places that its rows take.
     """
 
-    table: _Table
-    allowed: Array
+    table: int
+    names: Ints
+    costs: Array
+    base: float
     first: int
     cost: float
     taken: Ints
 
     @staticmethod
-    def of(table: _Table, allowed: Array | None = None, first: int = 0) -> _Part:
-        costs = table.costs if allowed is None else allowed
+    def of_table(table: int, score: float, options: Options) -> _Part:
+        columns = sorted({column for row in options for column, _ in row})
+        place = {column: i for i, column in enumerate(columns)}
+        rows = np.arange(len(options))
+        costs = np.full((len(rows), len(columns) + len(rows)), np.inf)
+        costs[rows, len(columns) + rows] = 0.0
+        for row, scores in enumerate(options):
+            for column, own in scores:
+                costs[row, place[column]] = -own
+        names = np.array([*columns, *(-1 for _ in options)], np.int64)
+        return _Part.of(table, names, costs, -score, 0)
+
+    @staticmethod
+    def of(table: int, names: Ints, costs: Array, base: float, first: int) -> _Part:
         try:
             rows, taken = linear_sum_assignment(costs)
+            cost = base + float(costs[rows, taken].sum())
         except ValueError:  # no way is allowed
-            return _Part(table, costs, first, np.inf, np.zeros(0, np.intp))
-        return _Part(table, costs, first, table.base + float(costs[rows, taken].sum()), taken)
+            taken, cost = np.zeros(0, np.intp), np.inf
+        return _Part(table, names, costs, base, first, cost, taken)
 
-    @cached_property
-    def more(self) -> Array:
-        """What a way costs more than the best one at least, by the place (K, L) that a row takes.
+    def others(self) -> Iterator[_Part]:
+        """Yield the other ways of this part, by the first row that differs from its best way."""
+        left = self.costs.copy()
+        for row in range(self.first, len(self.taken)):
+            other, own = left.copy(), left[row, self.taken[row]]
+            other[row, self.taken[row]] = np.inf
+            if np.isfinite(other[row]).any():
+                yield _Part.of(self.table, self.names, other, self.base, row)
+            left[row] = np.inf
+            left[row, self.taken[row]] = own
 
-        These are the reduced costs; the prices of the places solve the dual problem.
-        """
-        own = self.allowed - self.allowed[np.arange(len(self.taken)), self.taken][:, None]
-        price, before = np.zeros(own.shape[1]), np.ones(own.shape[1])
-        while np.max(before - price, initial=0.0) > _ROUNDING:
-            before = price
-            price = np.min(own + price[self.taken][:, None], 0, initial=0.0)
-        return own + price[self.taken][:, None] - price
-
-    def bounds(self) -> Array:
-        """Return for each row a lower bound of the cost of the ways in which it takes another place
-        than in the best way (K,)."""
-        more = self.more.copy()
-        more[np.arange(len(more)), self.taken] = np.inf
-        return np.asarray(self.cost + np.min(more, 1, initial=np.inf))
-
-    def narrowed(self, worst: float) -> _Table:
-        """Return the table without what no way of at most this cost takes."""
-        table, near = self.table, self.cost + self.more <= worst
-        free = near.sum(1) > 1
-        fixed = np.flatnonzero(~free)
-        near[:, self.taken[fixed]] = False
-        places = np.flatnonzero(near[free].any(0))
-        taken = table.taken.copy()
-        taken[table.rows] = table.places[self.taken]
-        costs = np.where(near, table.costs, np.inf)[np.ix_(free, places)]
-        base = table.base + float(table.costs[fixed, self.taken[fixed]].sum())
-        return _Table(
-            table.number, table.names, taken, table.rows[free], table.places[places], costs, base
-        )
-
-    def otherwise(self, row: int) -> _Part:
-        """Return the ways in which this row is the first one that differs from the best way."""
-        other, fixed = self.allowed.copy(), np.arange(self.first, row)
-        other[fixed] = np.inf
-        other[fixed, self.taken[fixed]] = self.allowed[fixed, self.taken[fixed]]
-        other[row, self.taken[row]] = np.inf
-        return _Part.of(self.table, other, row)
-
-    def through(self, row: int, place: int) -> _Part:
-        """Return the ways in which this row takes a given place."""
-        other = self.allowed.copy()
-        other[row] = np.inf
-        other[row, place] = self.allowed[row, place]
-        return _Part.of(self.table, other)
+    def through(self, row: int, column: int) -> _Part:
+        """Return the ways in which this row takes a given column."""
+        other = self.costs.copy()
+        other[row, self.names != column] = np.inf
+        return _Part.of(self.table, self.names, other, self.base, 0)
 
     @property
     def columns(self) -> tuple[int, ...]:
-        """The column of each row of the whole table in the best way, -1 for none."""
-        taken = self.table.taken.copy()
-        taken[self.table.rows] = self.table.places[self.taken]
-        return tuple(self.table.names[taken].tolist())
+        """The column of each row in the best way, -1 for none."""
+        return tuple(self.names[self.taken].tolist())
+
+    @property
+    def options(self) -> set[tuple[int, int]]:
+        """All rows and columns that a way may contain."""
+        rows, places = np.nonzero(np.isfinite(self.costs))
+        return {*zip(rows.tolist(), self.names[places].tolist())}
 
 
 def _of_each_option(best: Sequence[_Part], found: Sequence[_Part], worst: float) -> list[_Part]:
@@ -189,24 +128,9 @@ def _of_each_option(best: Sequence[_Part], found: Sequence[_Part], worst: float)
     best : the whole tables.
     """
     used = {option for part in found for option in enumerate(part.columns)}
-    trials: dict[tuple[int, int], list[tuple[float, int, int, int]]] = {}
-    for k, part in enumerate(best):
-        table = part.table
-        for option in enumerate(part.columns):
-            trials.setdefault(option, []).append((part.cost, k, -1, -1))
-        for row, place in np.argwhere(part.cost + part.more <= worst).tolist():
-            option = int(table.rows[row]), int(table.names[table.places[place]])
-            bound = part.cost + float(part.more[row, place])
-            trials.setdefault(option, []).append((bound, k, row, place))
     out: dict[tuple[int, ...], _Part] = {}
-    for option in trials.keys() - used:
-        nearest, cost = None, worst
-        for bound, k, row, place in sorted(trials[option]):
-            if bound > cost:
-                break
-            part = best[k] if row < 0 else best[k].through(row, place)
-            if part.cost <= cost:
-                nearest, cost = part, part.cost
-        if nearest is not None:
+    for option in set[tuple[int, int]]().union(*(part.options for part in best)) - used:
+        nearest = min((part.through(*option) for part in best), key=lambda part: part.cost)
+        if nearest.cost <= worst:
             out[nearest.columns] = nearest
     return sorted(out.values(), key=lambda part: part.cost)

@@ -28,7 +28,7 @@ from telerig.estimator.bubbles.detect import detect_bubbles
 from telerig.estimator.bubbles.pairing.groups import Matches, match_tables
 from telerig.estimator.bubbles.pairing.learning import learn_rig
 from telerig.estimator.bubbles.pairing.matching import (
-    pair_geometry,
+    compared,
     shared_axis,
     view_of,
 )
@@ -92,7 +92,8 @@ def score(tables: list[pd.DataFrame], known: list[Array], first: Array, second: 
 
 def gap_only(tables: list[pd.DataFrame], cameras: tuple[Camera, Camera]) -> tuple[Array, Array]:
     axis = shared_axis(cameras)
-    gap = pair_geometry(*(view_of(t, c, axis) for t, c in zip(tables, cameras))).gap_px
+    one, two = (view_of(t, c, axis) for t, c in zip(tables, cameras))
+    gap = compared(cameras, one.take(np.s_[:, None]), two.take(None)).gap_px
     rows, columns = linear_sum_assignment(np.minimum(np.abs(gap), 6.0))
     kept = np.abs(gap[rows, columns]) < 6.0
     return rows[kept], columns[kept]
@@ -144,15 +145,14 @@ def agreement(found: list[pd.DataFrame], known: list[Array]) -> list[str]:
 
 
 def details(found: list[pd.DataFrame], known: list[Array], pairs: Matches) -> list[str]:
-    lines = ["| pair | first (u, v) | second (u, v) | list's rows | gap (px) | gap (sigma) | "
-             "height ratio | confidence |", "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = ["| pair | first (u, v) | second (u, v) | list's rows | confidence |",
+             "|---|---|---|---|---|"]  # fmt: skip
     mine = [rows_of_list(t, k) for t, k in zip(found, known)]
     for k, (i, j) in enumerate(zip(pairs.rows[:, 0], pairs.rows[:, 1])):
         one, two = found[0].iloc[i], found[1].iloc[j]
         lines.append(
             f"| {k + 1} | {one.u_px:.1f}, {one.v_px:.1f} | {two.u_px:.1f}, {two.v_px:.1f} | "
-            f"{mine[0][i]}, {mine[1][j]} | {pairs.gap_px[k]:+.2f} | {pairs.gap_sigma[k]:+.2f} | "
-            f"{pairs.height_ratio[k]:.3f} | {pairs.confidence[k]:.4f}"
+            f"{mine[0][i]}, {mine[1][j]} | {pairs.confidence[k]:.4f}"
             f"{' ambiguous' if pairs.ambiguous[k] else ''} |"
         )
     return lines

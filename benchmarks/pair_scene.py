@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.matching import Prediction
+from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -36,6 +36,9 @@ LEAST_SINE = 0.05
 """Of the angle between two lines of sight that show a depth."""
 VOLUME_SHARE = 0.6
 """Edge of the working volume, as a share of the smallest field of view of the cameras."""
+UNKNOWN_MM = 100.0
+"""Standard deviation of a coordinate that nothing has measured: several times the volume's edge."""
+
 _STEPS = 20
 _BLOCK = 4096
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -348,21 +351,19 @@ def nearest_to_rays(origins: Array, directions: Array) -> Array:
     return np.asarray(np.linalg.solve(total, right)[..., 0])
 
 
-def on_rays(
-    camera: Camera, uv_px: Array, covariance_px2: Array, near_mm: Array, depth_sd_mm: float
-) -> tuple[Array, Array, Array]:
-    """Return the points of N rays that are nearest to a point, as if one camera measured points.
+def on_rays(camera: Camera, uv_px: Array, covariance_px2: Array) -> tuple[Array, Array, Array]:
+    """Return N pixels as points in space whose depth is unknown.
 
-    uv_px, covariance_px2 : (N, 2), (N, 2, 2) pixels. near_mm : (3,) in the rig frame. depth_sd_mm :
-    standard deviation of the unknown position along the ray.
+    uv_px, covariance_px2 : (N, 2), (N, 2, 2) pixels.
 
-    Returns points (N, 3) in mm, covariances (N, 3, 3) in mm^2, and the scale (N,) in px/mm.
+    Returns the points (N, 3) of the rays that are nearest to the rig's origin (mm), covariances
+    (N, 3, 3) (mm^2) with `UNKNOWN_MM` along the ray, and the scale (N,) in px/mm.
     """
     origin, along = camera.unproject(uv_px)
-    points = origin + ((near_mm - origin) * along).sum(-1, keepdims=True) * along
+    points = origin - (origin * along).sum(-1, keepdims=True) * along
     _, by_point = stacked_jacobian((camera,), points)
     information = by_point.mT @ np.linalg.solve(covariance_px2, by_point)
-    information += along[:, :, None] * along[:, None] / depth_sd_mm**2
+    information += along[:, :, None] * along[:, None] / UNKNOWN_MM**2
     scale = np.linalg.det(by_point @ by_point.mT) ** 0.25
     return points, np.linalg.inv(information), np.asarray(scale)
 

@@ -15,16 +15,16 @@ runner-up is far enough behind; else the tracks that differ are broken.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.special import chdtri
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from telerig.arrays import Array, Bools, Ints, Rows
-from telerig.estimator.bubbles.pairing.matching import Prediction
+from telerig.arrays import Array, Bools, Ints
+from telerig.estimator.bubbles.pairing.evidence import Evidence, Prediction, evidence, gate2
 from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
     POSITION,
@@ -36,48 +36,12 @@ from telerig.estimator.tracking.filter import (
 )
 from telerig.estimator.tracking.ranked_ways import alternatives
 
-_LOG_2PI = float(np.log(2 * np.pi))
-_SIZE_SPAN_MM = 5.0
 _SHIFT_ROUNDS = 5
 _JOINTLY_SCORED = 10
 """For each hypothesis that is kept, so many ways to continue are scored with the common shift."""
 
 _CERTAIN = 1e12
 """Score of a pairing by an id that came with the data."""
-
-
-@dataclass(frozen=True)
-class Pairs(Rows):
-    """Hold E possible pairings of tracks with measurements, all inside the widest gate.
-
-    row, column : (E,) index of the track and index of the measurement.
-    innovation_mm : (E, 3) measured minus predicted position, without the shift common to all
-        bubbles.
-    covariance_mm2 : (E, 3, 3) covariance of the innovation.
-    information : (E, 3, 3) inverse of the covariance, in 1/mm^2.
-    constant : (E,) score (log-likelihood ratio) without the part that depends on the distance.
-    """
-
-    row: Ints
-    column: Ints
-    innovation_mm: Array
-    covariance_mm2: Array
-    information: Array
-    constant: Array
-
-    def distance2(self, shift_mm: Array) -> Array:
-        """Return the squared Mahalanobis distances (E,) without the common shift."""
-        left = self.innovation_mm - shift_mm
-        return np.asarray(np.einsum("ei,eij,ej->e", left, self.information, left))
-
-    def scores(self, shift_mm: Array) -> Array:
-        return self.constant - self.distance2(shift_mm) / 2
-
-
-@lru_cache(maxsize=64)
-def gate2(settings: TrackerSettings, dimensions: int = 3) -> float:
-    """Return the largest squared Mahalanobis distance inside the gate."""
-    return float(chdtri(dimensions, 1 - settings.gate_probability))
 
 
 def expected(tracks: Sequence[Track]) -> Prediction:
@@ -95,35 +59,25 @@ def gated_pairs(
     common: Common,
     settings: TrackerSettings,
     misses: Ints | None = None,
-) -> Pairs:
+) -> Evidence:
     """Return the pairings of tracks with measurements inside the gate, for an unknown common shift.
 
     allowed : (K, M) which pairings may be made; those with a measurement whose id came with the
         data are certain.
     misses : (K,) number of frames for which each track has not been seen; None for 0.
     """
-    x, p = predicted.points_mm, predicted.covariance_mm2
-    z, r = measured.points_mm, measured.covariance_mm2
     given = measured.particle != NO_PARTICLE
-    between = z[None] - x[:, None]
-    spread = np.trace(p, axis1=1, axis2=2)[:, None] + np.trace(r, axis1=1, axis2=2)[None]
-    reach2 = gate2(settings) * (spread + np.trace(common.covariance_mm2))
-    near = ((between - common.shift_mm) ** 2).sum(-1) <= reach2
-    row, column = np.nonzero(allowed & (near | given))
-    innovation, covariance = between[row, column], p[row] + r[column]
-    total = np.linalg.inv(covariance + common.covariance_mm2)
-    left = innovation - common.shift_mm
-    inside = np.einsum("ei,eij,ej->e", left, total, left) <= gate2(settings)
-    kept = inside | given[column]
-    row, column, innovation, covariance = (a[kept] for a in (row, column, innovation, covariance))
+    pairs = evidence(
+        predicted, measured.points_mm, measured.covariance_mm2, measured.d_eq_mm, allowed=allowed,
+        certain=given, shift_mm=common.shift_mm, unsure_mm2=common.covariance_mm2,
+    )  # fmt: skip
     seen = settings.detection_probability
-    density = -1.5 * _LOG_2PI - np.log(np.linalg.det(covariance)) / 2
-    base = np.log(seen / (1 - seen) / settings.new_per_mm3)
-    sure = np.log(np.clip(measured.confidence[column], 1e-3, 1.0))
-    alive = 0.0 if misses is None else _alive_score(misses, settings)[row]
-    size = _size_score(predicted.d_eq_mm[row], measured.d_eq_mm[column], settings)
-    constant = np.where(given[column], _CERTAIN, base + density + sure + alive + size)
-    return Pairs(row, column, innovation, covariance, np.linalg.inv(covariance), constant)
+    prior = np.log(np.clip(measured.confidence[pairs.column], 1e-3, 1.0))
+    prior += np.log(seen / (1 - seen) / settings.new_per_mm3)
+    if misses is not None:
+        prior += _alive_score(misses, settings)[pairs.row]
+    constant = np.where(given[pairs.column], _CERTAIN, pairs.constant + prior)
+    return replace(pairs, constant=constant)
 
 
 def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
@@ -132,14 +86,6 @@ def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
         np.maximum(misses, 1) - 1.0
     )
     return -np.log1p(misses * settings.end_probability / missed)
-
-
-def _size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:
-    """Return the log-likelihood ratio of sizes against a uniform density; 0 if unknown."""
-    sigma = settings.size_scatter * expected_mm
-    off = np.minimum(((measured_mm - expected_mm) / sigma) ** 2 / 2, settings.size_cap_log_ratio)
-    score = np.log(_SIZE_SPAN_MM / sigma) - _LOG_2PI / 2 - off
-    return np.where(np.isfinite(score), score, 0.0)
 
 
 def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
@@ -156,7 +102,7 @@ def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
 
 
 def assigned_with_shift(
-    pairs: Pairs, rows: int, best_rows: Bools, common: Common
+    pairs: Evidence, rows: int, best_rows: Bools, common: Common
 ) -> tuple[Common, Ints]:
     """Return the common shift and the assignment (rows,), estimated in turn.
 
@@ -182,7 +128,7 @@ def assigned_with_shift(
 
 
 def clear_assignment(
-    pairs: Pairs, rows: int, shift_mm: Array, settings: TrackerSettings
+    pairs: Evidence, rows: int, shift_mm: Array, settings: TrackerSettings
 ) -> tuple[Ints, Bools]:
     """Return the best assignment (rows,), -1 for none, and which rows have a measurement and no
     other pairing of the track or of this measurement that is nearly as likely."""
@@ -197,7 +143,7 @@ def clear_assignment(
     return chosen, clear
 
 
-def joint_scores(pairs: Pairs, ways: Sequence[Sequence[int]], common: Common) -> Array:
+def joint_scores(pairs: Evidence, ways: Sequence[Sequence[int]], common: Common) -> Array:
     """Return the joint log-likelihood ratio (W,) of the pairings of each way, marginal over the
     common shift.
 
@@ -460,20 +406,6 @@ class Scan:
     settings: TrackerSettings
 
 
-@dataclass(frozen=True)
-class Child:
-    """One way to continue some hypotheses with the measurements of a frame.
-
-    score : log weight.
-    parents : the hypotheses, one for each group of tracks.
-    edges : for each track the index of its pairing, -1 if it has no measurement in this frame.
-    """
-
-    score: float
-    parents: tuple[Branch, ...]
-    edges: tuple[int, ...]
-
-
 class Association:
     """The possible pairings of tracks and measurements in one frame.
 
@@ -503,7 +435,7 @@ class Association:
         closed = np.array([not c.open for c in clusters], bool)[self.cluster_of]
         missed = own & measured.alone & (closed & (chosen < 0))[:, None]
         alone = gated_pairs(where, measured, missed, self.common, scan.settings, misses)
-        self.pairs = Pairs.concat([pairs, alone])
+        self.pairs = Evidence.concat([pairs, alone])
         self.owner = self.cluster_of[self.pairs.row]
         self.edges = self._allowed()
 
@@ -531,7 +463,7 @@ class Association:
         shift = np.einsum("cij,cj->ci", outside, pull.sum(0) - pull)[owner]
         total = np.linalg.inv(pairs.covariance_mm2 + outside[owner])
         off = left - shift
-        near = np.einsum("ei,eij,ej->e", off, total, off) <= gate2(self.scan.settings)
+        near = np.einsum("ei,eij,ej->e", off, total, off) <= gate2(3)
         return np.flatnonzero(near | (pairs.constant == _CERTAIN))
 
     def components(self) -> list[tuple[list[int], list[int]]]:
@@ -540,16 +472,15 @@ class Association:
         Each is given by the indices of the earlier groups that it joins, and the indices of its
         pairings.
         """
-        owner, columns = self.owner[self.edges].tolist(), self.pairs.column[self.edges].tolist()
-        label, first = list(range(len(self.clusters))), dict[int, int]()
-        for cluster, column in zip(owner, columns):
-            low, high = sorted((label[cluster], label[first.setdefault(column, cluster)]))
-            if low != high:
-                label = [low if own == high else own for own in label]
+        count = len(self.clusters)
+        owner, columns = self.owner[self.edges], count + self.pairs.column[self.edges]
+        size = count + len(self.scan.measured)
+        joined = coo_array((np.ones(len(owner)), (owner, columns)), shape=(size, size))
+        label = connected_components(joined, directed=False)[1].tolist()
         groups: dict[int, tuple[list[int], list[int]]] = {}
-        for cluster, group in enumerate(label):
-            groups.setdefault(group, ([], []))[0].append(cluster)
-        for edge, cluster in zip(self.edges.tolist(), owner):
+        for cluster in range(count):
+            groups.setdefault(label[cluster], ([], []))[0].append(cluster)
+        for edge, cluster in zip(self.edges.tolist(), owner.tolist()):
             groups[label[cluster]][1].append(edge)
         return list(groups.values())
 
@@ -564,18 +495,19 @@ class Association:
         )
 
 
-def children(
-    found: Association, members: Sequence[int], edges: Sequence[int], outside: Common
-) -> list[Child]:
+def grown(
+    found: Association, members: Sequence[int], edges: Sequence[int], mean_gain: Array
+) -> list[Branch]:
     """Return the likely ways to continue some groups of tracks together, best first.
 
-    Those with the same recent measurements are merged.
+    Those with the same recent measurements are merged. The tracks are updated with their
+    measurements, and with the shift of all bubbles that follows from them and from the others.
 
-    members : indices of the groups.
-    edges : indices of the pairings that are possible for them.
-    outside : the shift that all bubbles share, estimated from the other bubbles.
+    members : indices of the groups. edges : indices of the pairings that are possible for them.
+    mean_gain : (12, 3) mean Kalman gain of the bubbles.
     """
-    settings, pairs = found.scan.settings, found.pairs
+    scan, settings, pairs = found.scan, found.scan.settings, found.pairs
+    outside = found.outside(members)
     score = pairs.scores(outside.shift_mm)
     options: dict[int, list[tuple[int, float]]] = {}
     edge_of = {}
@@ -584,19 +516,27 @@ def children(
         options.setdefault(row, []).append((column, float(score[e])))
         edge_of[row, column] = e
     every = _joint([found.clusters[m].branches for m in members], settings.max_hypotheses)
-    rows = [[found.row_of[id(t)] for b in parents for t in b.tracks] for parents in every]
+    of_rows = [[found.row_of[id(t)] for b in parents for t in b.tracks] for parents in every]
     start = [sum(b.weight for b in parents) for parents in every]
-    tables = [(own, [options.get(r, []) for r in of]) for own, of in zip(start, rows)]
+    tables = [(own, [options.get(r, []) for r in rows]) for own, rows in zip(start, of_rows)]
     within = settings.prune_log_ratio + _SLACK_LOG_RATIO
     ways = alternatives(tables, within, _JOINTLY_SCORED * settings.max_hypotheses)
-    chosen = [tuple(edge_of.get(at, -1) for at in zip(rows[k], taken)) for k, taken, _ in ways]
-    joint = joint_scores(pairs, [[e for e in one if e >= 0] for one in chosen], outside).tolist()
-    raw = [
-        Child(start[k] + score, every[k], edges)
-        for (k, *_), score, edges in zip(ways, joint, chosen)
-    ]
-    scored = ((c.score, _recent(c, pairs, found.scan.frame), i) for i, c in enumerate(raw))
-    return [Child(w, raw[i].parents, raw[i].edges) for w, i in merged(scored, settings)]
+    used = [[edge_of[at] for at in zip(of_rows[k], taken) if at[1] >= 0] for k, taken, _ in ways]
+    joint = joint_scores(pairs, used, outside).tolist()
+    raw = []
+    for (k, taken, _), score_of in zip(ways, joint):
+        before = [(t.particle, b.history.get(t.particle, [])) for b in every[k] for t in b.tracks]
+        history = {p: [*old, (scan.frame, c)] for (p, old), c in zip(before, taken)}
+        raw.append((start[k] + score_of, history))
+    scored = ((weight, merge_key(h.values()), i) for i, (weight, h) in enumerate(raw))
+    out = []
+    for weight, i in merged(scored, settings):
+        (k, taken, _), own = ways[i], used[i]
+        common = outside.informed(pairs.innovation_mm[own], pairs.covariance_mm2[own])
+        tracks = [t.copy() for b in every[k] for t in b.tracks]
+        continue_tracks(tracks, taken, scan, common, mean_gain)
+        out.append(Branch(weight, tracks, raw[i][1]))
+    return out
 
 
 def _joint(groups: Sequence[Sequence[Branch]], most: int) -> list[tuple[Branch, ...]]:
@@ -616,39 +556,6 @@ def _joint(groups: Sequence[Sequence[Branch]], most: int) -> list[tuple[Branch, 
         for branch in group
         if id(branch) not in used
     ]
-
-
-def _new_entries(
-    child: Child, pairs: Pairs, frame: int
-) -> Iterator[tuple[int, list[Entry], Entry]]:
-    """Yield each track's id, its entries so far, and its entry of this frame."""
-    tracks = ((b.history, t.particle) for b in child.parents for t in b.tracks)
-    for (history, particle), e in zip(tracks, child.edges):
-        yield particle, history.get(particle, []), (frame, int(pairs.column[e]) if e >= 0 else -1)
-
-
-def _histories(child: Child, pairs: Pairs, frame: int) -> History:
-    return {p: [*before, new] for p, before, new in _new_entries(child, pairs, frame)}
-
-
-def _recent(child: Child, pairs: Pairs, frame: int) -> Recent:
-    new = _new_entries(child, pairs, frame)
-    return merge_key([*before[-_MERGE_FRAMES:], entry] for _, before, entry in new)
-
-
-def grow(found: Association, outside: Common, child: Child, mean_gain: Array) -> Branch:
-    """Return the hypothesis that continues some hypotheses in the way ``child``.
-
-    Its tracks are updated with the measurements, and with the shift of all bubbles that follows
-    from them. outside : as for `children`. mean_gain : (n, 3) mean Kalman gain of the bubbles.
-    """
-    pairs, scan = found.pairs, found.scan
-    used = np.array([e for e in child.edges if e >= 0], int)
-    common = outside.informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
-    tracks = [t.copy() for b in child.parents for t in b.tracks]
-    columns = [int(pairs.column[e]) if e >= 0 else -1 for e in child.edges]
-    continue_tracks(tracks, columns, scan, common, mean_gain)
-    return Branch(child.score, tracks, _histories(child, pairs, scan.frame))
 
 
 def continue_tracks(
@@ -698,8 +605,6 @@ def advance(
             columns.append(column)
             out.append(Cluster([Branch(0.0, [track], {track.particle: [(scan.frame, column)]})]))
             continue
-        outside = found.outside(members)
-        every = children(found, members, edges, outside)
-        out.append(Cluster([grow(found, outside, child, gain) for child in every]))
+        out.append(Cluster(grown(found, members, edges, gain)))
     continue_tracks(alone, columns, scan, found.common, gain)
     return out, found.common, mean_gain

@@ -20,12 +20,11 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints, Rows
+from telerig.estimator.bubbles.pairing.evidence import Prediction, gate2
 from telerig.estimator.bubbles.pairing.groups import Candidates, Pixels
-from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.bubbles.shape.body import Bodies
-from telerig.estimator.tracking.association import clear_assignment, gate2, gated_pairs
+from telerig.estimator.tracking.association import clear_assignment, gated_pairs
 from telerig.estimator.tracking.filter import (
-    ANYWHERE_MM,
     NO_PARTICLE,
     POSITION,
     Common,
@@ -35,7 +34,7 @@ from telerig.estimator.tracking.filter import (
     birth_covariance,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import on_rays, stacked_jacobian
+from telerig.rig.triangulation import UNKNOWN_MM, on_rays, stacked_jacobian
 
 Tables = tuple["pd.DataFrame", ...]
 """One frame's detections in each camera."""
@@ -75,7 +74,7 @@ class Bubbles(Rows):
         offset_px : (C, 2) shift of all detections of each camera.
         """
         found = [
-            on_rays(camera, uv - offset, noise, np.zeros(3), ANYWHERE_MM)
+            on_rays(camera, uv - offset, noise)
             for camera, (uv, noise), offset in zip(cameras, sight.pixels, offset_px)
         ]
         points, covariances, px_per_mm = map(np.concatenate, zip(*found))
@@ -199,7 +198,7 @@ def smooth_points(
     """
     from telerig.estimator.tracking import kernels
 
-    prior = birth_covariance(settings, ANYWHERE_MM**2 * np.eye(3), encoder=False)
+    prior = birth_covariance(settings, UNKNOWN_MM**2 * np.eye(3), encoder=False)
     x = np.zeros((points_mm.shape[1], len(prior)))
     seen = np.isfinite(points_mm[..., :1])
     weight = np.linalg.inv(np.where(seen[..., None], covariance_mm2, np.eye(3))) * seen[..., None]
@@ -301,7 +300,7 @@ def follow_back(tracks: SmoothedTracks, changeable: set[int]) -> None:
             changed |= {
                 here[k]
                 for k, rays in enumerate(found)
-                if _claim(frames[i], rays[rays >= 0], predicted.take([k]), tracks.settings)
+                if _claim(frames[i], rays[rays >= 0], predicted.take([k]))
             }
         if not changed:
             break
@@ -357,7 +356,7 @@ def _nearest(
     return np.stack(out, -1)
 
 
-def _claim(frame: Frame, rays: Ints, predicted: Prediction, settings: TrackerSettings) -> bool:
+def _claim(frame: Frame, rays: Ints, predicted: Prediction) -> bool:
     """Give detections of several cameras to a predicted particle, where they agree with it.
 
     rays : (n,) indices of the frame's rays. If they do not agree, those whose outlines are whole
@@ -366,7 +365,7 @@ def _claim(frame: Frame, rays: Ints, predicted: Prediction, settings: TrackerSet
     each = frame.rays.take(rays)
     members = [np.concatenate([getattr(one, name) for one in (predicted, each)])
                for name in ("points_mm", "covariance_mm2")]  # fmt: skip
-    if len(rays) and fused(*members)[2] <= gate2(settings, 2 * len(rays)):
+    if len(rays) and fused(*members)[2] <= gate2(2 * len(rays)):
         point, covariance, _ = fused(each.points_mm, each.covariance_mm2)
         frame.claim(
             Bubbles(
@@ -380,7 +379,7 @@ def _claim(frame: Frame, rays: Ints, predicted: Prediction, settings: TrackerSet
     whole = np.array([not _DOUBTFUL & set(text.split("|")) for text in flags], bool)
     if whole.all() or not whole.any():
         return False
-    return _claim(frame, rays[whole], predicted, settings)
+    return _claim(frame, rays[whole], predicted)
 
 
 FRAMES_BEFORE, FRAMES_AFTER = 15, 40

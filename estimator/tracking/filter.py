@@ -30,9 +30,6 @@ from telerig.factors.state_space import exact_step
 
 NO_PARTICLE = -1
 
-ANYWHERE_MM = 100.0
-"""Standard deviation of a coordinate that nothing has measured: several times the volume's size."""
-
 
 @dataclass(frozen=True)
 class TrackerSettings:
@@ -55,15 +52,12 @@ class TrackerSettings:
     shake_sd_mm, shake_time_s : sd and correlation time of the offset that all bubbles of a frame
         share.
     stage_acceleration_mm_s2 : RMS acceleration of the stage in frames without an encoder position.
-    size_scatter : relative sd of d_eq_mm (equivalent diameter) from frame to frame.
-    size_cap_log_ratio : largest penalty of a wrong size, as a difference of log-likelihoods.
     detection_probability : probability that a bubble is detected in a frame.
     missed_again_probability : probability that a bubble which was missed in the frame before is
         missed again.
     end_probability : probability that a bubble leaves for good in a frame. Because of it, a track
         that was missed for many frames is less likely to be given a measurement.
     new_per_mm3 : density of false detections and new bubbles in space (1/mm^3).
-    gate_probability : probability that the true continuation of a track lies inside its gate.
     margin_log_ratio : smallest log-likelihood ratio between the best and the second-best hypothesis
         for which the best one counts as unambiguous when the window ends; below it, the tracks are
         cut.
@@ -92,13 +86,10 @@ class TrackerSettings:
     shake_sd_mm: float = 0.3
     shake_time_s: float = 0.01
     stage_acceleration_mm_s2: float = 3000.0
-    size_scatter: float = 0.05
-    size_cap_log_ratio: float = 4.5
     detection_probability: float = 0.95
     missed_again_probability: float = 0.5
     end_probability: float = 0.002
     new_per_mm3: float = 1e-5
-    gate_probability: float = 0.9999
     margin_log_ratio: float = 4.6
     prune_log_ratio: float = 9.0
     window_frames: int = 25

@@ -12,6 +12,7 @@ import pandas as pd
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
+from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.bubbles.pairing.groups import (
     Candidates,
     Pixels,
@@ -21,7 +22,6 @@ from telerig.estimator.bubbles.pairing.groups import (
     match,
     places_of,
 )
-from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.bubbles.shape.body import Bodies, body_columns, fit_bodies
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
@@ -118,27 +118,16 @@ class RowMaker:
 
         counts : (F, C) detections of the frames, which follow each other in the other arguments.
         """
+        barred = [own != NO_PARTICLE for own in ids]
+        found = candidates(tables, pixels, counts, self.model, barred=barred)
         frames = [np.repeat(np.arange(len(counts)), many) for many in counts.T]
-        free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
-        left = np.array([np.bincount(n[i], minlength=len(counts)) for n, i in zip(frames, free)]).T
-        found = candidates(
-            [table.take(mine) for table, mine in zip(tables, free)],
-            [(uv[mine], covariance[mine]) for (uv, covariance), mine in zip(pixels, free)],
-            left, self.model,
-        )  # fmt: skip
         named, of_named = _named(ids, frames)
         at = Places.concat(
             [places_of(self.cameras, pixels, named), *(f.groups.places for f in found)]
         )
         starts = np.cumsum(counts, axis=0) - counts
         rows = [np.where(named >= 0, named - starts[of_named], -1)]
-        for f, one in enumerate(found):
-            begin = (np.cumsum(left, axis=0) - left)[f]
-            own = [
-                np.where(r >= 0, mine[np.minimum(r + b, len(mine) - 1)] - s, -1) if len(mine) else r
-                for r, mine, b, s in zip(one.groups.rows.T, free, begin, starts[f])
-            ]
-            rows.append(np.stack(own, -1))
+        rows += [one.groups.rows for one in found]
         every = np.concatenate(rows)
         frame = np.concatenate([of_named, np.repeat(np.arange(len(found)), [*map(len, found)])])
         given = np.max([_at(i, r) for i, r in zip(ids, named.T)], axis=0, initial=NO_PARTICLE)

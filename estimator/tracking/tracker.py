@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
-from telerig.estimator.bubbles.pairing.matching import Prediction
+from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.tracking.association import (
     Cluster,
     Decision,

@@ -333,7 +333,7 @@ def test_two_points_of_unknown_depth_are_one_of_known_depth(kind: str) -> None:
     pixels = [camera.project(truth) for camera in cameras]
     noise = [np.tile(own, (6, 1, 1)) for own in SIGMA]
     whole = triangulate_views(cameras, pixels, tuple(noise))
-    rays = [on_rays(c, uv, s, np.ones(3), 1e3) for c, uv, s in zip(cameras, pixels, noise)]
+    rays = [on_rays(c, uv, s) for c, uv, s in zip(cameras, pixels, noise)]
     weights = [np.linalg.inv(covariance) for _, covariance, _ in rays]
     pull = sum(w @ points[..., None] for w, (points, _, _) in zip(weights, rays))
     found = np.linalg.solve(sum(weights), pull)[..., 0]

@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.bubbles.pairing.groups import Matches, RigModel, match_tables
 from telerig.estimator.bubbles.pairing.matching import (
     PairModel,
-    Prediction,
-    pair_geometry,
+    View,
+    compared,
     shared_axis,
     view_of,
 )
@@ -42,9 +43,17 @@ def table(uv: Any, semi_axes: Any = 16.0, sigma: Any = 0.1, angle: Any = 0.0) ->
     )  # fmt: skip
 
 
-def geometry(first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]) -> Any:
+def views(
+    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
+) -> tuple[View, View]:
     axis = shared_axis(cameras)
-    return pair_geometry(view_of(first, cameras[0], axis), view_of(second, cameras[1], axis))
+    return view_of(first, cameras[0], axis), view_of(second, cameras[1], axis)
+
+
+def geometry(first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]) -> Any:
+    """Of each of N1 first with each of N2 second detections: arrays (N1, N2)."""
+    one, two = views(first, second, cameras)
+    return compared(cameras, one.take(np.s_[:, None]), two.take(None))
 
 
 def match_pairs(

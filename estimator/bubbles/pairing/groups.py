@@ -25,29 +25,35 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     centre_covariances,
     columns,
 )
+from telerig.estimator.bubbles.pairing.evidence import Prediction, evidence
 from telerig.estimator.bubbles.pairing.matching import (
     NEGLIGIBLE,
+    Cameras,
+    PairGeometry,
     PairModel,
-    Prediction,
     View,
     appearance_log_odds,
     bias_basis,
-    compared,
+    near_pairs,
     prior_log_odds,
     shared_axis,
     unbiased,
     view_of,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import stacked_jacobian, triangulate_views
+from telerig.rig.triangulation import UNKNOWN_MM, on_rays, stacked_jacobian, triangulate_views
 
 SAFE_LOG_ODDS = 3.0
 """Posterior log odds (20 to 1) below which a group is ambiguous."""
 
-_COMBINATIONS_AT_ONCE = 50_000
 _SEEN = 0.95
+"""Probability that a camera that shows the place of a bubble detects it."""
+
 _NEW_SHARE = 0.1
-_TRACK_SIZE_SD = 0.1
+"""Share of the bubbles of a frame that no track expects."""
+
+_SILHOUETTE_SIZE_SD = 0.1
+"""Relative standard deviation of a silhouette's mean diameter about the body's diameter."""
 
 Pixels = tuple[Array, Array]
 """Centres (N, 2) and covariances (N, 2, 2) of the N detections of one camera."""
@@ -157,10 +163,7 @@ class Groups(Rows):
     pair : (G,) which pair of the model's cameras it is; -1 for more than two detections.
     appearance : (G,) log odds from everything but the gaps, the positions and the tracks.
     gap_px, variance_px2 : (G,) gaps of pairs less the model's bias, and their variances.
-    variance_mm2 : (G,) variance of the point in every direction.
     log_radius : (G,) mean logarithm of the radius in all views (mm); NaN if unknown.
-    log_height_ratio : (G,) of pairs, logarithm of the height in the first view over that in the
-        second; NaN if unknown.
     places : the points, triangulated.
     noise_px2 : (G, C, 2, 2) covariances of the pixels, with the scatter of true groups.
     """
@@ -170,9 +173,7 @@ class Groups(Rows):
     appearance: Array
     gap_px: Array
     variance_px2: Array
-    variance_mm2: Array
     log_radius: Array
-    log_height_ratio: Array
     places: Places
     noise_px2: Array
 
@@ -182,9 +183,12 @@ class Groups(Rows):
 
 @dataclass(frozen=True)
 class Candidates:
-    """The possible groups of one frame, and all its detections by camera."""
+    """The possible groups of one frame, and all its detections by camera.
 
-    views: tuple[View, ...]
+    rays : of each camera points (N, 3) and covariances (N, 3, 3) of its detections (`on_rays`).
+    """
+
+    rays: tuple[Pixels, ...]
     groups: Groups
 
     def __len__(self) -> int:
@@ -198,23 +202,13 @@ class Matches:
     candidate : (M,) positions of the groups among the frame's `Candidates`.
     rows : (M, C) row in the table of each camera, -1 for none.
     confidence : (M,) posterior probability of the group.
-    gap_px, gap_sigma : (M,) of pairs: mismatch along the shared axis, first minus second, after the
-        model's bias and the frame's common shift are subtracted; in px of the first image, and in
-        standard deviations. NaN for larger groups.
-    height_ratio : (M,) of pairs: height (mm) in the first view divided by that in the second; NaN
-        if unknown.
     ambiguous : (M,) whether the group's posterior log odds are below ``SAFE_LOG_ODDS``.
-    frame_shift_px : (P,) for each pair of cameras the shift that all gaps of this frame share.
     """
 
     candidate: Ints
     rows: Ints
     confidence: Array
-    gap_px: Array
-    gap_sigma: Array
-    height_ratio: Array
     ambiguous: Bools
-    frame_shift_px: Array
 
     def __len__(self) -> int:
         return len(self.candidate)
@@ -255,36 +249,55 @@ def candidates(
     counts: Ints,
     model: RigModel,
     unsure_px: float = 0.0,
+    barred: Sequence[Bools] | None = None,
 ) -> list[Candidates]:
     """Return the possible groups of F frames.
 
     tables, pixels : of all detections of each camera, which follow each other frame by frame.
     counts : (F, C) number of detections in each frame and camera.
     unsure_px : standard deviation of the model's offsets.
+    barred : for each camera, which detections take part in no group; None for none.
 
     A gap may be twice as large as that of a pair, because all gaps of a frame shift together.
     """
     views: dict[int, View] = {}
     edges: list[_Edges] = []
     for k, (a, b) in enumerate(model.pairs):
-        axis = shared_axis((model.cameras[a], model.cameras[b]))
-        both = tuple(view_of(tables[c], model.cameras[c], axis) for c in (a, b))
+        cameras = model.cameras[a], model.cameras[b]
+        axis = shared_axis(cameras)
+        both = view_of(tables[a], cameras[0], axis), view_of(tables[b], cameras[1], axis)
         views |= {c: v for c, v in zip((a, b), both) if c not in views}
-        edges.append(_edges(k, (both[0], both[1]), counts[:, [a, b]], model))
+        own = _edges(k, cameras, both, counts[:, [a, b]], model)
+        if barred is not None:
+            own = own.take(~(barred[a][own.rows[:, 0]] | barred[b][own.rows[:, 1]]))
+        edges.append(own)
     starts = np.cumsum(counts, axis=0) - counts
     groups, frame = _grown(edges, pixels, views, counts, model, unsure_px)
     order = np.argsort(frame, kind="stable")
     groups, frame = groups.take(order), frame[order]
     groups.rows[:] = np.where(groups.rows >= 0, groups.rows - starts[frame], -1)
     cuts = np.searchsorted(frame, np.arange(len(counts) + 1)).tolist()
+    rays = [_rays(model, c, views[c]) for c in range(len(model.cameras))]
     of_frame = [
-        tuple(views[c].of(slice(s, s + n)) for c, (s, n) in enumerate(zip(first, many)))
+        tuple((x[s : s + n], p[s : s + n]) for (x, p), s, n in zip(rays, first, many))
         for first, many in zip(starts.tolist(), counts.tolist())
     ]
     return [
         Candidates(own, groups.take(slice(low, high)))
         for own, (low, high) in zip(of_frame, pairwise(cuts))
     ]
+
+
+def _rays(model: RigModel, c: int, view: View) -> Pixels:
+    """Return the detections of a camera as points of unknown depth, with all errors of the model
+    that they do not share with tracks."""
+    bias = [m.bias_px[0] for pair, m in model.pairs.items() if c in pair]
+    common = model.mean("scatter_px", c) ** 2 + model.mean("frame_px", c) ** 2
+    common += float(np.mean(np.square(bias))) / 4
+    points, covariances, _ = on_rays(
+        model.cameras[c], view.uv_px, view.covariance_px2 + common * np.eye(2)
+    )
+    return points, covariances
 
 
 @dataclass(frozen=True)
@@ -302,50 +315,30 @@ class _Edges(Rows):
     prior: Array
     gap_px: Array
     variance_px2: Array
-    variance_mm2: Array
     log_radius: Array
-    log_height_ratio: Array
 
 
-def _edges(k: int, views: tuple[View, View], counts: Ints, model: RigModel) -> _Edges:
+def _edges(
+    k: int, cameras: Cameras, views: tuple[View, View], counts: Ints, model: RigModel
+) -> _Edges:
     """Return the candidate pairs of F frames.
 
     counts : (F, 2) detections of the frames in both views.
     """
-    own = list(model.pairs.values())[k]
-    starts, combinations = np.cumsum(counts, axis=0) - counts, counts.prod(1)
-    parts, first = list[_Edges](), 0
-    while first < len(counts) or not parts:
-        some = np.searchsorted(np.cumsum(combinations[first:]), _COMBINATIONS_AT_ONCE)
-        frames = np.arange(first, min(first + max(int(some), 1), len(counts)))
-        parts.append(_some_edges(k, views, starts, counts, frames, own))
-        first += max(len(frames), 1)
-    return _Edges.concat(parts)
-
-
-def _some_edges(
-    k: int, views: tuple[View, View], starts: Ints, counts: Ints, frames: Ints, model: PairModel
-) -> _Edges:
     from telerig.estimator.bubbles.pairing import kernels
 
-    many = counts[frames].prod(1)
-    frame = np.repeat(frames, many)
-    at = np.arange(len(frame)) - np.repeat(np.cumsum(many) - many, many)
-    rows = starts[frame] + np.stack(np.divmod(at, counts[frame, 1]), -1)
-    every = compared(*(v.of(i) for v, i in zip(views, rows.T)))
-    gap, variance = unbiased(every, model)
-    limit2 = (2 * kernels.GATE_SIGMA) ** 2 * (variance + model.frame_px**2 + kernels.MOST_TAIL_PX2)
-    kept = np.flatnonzero(gap**2 < limit2)
-    near = every.of(kept)
-    first, second = near.views
-    trace = sum(np.trace(v.covariance_px2, axis1=1, axis2=2) for v in near.views)
-    variance_px2 = model.scatter_px**2 + 0.25 * trace + model.frame_px**2
-    sine2 = 1 - (first.direction * second.direction).sum(-1) ** 2
+    own = list(model.pairs.values())[k]
+
+    def near(every: PairGeometry) -> Bools:
+        gap, variance = unbiased(every, own)
+        wide = variance + own.frame_px**2 + kernels.MOST_TAIL_PX2
+        return np.asarray(gap**2 < (2 * kernels.GATE_SIGMA) ** 2 * wide)
+
+    pairs, rows, frame = near_pairs(cameras, views, counts, near)
     return _Edges(
-        np.full(len(kept), k), frame[kept], rows[kept], appearance_log_odds(near, model),
-        prior_log_odds(counts[frame[kept]], model.unmatched_share), gap[kept], variance[kept],
-        variance_px2 * near.mm_per_px**2 / sine2,
-        0.25 * (first.log_size + second.log_size).sum(-1), near.size[:, 0],
+        np.full(len(rows), k), frame, rows, appearance_log_odds(pairs, own),
+        prior_log_odds(counts[frame], own.unmatched_share), *unbiased(pairs, own),
+        0.25 * pairs.size_sum.sum(-1),
     )  # fmt: skip
 
 
@@ -403,8 +396,7 @@ def _grown(
     return Groups(
         rows, np.where(two, every.pair[of_pair], -1), alike + prior,
         every.gap_px[of_pair] + blank, every.variance_px2[of_pair] + blank,
-        mean(every.variance_mm2), mean(every.log_radius), every.log_height_ratio[of_pair] + blank,
-        at, spread,
+        mean(every.log_radius), at, spread,
     ), of_frame  # fmt: skip
 
 
@@ -549,31 +541,25 @@ def match(found: Candidates, model: RigModel, predicted: Prediction | None = Non
     from telerig.estimator.bubbles.pairing import kernels
 
     groups = found.groups
-    counts = np.array([len(view) for view in found.views])
+    counts = np.array([len(points) for points, _ in found.rays])
     odds = groups.appearance
     if predicted is not None and len(predicted.ids) and len(found):
         odds = odds + track_log_odds(found, model, predicted)
-    total, shifts = odds.copy(), np.zeros(len(model.pairs))
-    gap, sigma = groups.gap_px.copy(), np.sqrt(groups.variance_px2)
+    total = odds.copy()
     for k, ((a, b), own) in enumerate(model.pairs.items()):
         mine = np.flatnonzero(groups.pair == k)
-        total[mine], shifts[k], unsure = kernels.common_shift(
+        total[mine], _, _ = kernels.common_shift(
             groups.gap_px[mine], groups.variance_px2[mine], odds[mine],
             np.ascontiguousarray(groups.rows[mine][:, [a, b]]), counts[[a, b]],
             own.frame_px, own.span_px, NEGLIGIBLE,
         )  # fmt: skip
-        gap[mine] -= shifts[k]
-        sigma[mine] = np.sqrt(groups.variance_px2[mine] + unsure)
     larger = np.flatnonzero(groups.pair < 0)
     if len(larger):
         total[larger] = _larger(groups.take(larger), odds[larger], counts, model)
     chosen = best_groups(total, groups.rows)
     confidence = kernels.marginals(total, groups.rows, counts, NEGLIGIBLE)[chosen]
-    return Matches(
-        chosen, groups.rows[chosen], confidence, gap[chosen], gap[chosen] / sigma[chosen],
-        np.exp(groups.log_height_ratio[chosen]),
-        confidence < (1 - confidence) * np.exp(SAFE_LOG_ODDS), shifts,
-    )  # fmt: skip
+    ambiguous = confidence < (1 - confidence) * np.exp(SAFE_LOG_ODDS)
+    return Matches(chosen, groups.rows[chosen], confidence, ambiguous)
 
 
 def _larger(groups: Groups, odds: Array, counts: Ints, model: RigModel) -> Array:
@@ -626,65 +612,51 @@ def best_groups(log_odds: Array, rows: Ints) -> Ints:
 def _packed(log_odds: Array, rows: Ints, good: Ints) -> Ints:
     """Return the best set of disjoint groups among ``good``.
 
-    A group that is worth more than the groups of its detections can be together belongs to it; each
-    of these counts for a detection by the share of the detections that it has in common. What is
-    left is a set packing, solved by SciPy's mixed-integer solver.
+    A group that no other one contests belongs to it; the rest is a set packing, solved by SciPy's
+    mixed-integer solver.
     """
-    wide = np.cumsum([0, *(rows.max(0) + 1)])[:-1]
-    number = np.where(rows >= 0, rows + wide, -1)
-    chosen, order = [], good[np.argsort(-log_odds[good], kind="stable")]
-    again = True
-    while again and len(order):
-        again = False
-        for g in order.tolist():
-            if g not in (left := order):
-                continue
-            common = (number[left] == number[g]) & (number[g] >= 0)
-            shared = common.sum(1)
-            rival = (shared > 0) & (left != g)
-            each = (log_odds[left][rival] / shared[rival])[:, None]
-            worth = np.where(common[rival], each, 0.0)
-            if log_odds[g] >= worth.max(0, initial=0.0).sum():
-                chosen.append(g)
-                order = left[shared == 0]
-                again = True
-    if len(order):
-        from scipy.optimize import Bounds, LinearConstraint, milp
-        from scipy.sparse import coo_array
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import coo_array
 
-        at, _ = np.nonzero(number[order] >= 0)
-        used = number[order][number[order] >= 0]
-        shape = (int(used.max()) + 1, len(order))
-        packing = LinearConstraint(coo_array((np.ones(len(at)), (used, at)), shape), ub=1.0)
-        found = milp(
-            -log_odds[order], integrality=np.ones(len(order)), bounds=Bounds(0, 1),
-            constraints=packing,
-        )  # fmt: skip
-        chosen += order[found.x > 0.5].tolist()
-    return np.array(chosen, np.int64)
+    wide = np.cumsum([0, *(rows.max(0) + 1)])
+    group, camera = np.nonzero(rows[good] >= 0)
+    used = rows[good][group, camera] + wide[camera]
+    contested = np.zeros(len(good), bool)
+    contested[group[np.bincount(used)[used] > 1]] = True
+    if not contested.any():
+        return good
+    shape = (int(wide[-1]), len(good))
+    packing = LinearConstraint(coo_array((np.ones(len(used)), (used, group)), shape), ub=1.0)
+    found = milp(
+        -log_odds[good], integrality=contested.astype(int), bounds=Bounds(0, 1), constraints=packing
+    )
+    return np.asarray(good[found.x > 0.5])
 
 
 def track_log_odds(found: Candidates, model: RigModel, predicted: Prediction) -> Array:
     """Return the log odds (G,) that the predicted tracks add.
 
     Without tracks groups lie anywhere in the volume that the cameras see. With them most lie where
-    a track is expected (all pixels at once, through the point in space), and so do the detections
-    of bubbles that only one camera found; one track cannot be the unmatched detection of two
-    cameras.
+    a track is expected, and so do the detections of bubbles that only one camera found; one track
+    cannot be the unmatched detection of two cameras.
     """
-    points = np.asarray(predicted.points_mm, float)
-    expected = _track_density(found, model, predicted, points) / len(points)
-    rows = found.groups.rows
-    expected = (1 - _NEW_SHARE) * _SEEN**2 * expected + _NEW_SHARE
-    pixels, by_point = stacked_jacobian(model.cameras, points)
+    groups, at = found.groups, found.groups.places
+    scales = np.array([camera["scale_px_per_mm"] for camera in model.cameras])
+    blur_px2 = model.mean("scatter_px") ** 2 + model.mean("frame_px") ** 2
+    blurred = at.covariance_mm2 + blur_px2 / np.mean(scales) ** 2 * np.eye(3)
+    density = _densities(predicted, at.points_mm, blurred, 2 * np.exp(groups.log_radius))
+    volumes = np.array([model.volume_mm3(*pair) for pair in model.pairs])
+    volume = np.where(groups.pair >= 0, volumes[groups.pair], volumes.mean())
+    expected = (1 - _NEW_SHARE) * _SEEN**2 * volume * density.mean(1)
+    total = np.log(expected + _NEW_SHARE)
+    depths = model.areas_px2 / scales**2 * np.sqrt(2 * np.pi) * UNKNOWN_MM
     alone = []
-    for c in range(len(model.cameras)):
-        at = slice(2 * c, 2 * c + 2)
-        density = _unmatched_density(found.views[c], model, predicted, pixels[:, at],
-                                     by_point[:, at], c)  # fmt: skip
+    for c, (points, covariances) in enumerate(found.rays):
+        usual = max(len(points) * model.unmatched_share(c), 1e-3)
+        density = _densities(predicted, points, covariances, np.full(len(points), np.nan))
+        density *= _SEEN * (1 - _SEEN) * depths[c] / usual
         none = np.zeros((1, density.shape[1]))
-        alone.append(np.concatenate([density, none])[rows[:, c]])
-    total = np.log(expected)
+        alone.append(np.concatenate([density, none])[groups.rows[:, c]])
     every = [1 + one.sum(1) for one in alone]
     for c, one in enumerate(alone):
         total -= np.log(every[c])
@@ -694,43 +666,13 @@ def track_log_odds(found: Candidates, model: RigModel, predicted: Prediction) ->
     return np.asarray(total)
 
 
-def _track_density(
-    found: Candidates, model: RigModel, predicted: Prediction, points_mm: Array
+def _densities(
+    predicted: Prediction, points_mm: Array, covariances_mm2: Array, d_eq_mm: Array
 ) -> Array:
-    """Return the density (G,) of a group's point and size at the tracks, relative to anywhere."""
-    from telerig.estimator.bubbles.pairing import kernels
-
-    variances, axes = np.linalg.eigh(predicted.covariance_mm2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_expected = np.log(np.asarray(predicted.d_eq_mm, float) / 2)
-    groups = found.groups
-    population = float(np.sqrt(np.mean([m.size.spread.mean() for m in model.pairs.values()])))
-    sd = min(_TRACK_SIZE_SD, population)
-    density = kernels.track_density(
-        groups.places.points_mm, groups.variance_mm2, groups.log_radius, points_mm, variances, axes,
-        log_expected, sd, population / sd,
+    """Return the density (N, K) of N measured points and sizes at K tracks (1/mm^3)."""
+    near = evidence(
+        predicted, points_mm, covariances_mm2, d_eq_mm, size_sd=_SILHOUETTE_SIZE_SD
     )  # fmt: skip
-    volumes = np.array([model.volume_mm3(*pair) for pair in model.pairs])
-    own = np.where(groups.pair >= 0, volumes[groups.pair], volumes.mean())
-    return np.asarray(density * own)
-
-
-def _unmatched_density(
-    view: View, model: RigModel, predicted: Prediction, pixels: Array, by_point: Array, c: int
-) -> Array:
-    """Return the density (N, K) of detections of tracks that only this camera sees, relative.
-
-    pixels, by_point : (K, 2), (K, 2, 3) of the tracks in this camera.
-    """
-    from telerig.estimator.bubbles.pairing import kernels
-
-    spread = by_point @ predicted.covariance_mm2 @ np.swapaxes(by_point, 1, 2)
-    bias = [m.bias_px[0] for pair, m in model.pairs.items() if c in pair]
-    common = model.mean("scatter_px", c) ** 2 + model.mean("frame_px", c) ** 2
-    common += float(np.mean(np.square(bias))) / 4
-    density = kernels.pixel_density(
-        view.uv_px, view.covariance_px2, pixels, spread + common * np.eye(2)
-    )
-    width, height = view.camera.image_size_px
-    usual = max(len(view) * model.unmatched_share(c), 1e-3)
-    return np.asarray(_SEEN * (1 - _SEEN) * density * width * height / usual)
+    out = np.zeros((len(points_mm), len(predicted.ids)))
+    out[near.column, near.row] = np.exp(near.scores(np.zeros(3)))
+    return out

@@ -10,8 +10,6 @@ from telerig.compiled import compiled
 GATE_SIGMA, NEVER = 5.0, -1e6
 """Limit of a true pair's gap in standard deviations of its wide part, and the log odds beyond."""
 
-LARGEST_MAHALANOBIS2 = 60.0
-
 TAIL, _LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
 _EXACT_SIDE = 11
 _LARGEST_EXPONENT = 600.0
@@ -106,7 +104,16 @@ def _exact(weight: Array, alone: Array, choice: Ints, mask: Ints, columns: int) 
 
 @compiled
 def marginals(log_odds: Array, rows: Ints, counts: Ints, negligible: float) -> Array:
-    """Return the posterior probability (E,) of each group; see `groups.marginals`."""
+    """Return the posterior probability (E,) of each group.
+
+    log_odds : (E,) of the groups; those below ``negligible`` get the probability 0.
+    rows, counts : (E, C) detections of each camera, -1 for none, and (C,) numbers of detections.
+
+    Probabilities are exact per connected component with up to 11 detections beside those of the
+    camera with the most (sum over all sets by dynamic programming over subsets). Of a larger
+    component the least likely groups are left out, one unit of log odds after the other, until it
+    falls apart.
+    """
     out = np.zeros(log_odds.size)
     waiting = np.ones(log_odds.size, dtype=np.bool_)
     first = np.cumsum(counts) - counts
@@ -180,7 +187,7 @@ def common_shift(
     span_px: float,
     least: float,
 ) -> tuple[Array, float, float]:
-    """Estimate the shift that all gaps of a frame share; see `matching.common_shift`.
+    """Estimate the shift that all gaps of a frame share; see `groups.match`.
 
     gap, variance : (E,) gaps less their bias (px), and variances (px^2).
     appearance : (E,) log odds from everything but the gaps
@@ -206,112 +213,3 @@ def common_shift(
         gap_log_odds(gap, variance, shift, uncertainty, span_px, odds)
         odds += appearance
     return odds, shift, uncertainty
-
-
-@compiled
-def ratio_log_odds(
-    ratio: Array,
-    total: Array,
-    axes: Array,
-    alike: Array,
-    wrong: Array,
-    rare: float,
-    freedom: float,
-) -> Array:
-    """Return log odds (E,) from K properties; see `matching`.
-
-    ratio, total : (E, K) differences and sums of the logarithms, less their means. NaN where
-        unknown: such pairs get 0.
-    axes, alike : (K, K), (K,) as in `LogRatioModel.uncorrelated`.
-    wrong : (E,) probability that a measurement is unrelated to the bubble.
-    rare : limit of the bubble's rareness (standard deviations)
-    freedom : that of the tails.
-    """
-    pairs, many = ratio.shape
-    out = np.zeros(pairs)
-    constant = 0.0
-    for k in range(many):
-        constant += np.log1p(-alike[k] * alike[k])
-    for i in range(pairs):
-        odds, tails, known = 0.0, 0.0, True
-        for k in range(many):
-            apart = own = 0.0
-            for c in range(many):
-                known = known and abs(ratio[i, c]) < np.inf
-                apart += ratio[i, c] * axes[c, k]
-                own += total[i, c] * axes[c, k]
-            own = min(max(0.5 * own, -rare), rare)
-            odds += own * own * alike[k] / (1.0 + alike[k]) + apart * apart / 4.0
-            tails += apart * apart * 0.5 / (1.0 - alike[k])
-        if not known:
-            continue
-        odds -= 0.5 * (freedom + many) * np.log1p(tails / freedom) + 0.5 * constant
-        odds += np.log1p(-wrong[i])
-        floor = np.log(wrong[i])
-        high, low = max(odds, floor), min(odds, floor)
-        out[i] = high + np.log1p(np.exp(low - high))
-    return out
-
-
-@compiled
-def track_density(
-    points: Array,
-    added: Array,
-    log_size: Array,
-    expected: Array,
-    variances: Array,
-    axes: Array,
-    log_expected: Array,
-    size_sd: float,
-    size_factor: float,
-) -> Array:
-    """Return (E,) the density of a pair's point and size, summed over K tracks.
-
-    points : (E, 3) points (mm)
-    added : (E,) variance in every direction (mm^2).
-    log_size, log_expected : (E,), (K,) logarithms of the radii (mm); NaN where unknown.
-    expected, variances, axes : (K, 3), (K, 3), (K, 3, 3) the tracks' positions (mm), and the
-        variances (mm^2) of these along axes, which are the columns of matrices.
-    size_sd, size_factor : standard deviation of the logarithms' difference, and the density where
-        it is 0. The densities are not below those at the largest Mahalanobis distance.
-    """
-    out = np.zeros(added.size)
-    for i in range(added.size):
-        for k in range(expected.shape[0]):
-            distance2, determinant = 0.0, 1.0
-            for axis in range(3):
-                along = 0.0
-                for c in range(3):
-                    along += (points[i, c] - expected[k, c]) * axes[k, c, axis]
-                own = variances[k, axis] + added[i]
-                distance2 += along * along / own
-                determinant *= own
-            off = (log_size[i] - log_expected[k]) / size_sd
-            factor = 1.0
-            exponent = min(distance2, LARGEST_MAHALANOBIS2)
-            if abs(off) < np.inf:
-                exponent += off * off
-                factor = size_factor
-            out[i] += factor * np.exp(-0.5 * exponent) / np.sqrt(determinant)
-    out *= (2.0 * np.pi) ** -1.5
-    return out
-
-
-@compiled
-def pixel_density(uv: Array, covariance: Array, expected: Array, spread: Array) -> Array:
-    """Return (N, K) the density (1/px^2) of N detections at K expected pixels.
-
-    uv, expected : (N, 2), (K, 2) px; covariance, spread : (N, 2, 2), (K, 2, 2) px^2.
-    """
-    out = np.empty((uv.shape[0], expected.shape[0]))
-    for n in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            uu = covariance[n, 0, 0] + spread[k, 0, 0]
-            uv_ = covariance[n, 0, 1] + spread[k, 0, 1]
-            vv = covariance[n, 1, 1] + spread[k, 1, 1]
-            du, dv = uv[n, 0] - expected[k, 0], uv[n, 1] - expected[k, 1]
-            determinant = uu * vv - uv_ * uv_
-            distance2 = (vv * du * du - 2.0 * uv_ * du * dv + uu * dv * dv) / determinant
-            near = np.exp(-0.5 * min(distance2, LARGEST_MAHALANOBIS2))
-            out[n, k] = near / (2.0 * np.pi * np.sqrt(determinant))
-    return out

@@ -10,8 +10,8 @@ systematic part of the gaps is a constant, or smooth in space where pairs left o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from itertools import combinations
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
 
 import numpy as np
 import pandas as pd
@@ -27,6 +27,7 @@ from telerig.estimator.bubbles.pairing.groups import (
 )
 from telerig.estimator.bubbles.pairing.matching import (
     NEGLIGIBLE,
+    Cameras,
     Finding,
     LogRatioModel,
     PairGeometry,
@@ -34,12 +35,11 @@ from telerig.estimator.bubbles.pairing.matching import (
     View,
     appearance_log_odds,
     bias_basis,
-    common_shift,
-    marginals,
-    pair_geometry,
+    near_pairs,
     prior_log_odds,
     shared_axis,
-    views_of,
+    unbiased,
+    view_of,
 )
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import nearly_parallel, stacked_jacobian
@@ -47,6 +47,12 @@ from telerig.statistics import robust_sd
 
 MOST_FRAMES = 60
 MOST_BIAS_PX = 20.0
+_VOTE_REACH_PX = 5.0
+"""Beyond the largest bias: what a vote spreads to, and what gaps scatter."""
+
+_LIKELY = 0.01
+"""Probability of a pair above which it takes part in the fits."""
+
 _START_SCATTER_PX = 1.5
 _PASSES = 6
 _LEAST_UNMATCHED, _MOST_UNMATCHED = 0.05, 0.9
@@ -67,7 +73,7 @@ _LEAST_PROBLEM_PX, _SIGNIFICANT = 0.5, 4.0
 _FEW_PAIRS, _CLEAR_VOTE = 5.0, 3.0
 
 
-def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
+def default_model(cameras: Cameras) -> PairModel:
     """Return the model for matching bubbles across the two views before any detection is known.
 
     It assumes that the calibration is right: its bias is 0. Raises InputError for cameras whose
@@ -205,7 +211,7 @@ def _offset_fit(
 
 
 def estimate_pair_model(
-    frames: Sequence[tuple[pd.DataFrame, pd.DataFrame]], cameras: tuple[Camera, Camera]
+    frames: Sequence[tuple[pd.DataFrame, pd.DataFrame]], cameras: Cameras
 ) -> PairModel:
     """Learn from a run how the two images of one bubble agree.
 
@@ -226,26 +232,28 @@ def estimate_pair_model(
     tables = [frames[i] for i in chosen if len(frames[i][0]) and len(frames[i][1])]
     if not tables:
         return replace(model, findings=(Finding.NO_DETECTIONS,))
-    used = list(zip(*(views_of(own, c, axis) for own, c in zip(zip(*tables), cameras))))
-    model = _populations(model, used)
-    geometries = [pair_geometry(*pair) for pair in used]
-    points = np.concatenate([g.points_mm.reshape(-1, 3) for g in geometries])
-    start, votes = _vote(geometries, model)
+    first, second = (
+        view_of(pd.concat(own, ignore_index=True), c, axis) for own, c in zip(zip(*tables), cameras)
+    )
+    sample = _sampled(cameras, (first, second), np.array([[*map(len, own)] for own in tables]))
+    model = _populations(model, (first, second))
+    start, votes = _vote(sample, model)
+    points = sample.geometry.points_mm
     model = replace(
         model,
         bias_px=np.array([start]),
         scatter_px=_START_SCATTER_PX,
-        frame_px=_START_SCATTER_PX if len(used) > 1 else 0.0,
-        origin_mm=np.median(points, axis=0),
+        frame_px=_START_SCATTER_PX if len(tables) > 1 else 0.0,
+        origin_mm=np.median(points, axis=0) if len(points) else np.zeros(3),
     )
     for _ in range(_PASSES):
-        model = _improved(model, geometries, 1)
+        model = _improved(model, sample, 1)
     best = model
     for terms in _BIAS_TERMS[1:]:
         if model.pairs >= _PAIRS_PER_TERM * terms:
             trial = model
             for _ in range(_PASSES):
-                trial = _improved(trial, geometries, terms)
+                trial = _improved(trial, sample, terms)
             as_many = trial.pairs >= _AS_MANY * best.pairs
             best = trial if as_many and trial.rms_px[3] < _BETTER * best.rms_px[3] else best
     return replace(best, findings=_findings(best, votes))
@@ -269,76 +277,91 @@ def _findings(model: PairModel, votes: float) -> tuple[Finding, ...]:
 
 
 @dataclass(frozen=True)
-class _LikelyPairs:
-    """Likely pairs of all frames, one row each; fields as in `PairGeometry`.
+class _Sample:
+    """Combinations of the detections of F frames whose gaps a bias may explain.
 
-    gap_px is less the frame's common shift; weight is the probability of the pair.
+    geometry : of all E combinations. rows, frame : (E, 2), (E,) their rows in the tables of their
+    frames, and these. counts : (F, 2) detections of the frames.
     """
 
-    gap_px: Array
-    variance_px2: Array
-    points_mm: Array
-    size: Array
-    contrast: Array
-    scatter_factor: Array
-    weight: Array
+    geometry: PairGeometry
+    rows: Ints
+    frame: Ints
+    counts: Ints
+
+    def log_odds(self, model: PairModel) -> Array:
+        """Return the log odds (E,) without the gaps."""
+        odds = appearance_log_odds(self.geometry, model)
+        return odds + prior_log_odds(self.counts[self.frame], model.unmatched_share)
+
+    def by_frame(self) -> list[slice]:
+        """Return which combinations are those of each frame."""
+        cuts = np.searchsorted(self.frame, np.arange(len(self.counts) + 1)).tolist()
+        return [slice(*ends) for ends in pairwise(cuts)]
 
 
-def _likely_pairs(
-    geometries: list[PairGeometry], shifts_px: Array, probability: list[Array]
-) -> _LikelyPairs:
-    weight = np.concatenate([p.ravel() for p in probability])
-    use = weight > 0.01
-    columns = {}
-    for field in fields(_LikelyPairs)[:-1]:
-        arrays: list[Array] = [getattr(g, field.name) for g in geometries]
-        columns[field.name] = np.concatenate([a.reshape(-1, *a.shape[2:]) for a in arrays])[use]
-    columns["gap_px"] -= np.repeat(shifts_px, [g.gap_px.size for g in geometries])[use]
-    return _LikelyPairs(**columns, weight=weight[use])
+def _sampled(cameras: Cameras, views: tuple[View, View], counts: Ints) -> _Sample:
+    def near(geometry: PairGeometry) -> Bools:
+        return np.asarray(np.abs(geometry.gap_px) < MOST_BIAS_PX + _VOTE_REACH_PX)
+
+    geometry, rows, frame = near_pairs(cameras, views, counts, near)
+    starts = np.cumsum(counts, axis=0) - counts
+    return _Sample(geometry, rows - starts[frame], frame, counts)
 
 
-def _improved(model: PairModel, geometries: list[PairGeometry], terms: int) -> PairModel:
+def _improved(model: PairModel, sample: _Sample, terms: int) -> PairModel:
     """Do one pass: probabilities of all pairs, then the model that follows from them."""
-    found = [common_shift(g, model) for g in geometries]
-    probability = [marginals(odds) for odds, _ in found]
-    shifts = np.array([shift for _, shift in found])
-    total = np.array([p.sum() for p in probability])
-    counts = np.array([p.shape for p in probability])
+    from telerig.estimator.bubbles.pairing import kernels
+
+    gap, variance = unbiased(sample.geometry, model)
+    appearance, frames = sample.log_odds(model), len(sample.counts)
+    probability, shifts = np.zeros(len(gap)), np.zeros(frames)
+    for f, one in enumerate(sample.by_frame()):
+        rows, counts = sample.rows[one], sample.counts[f]
+        odds, shifts[f], _ = kernels.common_shift(
+            gap[one], variance[one], appearance[one], rows, counts, model.frame_px, model.span_px,
+            NEGLIGIBLE,
+        )  # fmt: skip
+        probability[one] = kernels.marginals(odds, rows, counts, NEGLIGIBLE)
+    total = np.asarray(np.bincount(sample.frame, probability, frames), float)
     centred = shifts - np.average(shifts, weights=total + 1e-9)
-    pairs = _likely_pairs(geometries, centred, probability)
-    model = _with_bias(model, pairs, terms)
-    unmatched = 1 - (total.sum() + 0.5) / (counts.sum(0) + 1.0)
+    likely = np.flatnonzero(probability > _LIKELY)
+    pairs, weight = sample.geometry.take(likely), probability[likely]
+    pairs = replace(pairs, gap_px=pairs.gap_px - centred[sample.frame[likely]])
+    model = _with_bias(model, pairs, weight, terms)
+    unmatched = 1 - (total.sum() + 0.5) / (sample.counts.sum(0) + 1.0)
     first, second = np.clip(unmatched, _LEAST_UNMATCHED, _MOST_UNMATCHED)
     mean, error = model.mean_gap_px
-    frame_px = _frame_scatter(model, centred, total) if len(geometries) > 1 else 0.0
-    size_weight = pairs.weight / pairs.scatter_factor**2
+    frame_px = _frame_scatter(model, centred, total) if frames > 1 else 0.0
     return replace(
         model,
-        mean_gap_px=(mean, float(np.hypot(error, frame_px / np.sqrt(len(geometries))))),
+        mean_gap_px=(mean, float(np.hypot(error, frame_px / np.sqrt(frames)))),
         frame_px=frame_px,
-        size=_learnt(model.size, "size", pairs.size, size_weight),
-        contrast=_learnt(model.contrast, "contrast", pairs.contrast, pairs.weight),
+        size=_learnt(model.size, "size", pairs.size, weight / pairs.scatter_factor**2),
+        contrast=_learnt(model.contrast, "contrast", pairs.contrast, weight),
         unmatched_share=(float(first), float(second)),
         pairs=float(total.sum()),
     )
 
 
-def _with_bias(model: PairModel, pairs: _LikelyPairs, terms: int) -> PairModel:
-    """The model with bias, its covariance and the scatter; terms : 1, 4 or 10, see `PairModel`."""
-    weight = pairs.weight
+def _with_bias(model: PairModel, pairs: PairGeometry, weight: Array, terms: int) -> PairModel:
+    """The model with bias, its covariance and the scatter; terms : 1, 4 or 10, see `PairModel`.
+
+    pairs, weight : gaps less the common shifts of their frames, and probabilities.
+    """
     if weight.sum() < 0.5:
         return model
     square = np.average((pairs.points_mm - model.origin_mm) ** 2, 0, weight)
     reach = np.maximum(3 * np.sqrt(square), 1e-3)
     model = replace(model, reach_mm=np.maximum(reach / 1.5, 0.1 * reach.max()))
-    constant, rms_px = _bias_fit(model, pairs, 1)
-    best, best_rms_px = (constant, rms_px) if terms == 1 else _bias_fit(model, pairs, terms)
+    constant, rms_px = _bias_fit(model, pairs, weight, 1)
+    best, best_rms_px = (constant, rms_px) if terms == 1 else _bias_fit(model, pairs, weight, terms)
     mean = (float(constant.bias_px[0]), float(np.sqrt(constant.bias_covariance_px2[0, 0])))
     return replace(best, mean_gap_px=mean, rms_px=(*rms_px[:2], *best_rms_px[1:]))
 
 
 def _bias_fit(
-    model: PairModel, pairs: _LikelyPairs, terms: int
+    model: PairModel, pairs: PairGeometry, weight: Array, terms: int
 ) -> tuple[PairModel, tuple[float, float, float]]:
     """The model with a bias of so many terms; then the RMS of the gaps, after it, and left out.
 
@@ -352,10 +375,10 @@ def _bias_fit(
     bias[0] = model.bias_px[0]
     residual = gap_px - basis @ bias
     covariance: Array = np.zeros((terms, terms))
-    tempered = influence = lost = pairs.weight
+    tempered = influence = lost = weight
     for _ in range(8):
         own = variance_px2 + (scatter * factor) ** 2
-        tempered = pairs.weight * 9 / (8 + residual**2 / own)
+        tempered = weight * 9 / (8 + residual**2 / own)
         influence = tempered / own
         covariance = np.asarray(np.linalg.inv((basis.T * influence) @ basis + np.diag(prior)))
         bias = covariance @ (basis.T @ (influence * gap_px))
@@ -363,7 +386,7 @@ def _bias_fit(
         lost = np.einsum("ni,ij,nj->n", basis, covariance, basis)
         excess = (tempered * (residual**2 + lost - variance_px2) / factor**2).sum()
         prior_squares = _PRIOR_SCATTER_PAIRS * _PRIOR_SCATTER_PX**2
-        free = pairs.weight.sum() + _PRIOR_SCATTER_PAIRS
+        free = weight.sum() + _PRIOR_SCATTER_PAIRS
         scatter = float(np.sqrt(max((excess + prior_squares) / free, _SMALLEST_SCATTER_PX**2)))
     left_out = residual / (1 - np.minimum(influence * lost, 0.95))
     raw, after, predicted = (
@@ -399,13 +422,13 @@ def _learnt(old: LogRatioModel, name: str, ratio: Array, weight: Array) -> LogRa
     return replace(old, difference=mean, scatter=scatter)
 
 
-def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
+def _populations(model: PairModel, views: tuple[View, View]) -> PairModel:
     """Return means and spreads of all detections; outliers count as 3 sd."""
     learnt: dict[str, LogRatioModel] = {}
     for name, usual in _USUAL.items():
         means, squares, count = [], _USUAL_WEIGHT * usual, _USUAL_WEIGHT
-        for c in range(2):
-            values: Array = np.concatenate([getattr(pair[c], f"log_{name}") for pair in views])
+        for view in views:
+            values: Array = getattr(view, f"log_{name}")
             values = values[np.isfinite(values).all(-1)]
             middle = np.median(values, axis=0) if len(values) else np.zeros(len(usual))
             off = values - middle
@@ -418,25 +441,21 @@ def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
     return replace(model, size=learnt["size"], contrast=learnt["contrast"])
 
 
-def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, float]:
+def _vote(sample: _Sample, model: PairModel) -> tuple[float, float]:
     """Return the gap with most votes within the search range, and its significance.
 
     Each combination counts by the log odds of its appearance, at most e^6 for one.
     """
     grid = np.arange(-MOST_BIAS_PX, MOST_BIAS_PX + 0.125, 0.25)
-    density = np.zeros(len(grid))
-    for g in geometries:
-        near = np.abs(g.gap_px) < MOST_BIAS_PX + 5
-        odds = appearance_log_odds(g, model)
-        odds += prior_log_odds(np.array(g.gap_px.shape), model.unmatched_share)
-        share = 1 / (1 + np.exp(-np.clip(odds + np.log(model.span_px / 4), -30.0, 30.0)))
-        kernel = np.exp(-0.5 * (g.gap_px[near][:, None] - grid) ** 2)
-        density += np.sum(share[near][:, None] * kernel, axis=0)
+    odds = np.clip(sample.log_odds(model) + np.log(model.span_px / 4), -30.0, 30.0)
+    share, gap, density = 1 / (1 + np.exp(-odds)), sample.geometry.gap_px, np.zeros(len(grid))
+    for one in sample.by_frame():
+        density += share[one] @ np.exp(-0.5 * (gap[one, None] - grid) ** 2)
     peak = int(np.argmax(density * np.exp(-0.5 * (grid / MOST_BIAS_PX) ** 2)))
     return float(grid[peak]), float(density[peak] / max(np.median(density), 1e-9))
 
 
-def _span_px(cameras: tuple[Camera, Camera], axis: Array) -> float:
+def _span_px(cameras: Cameras, axis: Array) -> float:
     """Length of the shared coordinate that both images cover, in px of the first."""
     spans = []
     for camera in cameras:

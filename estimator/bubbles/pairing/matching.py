@@ -16,11 +16,10 @@ pairs, and each pair has a posterior probability.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from enum import Enum, auto
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -48,14 +47,15 @@ _UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
 the major semi-axis."""
 _OUTLINE_SAMPLES = 96
 
+Cameras = tuple[Camera, Camera]
+
 
 @dataclass(frozen=True)
-class View:
-    """Hold the N detections of one camera, as `pair_geometry` compares them.
+class View(Rows):
+    """Hold the N detections of one camera, as `compared` takes them.
 
     The shared axis is the common perpendicular of both cameras' optical axes.
 
-    camera : the camera.
     uv_px, covariance_px2 : (N, 2) centres (px) and their (N, 2, 2) covariances (px^2).
     origin_mm, direction : (N, 3) origins (mm) and unit directions of the rays in the rig frame.
     mm_by_px : (N, 2, 2) derivative of a point at depth 0 in the camera's frame (mm) by the pixel.
@@ -67,58 +67,42 @@ class View:
     scatter_factor : (N,) factor on the scatter of the gap, above 1 for detections with some flags.
     """
 
-    camera: Camera
     uv_px: Array
+    covariance_px2: Array
     origin_mm: Array
     direction: Array
     mm_by_px: Array
-    covariance_px2: Array
     middle_mm: Array
     log_size: Array
     log_contrast: Array
     scatter_factor: Array
 
-    def __len__(self) -> int:
-        return len(self.scatter_factor)
-
-    def of(self, rows: slice | Ints | tuple[slice | None, ...] | None) -> View:
-        """Return some of the detections, or all of them with one more axis."""
-        arrays = [getattr(self, field.name)[rows] for field in fields(self)[1:]]
-        return View(self.camera, *arrays)
-
 
 @dataclass(frozen=True)
-class PairGeometry:
+class PairGeometry(Rows):
     """Compare first with second detections, in arrays of any shape (...).
 
-    views : the detections of both cameras, with shapes that broadcast to this one.
     gap_px : (...) position of the first minus that of the second along the shared axis, in px of
         the first image, including any bias. It is positive along +u or +v of this image, whichever
         is nearer to the axis.
     variance_px2 : (...) variance of the gap that follows from the detections' covariances.
     points_mm : (..., 3) points midway between the two rays, in the rig frame (mm).
-    size : (..., 2) logarithms of the ratios first / second of height and width.
-    contrast : (..., 1) logarithm of the ratio first / second of the contrast.
-    mm_per_px : (...) length of one pixel of the gap (mm).
+    size, size_sum : (..., 2) differences and sums of the logarithms of height and width.
+    contrast, contrast_sum : (..., 1) difference and sum of the logarithm of the contrast.
     scatter_factor : (...) the larger of both detections' factors.
     """
 
-    views: tuple[View, View]
     gap_px: Array
     variance_px2: Array
     points_mm: Array
     size: Array
+    size_sum: Array
     contrast: Array
-    mm_per_px: Array
+    contrast_sum: Array
     scatter_factor: Array
 
-    def of(self, keep: Ints) -> PairGeometry:
-        """Return some of the pairs of a geometry with the shape (E,)."""
-        arrays = [getattr(self, field.name)[keep] for field in fields(self)[1:]]
-        return PairGeometry((self.views[0].of(keep), self.views[1].of(keep)), *arrays)
 
-
-def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
+def shared_axis(cameras: Cameras) -> Array:
     """Return the direction of the common perpendicular of two cameras' optical axes.
 
     Returns a unit vector (3,) in the rig frame. It points along +u or +v of the first camera's
@@ -175,37 +159,24 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
         log_width = np.log(area_mm2 / np.pi) - log_height
         log_contrast = np.log(contrast)
     return View(
-        camera, uv, origin, direction, mm_by_px,
-        covariance + extra[:, None, None] * np.eye(2), middle,
+        uv, covariance + extra[:, None, None] * np.eye(2), origin, direction, mm_by_px, middle,
         _finite(np.stack([log_height, log_width], -1)), _finite(log_contrast[:, None]),
         scatter_factor,
     )  # fmt: skip
 
 
-def views_of(tables: Sequence[pd.DataFrame], camera: Camera, axis: Array) -> list[View]:
-    """Return `view_of` of several tables; all at once are quicker than one after the other."""
-    every = view_of(pd.concat(tables, ignore_index=True), camera, axis)
-    ends = np.cumsum([0, *map(len, tables)]).tolist()
-    return [every.of(slice(low, high)) for low, high in pairwise(ends)]
-
-
-def pair_geometry(first: View, second: View) -> PairGeometry:
-    """Compare each of N1 first detections with each of N2 second ones: arrays (N1, N2)."""
-    return compared(first.of(np.s_[:, None]), second.of(None))
-
-
-def compared(first: View, second: View) -> PairGeometry:
+def compared(cameras: Cameras, first: View, second: View) -> PairGeometry:
     """Compare the detections of two views, whose arrays are broadcast."""
     points, _ = midpoint(first.origin_mm, first.direction, second.origin_mm, second.direction)
     axis = cross(first.direction, second.direction)
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
-    axis *= np.sign(axis @ shared_axis((first.camera, second.camera)))[..., None]
+    axis *= np.sign(axis @ shared_axis(cameras))[..., None]
     gap = ((first.origin_mm - second.origin_mm) * axis).sum(-1)
     variance, stretch, lengths = np.zeros_like(gap), [], []
-    for sign, view in zip((1, -1), (first, second)):
-        pose = view.camera.camera_from_rig
+    for sign, camera, view in zip((1, -1), cameras, (first, second)):
+        pose = camera.camera_from_rig
         depth = points @ pose.rotation[2] + pose.translation_mm[2]
-        magnified = 1 + view.camera["kappa_per_mm"] * depth
+        magnified = 1 + camera["kappa_per_mm"] * depth
         across = ((axis @ pose.rotation.T)[..., None, :2] @ view.mm_by_px)[..., 0, :]
         across = across * magnified[..., None]
         variance += np.einsum("...i,...ij,...j", across, view.covariance_px2, across)
@@ -213,11 +184,48 @@ def compared(first: View, second: View) -> PairGeometry:
         stretch.append(np.log(magnified))
         lengths.append(np.linalg.norm(across, axis=-1))
     return PairGeometry(
-        (first, second), gap / lengths[0], variance / lengths[0] ** 2, points,
+        gap / lengths[0], variance / lengths[0] ** 2, points,
         first.log_size - second.log_size + (stretch[0] - stretch[1])[..., None],
-        first.log_contrast - second.log_contrast,
-        lengths[0], np.maximum(first.scatter_factor, second.scatter_factor),
+        first.log_size + second.log_size,
+        first.log_contrast - second.log_contrast, first.log_contrast + second.log_contrast,
+        np.maximum(first.scatter_factor, second.scatter_factor),
     )  # fmt: skip
+
+
+_COMBINATIONS_AT_ONCE = 50_000
+
+
+def near_pairs(
+    cameras: Cameras,
+    views: tuple[View, View],
+    counts: Ints,
+    near: Callable[[PairGeometry], Bools],
+) -> tuple[PairGeometry, Ints, Ints]:
+    """Compare all detections of each of F frames, and keep pairs with gaps that are small enough.
+
+    views : of all detections, which follow each other frame by frame. counts : (F, 2) of the
+    frames. near : says which pairs are kept.
+
+    Returns E pairs, ascending by frame and first detection; their rows (E, 2) among all detections,
+    and their frames (E,).
+    """
+    combinations = counts.prod(1)
+    part = np.cumsum(combinations) // _COMBINATIONS_AT_ONCE
+    kept, starts = [], np.cumsum(counts, axis=0) - counts
+    for one in np.unique(part):
+        frames = np.flatnonzero(part == one)
+        frame = np.repeat(frames, combinations[frames])
+        first = np.cumsum(combinations[frames]) - combinations[frames]
+        at = np.arange(len(frame)) - np.repeat(first, combinations[frames])
+        rows = starts[frame] + np.stack(np.divmod(at, counts[frame, 1]), -1)
+        every = compared(cameras, *(v.take(i) for v, i in zip(views, rows.T)))
+        good = near(every)
+        kept.append((every.take(good), rows[good], frame[good]))
+    if not kept:
+        none = np.zeros((0, 2), np.int64)
+        return compared(cameras, *(v.take(none[:, 0]) for v in views)), none, none[:, 0]
+    pairs, rows_of, frames_of = zip(*kept)
+    return PairGeometry.concat(pairs), np.concatenate(rows_of), np.concatenate(frames_of)
 
 
 def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
@@ -293,25 +301,6 @@ def _finite(values: Array) -> Array:
 
 NEGLIGIBLE = -9.0
 """Log odds below which a pair is never considered: its probability stays under exp(-9)."""
-
-
-def marginals(log_odds: Array, negligible: float = NEGLIGIBLE) -> Array:
-    """Compute the posterior probability of each pair.
-
-    log_odds : (N1, N2) log odds of each pair of a first and a second detection.
-    negligible : pairs with smaller log odds get the probability 0.
-
-    Returns (N1, N2) probabilities. They are exact per connected component with up to 11 detections
-    beside those of the camera with the most (sum over all sets by dynamic programming over
-    subsets); so are those of larger groups. Of a larger component the least likely pairs are left
-    out, one unit of log odds after the other, until it falls apart.
-    """
-    from telerig.estimator.bubbles.pairing import kernels
-
-    odds = np.asarray(log_odds, float)
-    rows = np.stack(np.unravel_index(np.arange(odds.size), odds.shape), -1)
-    found = kernels.marginals(odds.ravel(), rows, np.array(odds.shape), negligible)
-    return np.asarray(found.reshape(odds.shape))
 
 
 @dataclass(frozen=True)
@@ -482,50 +471,11 @@ _UNKNOWN_SIZE = 2.0
 _RARE, _FREEDOM = 2.5, 6.0
 
 
-@dataclass(frozen=True)
-class Prediction(Rows):
-    """Hold where K tracks are expected in a frame.
-
-    ids : (K,) numbers of the tracks.
-    points_mm, covariance_mm2 : (K, 3) expected positions in the rig frame (mm) and their (K, 3, 3)
-        covariances (mm^2).
-    d_eq_mm : (K,) equivalent diameters of the bubbles (mm).
-    """
-
-    ids: Ints
-    points_mm: Array
-    covariance_mm2: Array
-    d_eq_mm: Array
-
-
 def unbiased(geometry: PairGeometry, model: PairModel) -> tuple[Array, Array]:
     """Return gaps (px) less the model's bias, and their variances (px^2)."""
     bias, variance = model.bias(geometry.points_mm)
     own = geometry.variance_px2 + variance + (model.scatter_px * geometry.scatter_factor) ** 2
     return geometry.gap_px - bias, own
-
-
-def common_shift(geometry: PairGeometry, model: PairModel) -> tuple[Array, float]:
-    """Estimate the shift that all gaps of a frame share.
-
-    geometry : all combinations of N1 first and N2 second detections.
-
-    Returns the log odds (N1, N2) of all pairs without tracks, and the shift (px). The shift starts
-    as unknown within ``model.frame_px`` and is then the mean over the pairs by their probabilities,
-    with that scatter as its prior.
-    """
-    from telerig.estimator.bubbles.pairing import kernels
-
-    counts = np.array(geometry.gap_px.shape)
-    appearance = appearance_log_odds(geometry, model)
-    appearance += prior_log_odds(counts, model.unmatched_share)
-    rows = np.stack(np.unravel_index(np.arange(appearance.size), appearance.shape), -1)
-    gap, variance = unbiased(geometry, model)
-    odds, shift, _ = kernels.common_shift(
-        gap.ravel(), variance.ravel(), appearance.ravel(), rows, counts, model.frame_px,
-        model.span_px, NEGLIGIBLE,
-    )  # fmt: skip
-    return odds.reshape(appearance.shape), shift
 
 
 def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
@@ -536,17 +486,15 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
     """
     from telerig.estimator.bubbles.pairing import kernels
 
-    first, second = geometry.views
     flagged = geometry.scatter_factor > 1
     wrong = np.where(flagged, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
-    odds = _ratio_log_odds(model.size, geometry.size, first.log_size + second.log_size, wrong)
+    odds = _ratio_log_odds(model.size, geometry.size, geometry.size_sum, wrong)
     apart = np.abs(geometry.size[..., 0] - model.size.difference[0])
     limit = max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
     odds[apart > np.where(flagged, 2 * limit, limit)] = kernels.NEVER
     odds -= np.where(np.isfinite(apart), 0.0, _UNKNOWN_SIZE)
-    contrasts = first.log_contrast + second.log_contrast
     wrong = np.full(flagged.shape, _WRONG_CONTRAST)
-    return odds + _ratio_log_odds(model.contrast, geometry.contrast, contrasts, wrong)
+    return odds + _ratio_log_odds(model.contrast, geometry.contrast, geometry.contrast_sum, wrong)
 
 
 def prior_log_odds(counts: Ints, unmatched: tuple[float, float]) -> Array:
@@ -564,16 +512,16 @@ def _ratio_log_odds(expected: LogRatioModel, ratio: Array, total: Array, wrong: 
     """Log odds (...) of properties: two noisy images of one bubble, or of two bubbles.
 
     In the axes in which scatter and population are both uncorrelated, two images of one bubble
-    have correlation 1 - scatter / 2; the log odds are those of the two normal distributions. How
-    rare a bubble is counts to ``_RARE`` standard deviations.
-    ratio, total : (..., K) differences and sums of the logarithms.
+    have correlation 1 - scatter / 2; the log odds are those of the two normal distributions, with
+    the tails of Student's t. How rare a bubble is counts to ``_RARE`` standard deviations.
+    ratio, total : (..., K) differences and sums of the logarithms; pairs with unknown ones get 0.
     wrong : (...) probability that a measurement is unrelated to the bubble.
     """
-    from telerig.estimator.bubbles.pairing import kernels
-
     axes, alike = expected.uncorrelated
-    many = ratio.shape[-1]
-    ratio = (ratio - expected.difference).reshape(-1, many)
-    total = (total - expected.means.sum(0)).reshape(-1, many)
-    odds = kernels.ratio_log_odds(ratio, total, axes, alike, wrong.ravel(), _RARE, _FREEDOM)
-    return np.asarray(odds.reshape(wrong.shape))
+    apart = np.square((ratio - expected.difference) @ axes)
+    own = np.square(np.clip((total - expected.means.sum(0)) @ axes / 2, -_RARE, _RARE))
+    odds = own @ (alike / (1 + alike)) + apart.sum(-1) / 4 - np.log1p(-np.square(alike)).sum() / 2
+    tails = np.log1p(apart @ (0.5 / (1 - alike)) / _FREEDOM)
+    odds += np.log1p(-wrong) - (_FREEDOM + len(alike)) / 2 * tails
+    known = np.isfinite(odds)
+    return np.where(known, np.logaddexp(np.where(known, odds, 0.0), np.log(wrong)), 0.0)

@@ -11,6 +11,7 @@ from matching_scenes import Array, match_pairs, table
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing import kernels
+from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.bubbles.pairing.groups import (
     RigModel,
     best_groups,
@@ -19,7 +20,7 @@ from telerig.estimator.bubbles.pairing.groups import (
     match_tables,
 )
 from telerig.estimator.bubbles.pairing.learning import default_model, learn_rig
-from telerig.estimator.bubbles.pairing.matching import NEGLIGIBLE, Prediction
+from telerig.estimator.bubbles.pairing.matching import NEGLIGIBLE
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

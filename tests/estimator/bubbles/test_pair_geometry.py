@@ -6,10 +6,11 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
-from matching_scenes import Array, geometry, rig, table
+from matching_scenes import Array, geometry, rig, table, views
 
 from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONIC_COLUMNS, HARMONICS
-from telerig.estimator.bubbles.pairing.matching import marginals, outline_extent
+from telerig.estimator.bubbles.pairing import kernels
+from telerig.estimator.bubbles.pairing.matching import NEGLIGIBLE, outline_extent
 from telerig.rig.pose import Pose
 
 # Geometry
@@ -54,17 +55,17 @@ def test_an_ellipsoid_has_one_height_in_both_views(angle_deg: float) -> None:
         turn = Pose.from_rotvec(rng.normal(0, 1, 3)).rotation
         body = turn @ np.diag(rng.uniform(0.4, 1.6, 3) ** 2) @ turn.T
         point = rng.uniform(-10, 10, (1, 3))
-        views = []
+        tables = []
         for camera in cameras:
             to_pixel = 20.0 * camera.camera_from_rig.rotation[:2]
             values, vectors = np.linalg.eigh(to_pixel @ body @ to_pixel.T)
             angle = np.arctan2(vectors[1, 1], vectors[0, 1])
             semi_axes = [[np.sqrt(values[1]), np.sqrt(values[0])]]
-            views.append(table(camera.project(point), semi_axes, angle=angle))
-        found = geometry(views[0], views[1], cameras)
+            tables.append(table(camera.project(point), semi_axes, angle=angle))
+        found = geometry(*tables, cameras)
         assert found.size[0, 0, 0] == pytest.approx(0, abs=1e-12)
         assert found.gap_px[0, 0] == pytest.approx(0, abs=1e-9)
-        half = np.exp(geometry(views[0], views[0], cameras).views[0].log_size[0, 0, 0])
+        half = np.exp(views(*tables, cameras)[0].log_size[0, 0])
         assert half == pytest.approx(np.sqrt(body[1, 1]), rel=1e-12)
 
 
@@ -92,6 +93,12 @@ def test_extent_with_harmonics_is_that_of_the_dense_outline() -> None:
 
 
 # Probabilities
+
+
+def marginals(log_odds: Array) -> Array:
+    rows = np.stack(np.unravel_index(np.arange(log_odds.size), log_odds.shape), -1)
+    found = kernels.marginals(log_odds.ravel(), rows, np.array(log_odds.shape), NEGLIGIBLE)
+    return np.asarray(found.reshape(log_odds.shape))
 
 
 def enumerated(log_odds: Array) -> Array:

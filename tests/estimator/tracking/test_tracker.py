@@ -10,7 +10,7 @@ import pytest
 from tracker_runs import STILL, UP, Array, cameras, frame_of, kinds, run
 
 from telerig.errors import InputError
-from telerig.estimator.tracking.filter import ANYWHERE_MM, FrameMeasurements, TrackerSettings
+from telerig.estimator.tracking.filter import FrameMeasurements, TrackerSettings
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.triangulation import on_rays
 
@@ -166,7 +166,7 @@ def test_one_camera_alone_keeps_a_track_alive(seeing: int) -> None:
     for i, point in enumerate(points):
         alone = 30 <= i < 110
         uv = camera.project(point[None])
-        seen = on_rays(camera, uv, 0.04 * np.eye(2)[None], np.zeros(3), ANYWHERE_MM)
+        seen = on_rays(camera, uv, 0.04 * np.eye(2)[None])
         ray = FrameMeasurements.create(*seen[:2], alone=[True])
         final += tracker.update(i, i / 500, ray if alone else frame_of([point]), 0.0).final
         if alone:

@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from batch_dataset import make_results
+from compiled_once import compile_one_at_a_time
 from made_once import made_once
 from run_files import LEFT, RIG, RIGHT, write_images
 from undrawn_pages import undrawn_pages
@@ -43,6 +44,7 @@ HALF_VOLUME_MM = 15.0
 if "PYTEST_XDIST_WORKER" in os.environ:
     # a worker of xdist has a thread that `threading` does not count: a copy of it can hang
     parallel.can_fork = lambda: False
+    compile_one_at_a_time()
 
 
 def rigidly_aligned(points: Any, onto: Any) -> Any:

@@ -50,7 +50,7 @@ class Swarm:
 def swarm(tmp_path_factory: pytest.TempPathFactory) -> Swarm:
     folder = tmp_path_factory.mktemp("share") / "swarm"
     rng = np.random.default_rng(1)
-    config = run_preset("swarm", frames=12)
+    config = run_preset("swarm", frames=12, bubbles=8)
     dataset = telerig.simulate(config, rng=rng, out=folder, images=False)
     calibration = telerig.calibrate(dataset, model="radial")
     return Swarm(dataset, calibration, telerig.track(dataset.runs["swarm"].load(), calibration))

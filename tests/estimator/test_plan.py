@@ -64,8 +64,8 @@ def calibration() -> telerig.Calibration:
     ("added", "position_um", "velocity_mm_s", "verdict"),
     [
         ({}, 39.0, 3.9, "UNRESOLVED"),
-        ({"bubbles": 5}, 32.0, 3.1, "PARTIAL"),
-        ({"arms": True}, 14.7, 2.23, "RESOLVED"),
+        pytest.param({"bubbles": 5}, 32.0, 3.1, "PARTIAL", marks=pytest.mark.slow),
+        pytest.param({"arms": True}, 14.7, 2.23, "RESOLVED", marks=pytest.mark.slow),
         ({"marks": 4}, 13.9, 2.23, "RESOLVED"),
     ],
 )

@@ -18,12 +18,11 @@ from telerig.estimator.calibration.result.calibration import calibration_from_ca
 from telerig.io.exchange.export.netcdf import write_netcdf
 from telerig.io.exchange.export.opencv import camera_matrices
 from telerig.io.exchange.export.run_results import read_results
-from telerig.io.results.findings import Code
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import POSE_COMPONENTS, Triangulation, triangulate_views
-from telerig.short_text import LONGEST, ShortText
+from telerig.short_text import ShortText
 
 
 class Chain(NamedTuple):
@@ -41,7 +40,12 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Chain:
     calibration = calibration_from_cameras(list(true_cameras(config.calibration).values()))
     run = dataset.runs["rise"].load()
     tracks = telerig.track(run, calibration)
-    return Chain(dataset, calibration, tracks, telerig.smooth(tracks, calibration, stage=run))
+    return Chain(
+        dataset,
+        calibration,
+        tracks,
+        telerig.smooth(tracks, calibration, stage=run, model="default"),
+    )
 
 
 def points(calibration: telerig.Calibration, count: int = 3) -> Triangulation:
@@ -77,29 +81,6 @@ def test_tables_for_notebooks_are_well_formed_and_escaped(chain: Chain) -> None:
     parser = Tags()
     parser.feed(chain.dataset._repr_html_())
     assert parser.open_ == 0 and "<tank & co>" in parser.text
-
-
-def test_texts_of_results_without_rows(chain: Chain) -> None:
-    empty = telerig.Tracks(
-        "none", chain.tracks.detections[:0], chain.tracks.table[:0], chain.tracks.events[:0]
-    )
-    assert "0 tracks" in repr(empty) and len(empty.to_xarray()["rowSize"]) == 0
-    none = replace(
-        chain.smoothing.tables, trajectories=chain.smoothing.trajectories[:0], states={}
-    )  # fmt: skip
-    smoothing = replace(chain.smoothing, tables=none, verdict={})
-    assert "not judged" in repr(smoothing) and "0 bubbles" in repr(smoothing)
-    nothing = Triangulation(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, 3, 3)))
-    assert repr(nothing) == "Triangulation of 0 points" and nothing.to_pandas().empty
-    blind = replace(points(chain.calibration), points_mm=np.full((3, 3), np.nan))
-    assert "placed  none" in repr(blind)
-
-
-def test_long_reasons_are_cut(chain: Chain) -> None:
-    faults = ("a fault " * 100, "another")
-    findings = tuple(Code.EARLIER_REJECTION.found(text=text) for text in faults)
-    text = repr(replace(chain.calibration, findings=findings))
-    assert max(map(len, text.splitlines())) < LONGEST + 20 and "and 1 more" in text
 
 
 def test_a_smoothing_read_again_is_the_one_that_was_saved(chain: Chain, tmp_path: Path) -> None:

@@ -191,14 +191,6 @@ def test_depth_gauge_residual(rotvec: list[float]) -> None:
     np.testing.assert_allclose(jacobian, expected, atol=1e-6)
 
 
-def test_depth_gauge_is_zero_where_the_axes_come_closest() -> None:
-    """Axes z and a second one: the foot points of their common perpendicular span the offset."""
-    turn = rotation_from_rotvec([0.2, 1.4, 0.1])
-    across = np.cross([0.0, 0.0, 1.0], turn[:, 2])
-    value, _ = depth_gauge_residual(pose([0.2, 1.4, 0.1], 0.37 * across), 1.0)
-    np.testing.assert_allclose(value, 0, atol=1e-15)
-
-
 @pytest.fixture(scope="module")
 def problem(scene: Any) -> tuple[Problem, State]:
     made = scene("near_telecentric", 4, views=6)

@@ -12,7 +12,6 @@ from telerig.errors import InputError
 from telerig.factors.state_space import (
     Component,
     Steps,
-    block_diagonal,
     broad_band,
     discretise,
     distinct_steps,
@@ -72,14 +71,6 @@ def test_steps_are_exact(component: Component, dt: float) -> None:
     white = steps.whitener[0, 0] @ steps.covariance[0, 0] @ steps.whitener[0, 0].T
     np.testing.assert_allclose(white, np.eye(component.size), atol=1e-8)
     assert steps.log_det[0, 0] == pytest.approx(np.linalg.slogdet(steps.whitener[0, 0])[1])
-
-
-@pytest.mark.parametrize("component", ALL, ids=lambda c: c.name)
-def test_two_steps_are_one(component: Component) -> None:
-    half, whole = steps_of(component, 0.05), steps_of(component, 0.1)
-    phi, q = half.transition[0, 0], half.covariance[0, 0]
-    np.testing.assert_allclose(phi @ phi, whole.transition[0, 0], atol=1e-9)
-    np.testing.assert_allclose(phi @ q @ phi.T + q, whole.covariance[0, 0], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("component", SETTLING, ids=lambda c: c.name)
@@ -152,14 +143,6 @@ def test_an_inertial_path_is_sawfords_process_at_all_times(inertia_s: float) -> 
     np.testing.assert_allclose(state, [5.0 + 280 * 0.02, 280.0, 0.0], atol=1e-5)
 
 
-def test_a_short_inertia_leaves_the_path_and_its_oscillations() -> None:
-    """The position after a step from a known state has the variance of the processes themselves."""
-    swing, step = oscillator(2.0, 6.0, 0.03), 0.05
-    steps = steps_of(inertial_path(10.0, 0.3, 1e-5, [swing]), step)
-    apart = [steps_of(c, step).covariance[0, 0, 0, 0] for c in (ou_velocity(10.0, 0.3), swing)]
-    assert steps.covariance[0, 0, 0, 0] == pytest.approx(sum(apart), rel=1e-2)
-
-
 def test_irregular_steps_each_get_their_own(rng: np.random.Generator) -> None:
     dt = rng.uniform(1e-3, 5e-3, 40)
     dt[7] = dt[3]
@@ -185,13 +168,6 @@ def test_elimination_basis_makes_pivots_the_identity() -> None:
     ahead = steps.whitener[0, 0] @ steps.transition[0, 0] @ basis
     prior = basis.T @ np.linalg.solve(component.start_covariance, basis)
     np.testing.assert_allclose(ahead.T @ ahead + prior, np.eye(5), atol=1e-5)
-
-
-def test_block_diagonal() -> None:
-    blocks = [np.ones((3, 2, 2)), 2 * np.ones((3, 1, 1))]
-    whole = block_diagonal(blocks)
-    assert whole.shape == (3, 3, 3)
-    np.testing.assert_array_equal(whole[1], [[1, 1, 0], [1, 1, 0], [0, 0, 2]])
 
 
 def test_refusals() -> None:

@@ -54,7 +54,7 @@ def _dataset(folder: Path, rng: np.random.Generator) -> None:
     run = telerig.load_run(folder / "runs" / "S2")
     tracks = telerig.track(run, calibration)
     tracks.save(results / "S2")
-    telerig.smooth(tracks, calibration, stage=run.stage).save(results / "S2")
+    telerig.smooth(tracks, calibration, stage=run.stage, model="default").save(results / "S2")
     (results / "S2" / "results.h5").unlink()
     record = {"command": "track", "telerig": "1", "seconds": {"all": 1.0}, "options": {},
               "inputs_sha256": {"runs/S2/frames.csv": "0" * 64}}  # fmt: skip

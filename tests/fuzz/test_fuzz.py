@@ -8,7 +8,7 @@ import pytest
 from fuzz_corpus import write_corpus
 from fuzz_driver import run_cases
 
-CASES = 1_000
+CASES = 300
 SHARDS = 20
 LONG_CASES = 200_000
 

@@ -1,4 +1,4 @@
-"""The demo's last part: smoothed from tables of the same run, which takes seconds."""
+"""The demo's last part, smoothed from tables of the same run."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from telerig.io.simulation.simulate import simulate
 from telerig.scripts.demo import _config, smooth_and_compare, track_and_compare
 
 
+@pytest.mark.slow
 def test_the_demo_resolves_its_shake_and_states_its_errors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

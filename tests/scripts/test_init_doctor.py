@@ -12,7 +12,6 @@ import pytest
 from target_pictures import draw, pixel_from_mm
 from typer.testing import CliRunner
 
-from telerig.errors import InputError
 from telerig.estimator.doctor import checks as doctor
 from telerig.estimator.doctor.checks import check_dataset, check_installation, check_ports
 from telerig.io.dataset.new_dataset import NewCamera, new_dataset
@@ -283,11 +282,6 @@ def test_the_command_prints_json_and_its_exit_code_says_whether_all_is_well(data
     bad = _asked("doctor", str(tmp_path / "nowhere"))
     assert bad.exit_code == 1
     assert "FAILURE dataset" in bad.output
-
-
-def test_bad_values_raise_in_the_library_too(tmp_path):
-    with pytest.raises(InputError, match="image size"):
-        new_dataset(tmp_path / "x", [NewCamera("left", (0, 5))])
 
 
 def test_the_time_and_memory_of_a_run_are_estimated(data: Path) -> None:

@@ -55,8 +55,10 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-@pytest.mark.parametrize("size_bytes", [100, 6_000])
+@pytest.mark.parametrize(
+    ("name", "size_bytes"),
+    [*((name, 6_000) for name in COMMANDS), ("track", 100), ("trackpy", 100), ("opencv", 100)],
+)
 def test_a_full_disk_leaves_the_old_results_and_says_what_to_do(
     name: str, size_bytes: int, tank: Path, tmp_path: Path
 ) -> None:
@@ -128,7 +130,7 @@ def check_interrupts(moments_s: list[float], tank: Path, tmp_path: Path) -> None
 
 
 def test_ctrl_c_at_any_moment_prints_no_traceback(tank: Path, tmp_path: Path) -> None:
-    check_interrupts([0.05, 0.5, 1.0, 2.0], tank, tmp_path)
+    check_interrupts([0.05, 1.0], tank, tmp_path)
 
 
 @pytest.mark.slow

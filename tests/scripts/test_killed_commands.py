@@ -155,13 +155,16 @@ def _words(found: list[Any], got: Any) -> str:
     return "old" if got == found[0] else "new" if got == found[-1] else "a mixture"
 
 
-@pytest.mark.parametrize("command", list(READERS))
+@pytest.mark.parametrize(
+    "command", ["calibrate", "track", pytest.param("smooth", marks=pytest.mark.slow), "batch"]
+)
 def test_readers_never_get_a_mixture(commands: Commands, command: str) -> None:
     for name, seen in outcomes(commands, command, READERS[command]).items():
         order = [what for i, what in enumerate(seen) if i == 0 or seen[i - 1] != what]
         assert order == ["old", "refused", "new"], (name, seen)
 
 
+@pytest.mark.slow
 def test_a_new_tracking_leaves_no_old_trajectories_for_export(commands: Commands) -> None:
     """The tracks are old, new or a mixture; the trajectories are exported only with the old."""
     folder = commands.folder("track")

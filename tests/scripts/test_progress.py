@@ -32,19 +32,6 @@ def test_lines_say_how_many_of_all_how_fast_and_how_long(
     assert stage.words() == "detection 29 s, pair model 300 s"
 
 
-def test_a_share_is_said_in_percent(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    with console.progress(quiet=False) as stage:
-        for share in (0.0, 0.16, 1.0):
-            stage("smoothing 2 bubbles in 300 frames", share, 1)
-            now[0] += 16.0
-    lines = capsys.readouterr().err.replace("smoothing 2 bubbles in 300 frames", "it").splitlines()
-    assert lines == ["it: 0 %", "it: 16 %, 16 s so far, 84 s left", "it: 100 %, 32 s so far"]
-
-
 def test_quiet_says_nothing_but_takes_the_time(capsys: pytest.CaptureFixture[str]) -> None:
     with console.progress(quiet=True) as stage:
         stage("tracks", 1, 2)

@@ -85,13 +85,3 @@ def test_the_page_begins_with_it_and_smoothing_warns(data: Path) -> None:
         assert code == 0
         assert "stale" not in said
     assert telerig("export", data, "--to", "trackpy")[0] == 0
-
-
-def test_a_cut_table_is_used_with_a_warning(data: Path) -> None:
-    tracks = data / "results" / "rise" / "tracks.csv"
-    lines = tracks.read_text().splitlines(keepends=True)
-    tracks.write_text("".join(lines[:-4]))
-    code, said = again("smooth", data)
-    assert code == 0
-    rows = len(lines) - 1
-    assert f"has {rows - 4} of the {rows} rows that telerig wrote" in " ".join(said.split())

@@ -1,4 +1,4 @@
-"""Pictures of a target, drawn by supersampling."""
+"""The plate of the tests, and pictures of a target, drawn by supersampling."""
 
 from __future__ import annotations
 
@@ -9,6 +9,15 @@ from scipy.ndimage import gaussian_filter
 from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
+
+DESIGN = Target(
+    rows=3,
+    columns=5,
+    pitch_mm=(7.0, 7.0),
+    dot_diameter_mm=2.4,
+    marks=((1, 2), (1, 3), (0, 2)),
+    mark_diameter_mm=3.6,
+)
 
 
 def pixel_from_mm(scale: float, tilt_deg: float, roll_deg: float, mirrored: bool) -> Array:

@@ -12,7 +12,6 @@ import pytest
 from batch_dataset import make_dataset, outcome_here
 from typer.testing import CliRunner
 
-from telerig.errors import InputError
 from telerig.estimator.batch import batch as work
 from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
 from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
@@ -201,11 +200,6 @@ def test_run_refuses_before_work_begins(datasets, words):
     assert result.exit_code == 2
     assert words[1] in result.output
     assert not (datasets[0] / "results").exists()
-
-
-def test_unknown_runs_are_an_error_of_the_library_too(datasets):
-    with pytest.raises(InputError, match="fall"):
-        jobs_of(datasets, only=["fall"])
 
 
 def test_a_run_named_calibration_does_not_mix_with_the_calibration(tmp_path):

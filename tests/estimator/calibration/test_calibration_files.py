@@ -75,18 +75,6 @@ def test_round_trip(calibration: Calibration, saved: Path) -> None:
         np.testing.assert_array_equal(loaded.joint_covariance, calibration.joint_covariance)
 
 
-def test_the_loaded_rig_measures_the_same(calibration: Calibration, saved: Path) -> None:
-    loaded = load_calibration(saved)
-    points = np.random.default_rng(0).uniform(-10, 10, (20, 3))
-    pixels = [calibration.project(c, points) for c in (0, 1)]
-    np.testing.assert_array_equal(loaded.project("right", points), pixels[1])
-    for method in ("ml", "midpoint"):
-        a, b = (c.triangulate(*pixels, method=method) for c in (calibration, loaded))
-        np.testing.assert_array_equal(a.points_mm, b.points_mm)
-        np.testing.assert_array_equal(a.covariance_mm2, b.covariance_mm2)
-    assert loaded.report() == calibration.report()
-
-
 def test_a_second_save_of_the_loaded_is_the_same_file(saved: Path, tmp_path: Path) -> None:
     load_calibration(saved).save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_text() == (saved / "calibration.json").read_text()
@@ -119,20 +107,6 @@ def test_a_folder_is_an_input_by_its_file(saved: Path) -> None:
     folder = saved if saved.is_dir() else saved.parent
     _, used = calibration_for(folder, [folder])
     assert used == [folder / "calibration.json"] and used[0].is_file()
-
-
-def test_tables(calibration: Calibration, saved: Path) -> None:
-    dots, residuals = (pd.read_csv(saved / f"{n}.csv") for n in ("dots", "residuals"))
-    assert list(dots.columns)[:7] == ["view", "camera", "dot", "row", "column", "u_px", "v_px"]
-    assert list(residuals.columns) == [
-        "view", "camera", "dot", "row", "column", "u_px", "v_px", "du_px", "dv_px", "weight",
-        "reason",
-    ]  # fmt: skip
-    assert len(residuals) == calibration.statistics["dots_measured"]
-    out = residuals["weight"] < 1
-    assert out.sum() > 0
-    assert residuals.loc[out, "reason"].str.contains("standard deviations").all()
-    assert residuals.loc[~out, "reason"].isna().all()
 
 
 def test_it_loads_without_the_full_covariance(calibration: Calibration, saved: Path) -> None:
@@ -215,13 +189,6 @@ def test_foreign_files(text: str, tmp_path: Path) -> None:
         load_calibration(file)
 
 
-def test_binary_file(tmp_path: Path) -> None:
-    file = tmp_path / "calibration.json"
-    file.write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match=r"calibration\.json: (cannot|garbles|lacks)"):
-        load_calibration(file)
-
-
 def edited(folder: Path, change: Any) -> Path:
     file = folder / "calibration.json"
     data = json.loads(file.read_text())
@@ -282,12 +249,6 @@ def test_cameras_and_covariances_that_cannot_be(change: Any, words: str, saved: 
     change(content)
     (saved / "calibration.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=words):
-        load_calibration(saved)
-
-
-def test_damaged_covariance(saved: Path) -> None:
-    (saved / "covariance.npz").write_bytes(b"not a zip archive")
-    with pytest.raises(InputError, match=r"covariance\.npz"):
         load_calibration(saved)
 
 

@@ -15,7 +15,6 @@ from telerig.estimator.calibration.lens.choice import (
     Step,
     considered_covariance,
     considered_groups,
-    considered_words,
 )
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver import covariance
@@ -70,12 +69,6 @@ def test_what_is_hardly_chance_is_considered_and_what_no_view_determines_is_not(
         vague = choice(left_out(0, ("aspect", "skew"), gain, undetermined=True))
         assert considered_groups(vague, 2) == (NONE, NONE)
     assert considered_groups(None, 2) == (NONE, NONE)
-
-
-def test_the_words_name_what_is_considered() -> None:
-    assert considered_words((NONE, NONE), ("left", "right")) == ""
-    words = considered_words((NONE, STRETCH | {"k2"}), ("left", "right"))
-    assert "aspect, skew, k2 of camera 'right'" in words
 
 
 @pytest.fixture(scope="module")

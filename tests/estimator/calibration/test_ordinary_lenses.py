@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.io.results.calibration_words import telecentricity_words
 from telerig.io.results.findings import Code
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX
@@ -110,22 +109,6 @@ def test_a_smooth_error_of_the_lens_model_widens_the_standard_deviations(seeds: 
                 squares.append((error / found.sd(f"{camera.name}.{name}")) ** 2)
     assert max(squares) < 4.0**2
     assert 0.1 < np.mean(squares) < 3.0
-
-
-def test_words_of_lenses_that_are_telecentric_and_not_quite() -> None:
-    lens = {"sd_per_mm": 1e-6, "depth_mm": 20.0, "perspective": 1e-3}
-    words = telecentricity_words({
-        "telecentricity": {
-            "left": {"change_per_mm": 1e-5, **lens}, "right": {"change_per_mm": -2e-4, **lens},
-        }
-    })  # fmt: skip
-    assert words == [
-        "camera left is telecentric: its scale changes by 0.02 ± 0.002 % over the views' 20 mm of "
-        "depth",
-        "camera right is not quite telecentric: its scale changes by -0.4 ± 0.002 % over the "
-        "views' 20 mm of depth",
-    ]
-    assert telecentricity_words({}) == []
 
 
 def test_linked_parameters_make_one_finding_a_group() -> None:

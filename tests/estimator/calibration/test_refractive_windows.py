@@ -27,7 +27,6 @@ from telerig.estimator.calibration.calibrate import run_calibration
 from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.refractive_windows import (
     behind_windows,
-    model_error_um,
     window_findings,
     window_warnings,
     with_windows,
@@ -312,12 +311,6 @@ def test_a_perspective_lens_from_air_into_water(scene: Callable[..., Any]) -> No
         seen = calibration.triangulate(uv[0], uv[1], sigma_px=0.01).points_mm - points
         wrong[calibration is air] = np.abs(seen - seen.mean(0)).max()
     assert wrong[False] < 2e-3 < 0.3 < wrong[True]
-
-
-def test_one_camera_is_told_too(in_air: Calibration) -> None:
-    both = in_air.cameras
-    alone = model_error_um([replace(both[0], wall=None)], both[:1])
-    assert alone == pytest.approx(SHEAR_UM / 30 * 0.5 * 0.6 * 512 / 10.0, rel=0.05)
 
 
 def test_the_smoother_sees_through_the_wall(in_air: Calibration) -> None:

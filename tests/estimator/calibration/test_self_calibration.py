@@ -72,19 +72,6 @@ def test_dense_target(scene: Any) -> None:
     assert made.space_rms_um(calibration) < 1.0
 
 
-def test_unknown_dots(paper: Any) -> None:
-    """Places good to 3 mm only: the shape of the target comes from the images."""
-    made = replace(paper, target=replace(paper.target, print_sigma_mm=3.0))
-    dots = made.dots.copy()
-    calibration = made.with_dots(dots).calibrate("radial")
-    assert calibration.verdict["status"] == "GOOD"
-    assert made.space_rms_um(calibration) < 1.0
-    truth = np.array([made.true_dots_mm[int(d)] for d in calibration.dot_ids])
-    offset = calibration.target_points_mm - truth
-    error = offset - offset.mean(0)
-    assert 1e3 * np.sqrt((error**2).mean()) < 2.0
-
-
 def test_unknown_dots_of_another_shape(paper: Any) -> None:
     """The nominal table may be off by more than a millimetre: only its order matters."""
     rng = np.random.default_rng(0)
@@ -202,14 +189,6 @@ def test_what_dots_may_do(dots_free: str, scene: Any) -> None:
 
 
 # --- the mirror twin --------------------------------------------------------------------------
-
-
-def test_both_twins_cost_the_same_and_are_shown(paper: Any) -> None:
-    calibration = paper.calibrate("radial")
-    twin = calibration.twin
-    assert twin["cost"] == pytest.approx(twin["other_cost"], rel=1e-6)
-    assert "0.9 degrees from the solution that is kept, 179" in twin["words"]
-    assert "mirror ambiguity" in calibration.report()
 
 
 def test_the_nominal_side_decides(paper: Any) -> None:

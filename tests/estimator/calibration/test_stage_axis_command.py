@@ -50,17 +50,6 @@ def test_calibration_json_says_axis_and_scale_with_covariance(data: Path) -> Non
     assert np.ptp(truth["position_mm"]) > 20
 
 
-def test_the_console_and_the_report_say_it(data: Path) -> None:
-    said = (data / "said.txt").read_text(encoding="utf-8")
-    assert "the encoder reads +" in said and "travel along" in said
-    from telerig.io.report.calibration.report import write_calibration_report
-
-    page = write_calibration_report(data / "results" / "calibration").read_text(encoding="utf-8")
-    assert "encoder reads too much (ppm of the travel)" in page
-    record = json.loads((data / "results" / "calibration" / "run.json").read_text("utf-8"))
-    assert any("positions.csv" in name for name in record["inputs_sha256"])
-
-
 def test_the_smoother_takes_it(data: Path) -> None:
     calibration = telerig.load_calibration(data / "results" / "calibration")
     run = load_run(data / "runs" / "rise")

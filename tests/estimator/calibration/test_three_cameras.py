@@ -27,7 +27,7 @@ from telerig.scripts.main import app
 
 PAIRS = (("left", "middle"), ("middle", "right"))
 NAMES = ("a", "b", "c", "d")
-pytestmark = pytest.mark.usefixtures("without_advice")
+pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
 
 
 def space_ratio(calibration: Any, made: Any) -> float:
@@ -217,7 +217,10 @@ def test_the_command_for_three_cameras(tmp_path: Path) -> None:
         return CliRunner().invoke(app, list(arguments))
 
     folder = tmp_path / "three"
-    assert asked("simulate", "three", "--no-images", "--out", str(folder)).exit_code == 0
+    assert (
+        asked("simulate", "three", "--no-images", "--frames", "1", "--out", str(folder)).exit_code
+        == 0
+    )
     result = asked("calibrate", str(folder), "--model", "radial", "--quiet")
     assert result.exit_code == 0, result.output
     place = folder / "results" / "calibration"

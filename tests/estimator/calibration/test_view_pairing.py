@@ -32,7 +32,9 @@ def offset(dots: pd.DataFrame, camera: str, first: int, by: int) -> pd.DataFrame
     return out.drop_duplicates(["view", "camera", "dot"], keep="last", ignore_index=True)
 
 
-@pytest.mark.parametrize(("first", "by", "views"), [(0, -1, 6), (2, 2, 8)])
+@pytest.mark.parametrize(
+    ("first", "by", "views"), [(0, -1, 6), pytest.param(2, 2, 8, marks=pytest.mark.slow)]
+)
 def test_images_under_the_names_of_other_views_are_refused(
     first: int, by: int, views: int, paper: Any
 ) -> None:

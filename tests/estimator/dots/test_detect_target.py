@@ -12,7 +12,7 @@ import pytest
 from finding_codes import codes, only
 from numpy.typing import NDArray
 from places import REAL
-from target_pictures import draw, pixel_from_mm
+from target_pictures import DESIGN, draw, pixel_from_mm
 
 import telerig
 from telerig.errors import DetectionError, InputError
@@ -32,14 +32,6 @@ Array = NDArray[np.float64]
 
 PLATE = REAL / "dic_stereo_dots"
 
-DESIGN = Target(
-    rows=3,
-    columns=5,
-    pitch_mm=(7.0, 7.0),
-    dot_diameter_mm=2.4,
-    marks=((1, 2), (1, 3), (0, 2)),
-    mark_diameter_mm=3.6,
-)
 RING = replace(DESIGN, mark_style="ring", mark_diameter_mm=None)
 PRINTED = Target(
     rows=8,

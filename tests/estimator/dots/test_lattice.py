@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -17,11 +15,9 @@ from telerig.estimator.dots.grid.lattice import (
     Cell,
     Lattice,
     apply_homography,
-    circle_from_ellipses,
     fit_affine,
     fit_homography,
     grow_lattice,
-    shape_matrix,
 )
 
 Array = NDArray[np.float64]
@@ -105,13 +101,6 @@ def test_axes_turn_as_u_and_v_and_pitch_vectors_are_the_steps() -> None:
         assert np.linalg.norm(lattice.basis_px[where[i, j], 0] - step) < 0.05 * np.linalg.norm(step)
 
 
-def test_shapes_in_pitch_units_do_not_depend_on_the_view() -> None:
-    points, shapes = seen(tilted_view(1.2, 1.0, 0.3, 1e-3) * [[20], [20], [1]], grid(7, 7), 1.4)
-    lattice = grow_lattice(points, shapes)
-    expected = np.broadcast_to(np.eye(2) * (1.4 / 7) ** 2, lattice.shape.shape)
-    np.testing.assert_allclose(lattice.shape, expected, atol=0.1 * (1.4 / 7) ** 2)
-
-
 def test_every_dot_left_out_has_its_reason() -> None:
     points, shapes = seen(np.diag([10.0, 10.0, 1.0]), grid(6, 6), 1.2)
     points[14] += [9.0, -8.0]
@@ -143,25 +132,6 @@ def test_dots_without_a_grid_are_an_error() -> None:
         grow_lattice(points, np.broadcast_to(25 * np.eye(2), (12, 2, 2)))
 
 
-def test_shape_matrix_of_an_ellipse_by_its_outline() -> None:
-    a, b, angle = 7.0, 3.0, 0.6
-    t = np.linspace(0, 2 * np.pi, 50)
-    axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    outline = np.stack([a * np.cos(t), b * np.sin(t)], -1) @ axes.T
-    inverse = np.linalg.inv(shape_matrix(a, b, angle))
-    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", outline, inverse, outline), 1, rtol=1e-12)
-
-
-def test_circle_from_ellipses_ignores_a_minority_of_odd_shapes() -> None:
-    shapes = np.concatenate(
-        [np.tile(shape_matrix(8.0, 2.0, 0.3), (9, 1, 1)), np.tile(100 * np.eye(2), (4, 1, 1))]
-    )
-    circle = circle_from_ellipses(shapes)
-    np.testing.assert_allclose(
-        circle @ shape_matrix(8.0, 2.0, 0.3) @ circle.T, np.eye(2), atol=1e-9
-    )
-
-
 def test_homography_and_affine_fits_recover_their_map() -> None:
     rng = np.random.default_rng(0)
     source = rng.uniform(-50, 50, (20, 2))
@@ -171,11 +141,3 @@ def test_homography_and_affine_fits_recover_their_map() -> None:
     homography[2] = [0, 0, 1]
     affine = fit_affine(source, apply_homography(homography, source))
     np.testing.assert_allclose(affine, homography, atol=1e-9)
-
-
-def test_1600_dots_are_fast() -> None:
-    points, shapes = seen(tilted_view(0.8, 0.4, 2.0, 1e-3) * [[6], [6], [1]], grid(40, 40), 1.2)
-    start = time.process_time()
-    lattice = grow_lattice(points, shapes)
-    assert len(lattice.index) == 1600
-    assert time.process_time() - start < 0.9

@@ -73,8 +73,8 @@ def reasons(measured: DotMeasurement, u: float, v: float, within: float = 6.0) -
 @pytest.mark.parametrize(
     ("radius", "tilt", "blur", "noise", "swap"),
     [
-        (4.0, 0.0, 0.8, 3.0, False),
-        (4.0, 65.0, 0.6, 1.5, False),
+        pytest.param(4.0, 0.0, 0.8, 3.0, False, marks=pytest.mark.slow),
+        pytest.param(4.0, 65.0, 0.6, 1.5, False, marks=pytest.mark.slow),
         (4.0, 65.0, 1.5, 3.0, True),
         (10.0, 40.0, 0.8, 3.0, True),
         (22.0, 30.0, 1.0, 1.0, False),
@@ -147,9 +147,9 @@ def test_a_slope_of_light_does_not_move_the_dots() -> None:
 @pytest.mark.parametrize(
     ("radius", "ground", "dot", "offset", "noise"),
     [
-        (3.0, 0.0, 160.0, 0.0, 3.0),
+        pytest.param(3.0, 0.0, 160.0, 0.0, 3.0, marks=pytest.mark.slow),
         (7.0, 0.0, 160.0, -12.0, 3.0),
-        (7.0, 270.0, 60.0, 0.0, 3.0),
+        pytest.param(7.0, 270.0, 60.0, 0.0, 3.0, marks=pytest.mark.slow),
         (3.0, 250.0, 60.0, 0.0, 4.0),
     ],
     ids=["black", "far below black", "white", "half white"],

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from seeds import few_or_many
+from target_pictures import DESIGN
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.grid.numbering import (
@@ -22,14 +23,6 @@ from telerig.rig.target import Target
 Array = NDArray[np.float64]
 DIRT = -(10**9)
 
-DESIGN = Target(
-    rows=3,
-    columns=5,
-    pitch_mm=(7.0, 7.0),
-    dot_diameter_mm=2.4,
-    marks=((1, 2), (1, 3), (0, 2)),
-    mark_diameter_mm=3.6,
-)
 LARGE = replace(DESIGN, rows=7, columns=12, marks=((3, 4), (3, 7), (1, 4)))
 RING = replace(LARGE, mark_style="ring")
 MISSING = replace(LARGE, mark_style="missing")
@@ -237,7 +230,7 @@ def test_symmetric_hexagonal_grids_list_every_equivalent(target: Target, order: 
     assert target.symmetry_order() == order
     assert not target.mirror_images_differ()
     labels = [tuple(label) for label in target.turns()]
-    for seed in range(10):
+    for seed in range(5):
         dots, truth = photograph(target, View(missing=0.03), np.random.default_rng([17, seed]))
         numbering = number_dots(dots, target)
         assert not numbering.ambiguous
@@ -254,16 +247,9 @@ def test_a_part_of_a_grid_without_marks_is_refused(target: Target) -> None:
         number_dots(part, target)
 
 
-def test_equivalents_are_the_half_turn_of_a_rectangle() -> None:
-    target = replace(LARGE, marks=())
-    dots, _ = photograph(target, View(missing=0, false=0), np.random.default_rng(0))
-    one, two = number_dots(dots, target).equivalents
-    np.testing.assert_array_equal(one + two, 83)
-
-
 def test_unequal_pitches_tell_rows_from_columns() -> None:
     target = replace(LARGE, rows=8, columns=8, pitch_mm=(7.0, 7.7), marks=())
-    for seed in range(25):
+    for seed in range(8):
         dots, truth = photograph(target, View(), np.random.default_rng([13, seed]))
         numbering = number_dots(dots, target)
         assert len(numbering.equivalents) == 2
@@ -273,7 +259,7 @@ def test_unequal_pitches_tell_rows_from_columns() -> None:
 @pytest.mark.parametrize("lost", [(1, 2), (1, 3), (0, 2)])
 def test_one_mark_seen_as_a_plain_dot_is_settled_or_left_open(lost: tuple[int, int]) -> None:
     ring = replace(DESIGN, mark_style="ring")
-    for seed in range(10):
+    for seed in range(5):
         dots, truth = photograph(ring, View(missing=0), np.random.default_rng([14, seed]))
         dots.loc[truth == int(ring.id_from_row_column(*lost)), "ring"] = False
         free = number_dots(dots, ring)
@@ -293,7 +279,7 @@ def test_a_tie_between_mirror_images_leaves_the_handedness_open() -> None:
 
 @pytest.mark.parametrize("target", [RING, replace(ENDLESS, mark_style="ring")])
 def test_one_false_mark_changes_nothing(target: Target) -> None:
-    for seed in range(15):
+    for seed in range(6):
         rng = np.random.default_rng([15, seed])
         dots, truth = photograph(target, View(), rng)
         row, column = target.row_column_from_id(np.maximum(truth, 0))
@@ -316,7 +302,7 @@ def test_a_false_mark_that_completes_the_mirror_image_is_a_tie() -> None:
 
 def test_a_part_of_a_bounded_target_is_numbered_from_its_marks() -> None:
     view = View(fill=1.4, off_centre=(-8.0, 0.0), tilt_deg=(0, 40), missing=0.05)
-    for seed in range(25):
+    for seed in range(8):
         dots, truth = photograph(LARGE, view, np.random.default_rng([16, seed]))
         if np.isin(LARGE.id_from_row_column(*np.transpose(LARGE.marks)), truth).all():
             assert is_right(number_dots(dots, LARGE), truth)
@@ -329,15 +315,6 @@ def test_an_unbounded_target_without_visible_marks_is_refused() -> None:
         number_dots(dots.assign(ring=False), target)
     with pytest.raises(InputError, match="no origin"):
         number_dots(dots, replace(target, marks=()))
-
-
-def test_a_lone_mark_gives_candidates_instead_of_a_guess() -> None:
-    target = replace(ENDLESS, mark_style="ring")
-    dots, truth = photograph(target, View(), np.random.default_rng(4))
-    dots["ring"] = truth == int(target.id_from_row_column(0, 0))
-    numbering = number_dots(dots, target)
-    assert numbering.ambiguous
-    assert any(is_right(numbering, truth, ids) for ids in numbering.equivalents)
 
 
 def test_dots_on_the_lattice_beyond_the_target_are_left_out_with_the_reason() -> None:
@@ -404,7 +381,7 @@ def test_mirrored_images_are_named() -> None:
 
 def test_targets_of_many_dots() -> None:
     rng = np.random.default_rng(0)
-    many = replace(LARGE, rows=40, columns=40, marks=((20, 21), (20, 27), (15, 21)))
+    many = replace(LARGE, rows=24, columns=24, marks=((12, 13), (12, 19), (7, 13)))
     for target in (LARGE, many, scattered(200, 0)):
         dots, truth = photograph(target, View(), rng)
         assert is_right(number_dots(dots, target), truth)

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from seeds import first_or_all
 from target_pictures import draw, pixel_from_mm
 
 from telerig.errors import DetectionError, InputError
@@ -45,7 +46,8 @@ def views(target: Target) -> list[Any]:
 @pytest.mark.parametrize(
     ("plate", "cameras"),
     [
-        (PLATE, ("camera",)), (LARGE, ("left", "right")), (OBLONG, ("camera",)),
+        (PLATE, ("camera",)), pytest.param(LARGE, ("left", "right"), marks=pytest.mark.slow),
+        pytest.param(OBLONG, ("camera",), marks=pytest.mark.slow),
         (MISSING, ("left", "right")),
     ],
     ids=["ring", "large", "oblong", "gap"],
@@ -170,7 +172,7 @@ def test_images_that_disagree_are_named(tmp_path: Path) -> None:
         target_from_images(tmp_path, pitch_mm=7.0, scale_px_per_mm=1.0)
 
 
-@pytest.mark.parametrize("style", ["ring", "large", "missing", None])
+@pytest.mark.parametrize("style", first_or_all("ring", "large", "missing", None))
 def test_the_description_of_a_hexagonal_plate_numbers_its_images(
     tmp_path: Path, style: Any
 ) -> None:

@@ -153,12 +153,6 @@ def test_smoothing_uses_the_marks_that_were_followed(data: Path, tmp_path: Path)
     assert any(name.endswith("references.csv") for name in record["inputs_sha256"])
 
 
-def test_the_library_gives_the_same_marks(data: Path) -> None:
-    again = telerig.load_tracks(data / "results" / "rise").references
-    assert again is not None
-    assert len(again) == len(pd.read_csv(data / "results" / "rise" / "references.csv"))
-
-
 def short(data: Path, target: Path, frames: int = 5) -> Path:
     """The first frames of the run as a dataset of its own."""
     run = target / "runs" / "rise"

@@ -9,7 +9,7 @@ import pytest
 import telerig
 from telerig.errors import InputError
 from telerig.estimator.physics.bodies import bodies_table
-from telerig.estimator.physics.frames import frames_table, propagated
+from telerig.estimator.physics.frames import frames_table
 from telerig.estimator.physics.means import Lasting, mean_of_body
 from telerig.estimator.physics.oscillation import dominant_oscillation
 from telerig.estimator.physics.summary import summary_table
@@ -140,13 +140,6 @@ def test_fluid_of_rig_toml_and_none() -> None:
     assert liquid_of(None, G) is None
     found = liquid_of(WATER, 9.8)
     assert found is not None and found[0].gravity == 9.8 and found[0].gas_density == 0
-
-
-def test_errors_that_are_not_known_of_what_does_not_matter_add_nothing() -> None:
-    one = np.ones((2, 1))
-    unknown = (one, np.full((2, 1), np.inf))
-    value, sd = propagated(lambda a, b: a[..., 0], [(one, 0.5 * one), unknown])
-    assert value.tolist() == [1, 1] and sd.tolist() == [0.5, 0.5]
 
 
 def test_bodies_of_a_table_without_outlines_are_diameters() -> None:

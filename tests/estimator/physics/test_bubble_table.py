@@ -24,7 +24,7 @@ WATER = Liquid(998.2, 1e-3, 0.0728)
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Smoothing, pd.DataFrame]:
     """A smoothed run, and its true bubbles."""
     folder = tmp_path_factory.mktemp("forces") / "d"
-    config = run_preset("forces", frames=120, bubbles=3)
+    config = run_preset("forces", frames=80, bubbles=2)
     dataset = telerig.simulate(config, rng=np.random.default_rng(5), out=folder, images=False)
     calibration, data = telerig.calibrate(dataset, model="radial"), dataset.runs["forces"].load()
     smoothing = telerig.smooth(telerig.track(data, calibration), calibration, stage=data)

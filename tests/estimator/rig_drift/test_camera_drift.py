@@ -20,7 +20,6 @@ from telerig.estimator.rig_drift import (
     DriftPrior,
     Noise,
     PairCollector,
-    RigChange,
     Series,
     covariance_root,
     drift_covariance,
@@ -364,27 +363,6 @@ def test_a_long_run_is_collected_in_bounded_memory(monkeypatch: pytest.MonkeyPat
     assert found is not None and every is not None and found.moved
     assert np.all(np.abs(found.values - [0.08, 0, 0]) < 3 * found.sigmas)
     assert np.all(found.sigmas < 1.5 * every[0].sigmas)
-
-
-def test_numbers_are_cut_where_their_deviation_has_two_digits() -> None:
-    values, sigmas = np.array([0.0885, -2.0249e-3, 5.04e-5]), np.array([9.51e-4, 5e-5, 5.4e-5])
-    six = np.zeros(6)
-    change = RigChange(
-        "right", six, np.diag(six), six[:3], values, sigmas, np.array([0.2, 5e-3, 5e-3]), 0.0, 100
-    )
-    assert change.size_words() == (
-        "by +88.50 ± 0.95 µm perpendicular to both optical axes, rolled by -2025 ± 50 µrad, "
-        "pitched by +50 ± 54 µrad"
-    )
-
-
-def test_smoothing_without_refinement_warns_of_a_movement() -> None:
-    from telerig.estimator.smoothing.results_folder import _moved
-
-    summary = {"rig_change": {"camera": "right", "moved": True, "offset_mm": 0.0885}}
-    (words,) = _moved(SimpleNamespace(summary=summary))
-    assert "'right' had moved" in words and "by +88 µm" in words and "--refine-rig" in words
-    assert not _moved(SimpleNamespace(summary={})) and not _moved(object())
 
 
 def test_smoothing_refuses_the_calibration_of_fewer_cameras() -> None:

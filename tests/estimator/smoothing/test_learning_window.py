@@ -102,6 +102,7 @@ def test_the_evidence_of_pieces_is_the_sum_of_theirs() -> None:
     assert apart[1] - apart[0] == pytest.approx(each[1] - each[0], rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_record_states_the_pieces_and_holds_the_rest_of_the_run_against_them() -> None:
     problem = _coming_and_going(4 * MOST_FRAMES, 200, bubbles=20)
     parts = learning_parts(problem)

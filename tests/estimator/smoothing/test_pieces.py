@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 import shake_problem
 from numpy.typing import NDArray
+from seeds import first_or_all
 from shake_cases import SCENARIOS, generate
 from shake_learning_data import run, true_model, with_comings_and_goings
 
@@ -70,9 +71,13 @@ def sigma(solution: Solution, rows: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    "made", [crowded, lambda: sensed("references"), lambda: sensed("arms")],
-    ids=["calibration", "marks", "accelerometers"],
-)  # fmt: skip
+    "made",
+    [
+        pytest.param(crowded, id="calibration"),
+        pytest.param(lambda: sensed("references"), id="marks"),
+        pytest.param(lambda: sensed("arms"), id="accelerometers", marks=pytest.mark.slow),
+    ],
+)
 def test_paths_and_sums_are_those_of_the_joint_solution(
     made: Callable[[], tuple[SmoothingProblem, ShakeModel]],
 ) -> None:
@@ -153,14 +158,14 @@ def tracks_of(problem: SmoothingProblem) -> pd.DataFrame:
 
 
 def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
-    problem, _ = crowded(200)
+    problem, _ = crowded(120)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
     whole, parts = (
         telerig.smooth(
             tracks_of(problem), calibration, model="default", t_s=problem.t_s,
             options=Options(frames=n),
         )
-        for n in (None, 100)
+        for n in (None, 60)
     )  # fmt: skip
     assert parts.verdict["verdict"] == whole.verdict["verdict"]
     assert parts.summary["bubbles"] == whole.summary["bubbles"]
@@ -207,7 +212,7 @@ def test_a_shake_without_bubbles_is_smoothed_in_pieces(tmp_path: Path) -> None:
     assert len(telerig.load_smoothing(tmp_path).shake) == 200
 
 
-@pytest.mark.parametrize("frames", [None, 100], ids=["whole", "pieces"])
+@pytest.mark.parametrize("frames", first_or_all(100, None))
 def test_bubbles_that_come_late_are_judged(frames: int | None, tmp_path: Path) -> None:
     problem, _ = crowded(300)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
@@ -223,15 +228,15 @@ def test_bubbles_that_come_late_are_judged(frames: int | None, tmp_path: Path) -
 
 def test_an_encoder_that_covers_a_part_of_the_run() -> None:
     """Where it does not, the carriage is unknown with and without shake, which is no separation."""
-    problem, _ = crowded(120)
+    problem, _ = crowded(80)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
-    t = problem.t_s[:30]
+    t = problem.t_s[:20]
     words = [
         telerig.smooth(
             tracks_of(problem), calibration, stage={"t_s": t, "position_mm": 0.2 * t},
             t_s=problem.t_s, model="default", options=Options(frames=n),
         ).verdict["verdict"]
-        for n in (None, 60)
+        for n in (None, 40)
     ]  # fmt: skip
     assert words == ["UNRESOLVED", "UNRESOLVED"]
 

@@ -71,7 +71,7 @@ def test_a_clock_that_keeps_time_has_no_drift(seed: int) -> None:
 
 @pytest.mark.parametrize(
     ("seed", "scenario", "information", "within"),
-    [(905, "S6", "references", 0.02), (907, "S3", "one", 0.1)],
+    [(905, "S6", "references", 0.02), *long((907, "S3", "one", 0.1))],
 )
 def test_a_wrong_rate_is_found(seed: int, scenario: str, information: str, within: float) -> None:
     """Beside one bubble of S3, the last third of the run alone shows no offset."""
@@ -129,6 +129,7 @@ def test_marks_show_the_unit_of_an_encoder_that_seems_to_stand() -> None:
     assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": 1e3}]
 
 
+@pytest.mark.slow
 def test_a_unit_that_is_likely_and_not_sure_is_a_warning() -> None:
     """Inches, seen at 3.9 standard deviations by one bubble and two sensors."""
     _, said = placed(907, "one", scenario="stick-slip", encoder=1 / 25.4)
@@ -136,7 +137,7 @@ def test_a_unit_that_is_likely_and_not_sure_is_a_warning() -> None:
     assert finding.code is None and "may read inches" in finding.warning
 
 
-@pytest.mark.parametrize(("information", "known"), [("one", False), ("references", True)])
+@pytest.mark.parametrize(("information", "known"), [("references", True), *long(("one", False))])
 def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
     information: str, known: bool
 ) -> None:
@@ -149,8 +150,8 @@ def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
 @pytest.mark.parametrize(
     ("scenario", "seed", "information", "blamed", "frames"),
     [
-        ("S1", 907, "one", "accelerometers", None),
         ("S2", 908, "references", "accelerometer arm_left", 300),
+        *long(("S1", 907, "one", "accelerometers", None)),
         *long(("S3", 907, "one", "accelerometer arm_left", None)),
     ],
 )
@@ -176,8 +177,7 @@ def test_an_arm_is_blamed_only_where_all_measurements_tell_it_from_the_other(
     ("scenario", "seed", "around_s"),
     [
         ("S6", 951, 10.0),
-        ("stick-slip", 950, 0.05),
-        *long(("S1", 972, 0.05), ("S1", 980, 0.05)),
+        *long(("stick-slip", 950, 0.05), ("S1", 972, 0.05), ("S1", 980, 0.05)),
     ],
 )
 def test_a_short_sound_run_is_no_fault(scenario: str, seed: int, around_s: float) -> None:

@@ -40,6 +40,7 @@ def test_where_nothing_tells_it_is_the_priors() -> None:
     assert found == pytest.approx(0.1 * np.sqrt(np.mean(np.exp(2 * ratio))), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_rig_that_bubbles_swings_hide_is_not_taken_for_still() -> None:
     """Modes that are found in the vertical may move across, too; held ones stay as they are."""
     problem, _, _ = run(

@@ -113,17 +113,6 @@ def test_a_corner_is_learned_unless_it_is_held_or_unlike(
     assert FORCE not in free_names(model, across, options, False)
 
 
-def test_white_forces_that_are_held_stay_white() -> None:
-    problem, _, _ = run(
-        np.random.default_rng(18), bubbles=2, seconds=0.4, rate_hz=200.0, sigma_px=0.05,
-        common_hz=25.0, force_hz=20.0,
-    )  # fmt: skip
-    start = replace(true_model(), name="mine")
-    found = learn(problem, start, Learning(hold=(FORCE,), most_modes=0))
-    assert found.modes
-    assert all(m.force_hz is None for m in found.modes)
-
-
 def test_an_ambiguous_line_is_halved_without_changing_one_bubbles_likelihood() -> None:
     """Also where the rig's other lines have a corner: the halves add up to the line."""
     problem, _, _ = run(np.random.default_rng(9), sigma_px=0.1)
@@ -163,6 +152,7 @@ def test_prior_weights_of_a_line_beside_the_bubbles() -> None:
     np.testing.assert_allclose(hidden_mode_weights(line, [half, arm])[1:], wanted[1:], rtol=0.01)
 
 
+@pytest.mark.slow
 def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None:
     """Elsewhere, of its own: then a second one just here would be a coincidence."""
     problem, _, _ = run(np.random.default_rng(16), bubbles=3, rate_hz=60.0)

@@ -257,6 +257,7 @@ def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
     assert with_hyperparameter_uncertainty(unused) is unused
 
 
+@pytest.mark.slow
 def test_a_line_of_several_bubbles_leaves_room_for_the_rigs() -> None:
     """The rig's line was missed: what five bubbles have in common at its frequency asks for it."""
     problem, _, _ = run(np.random.default_rng(5), bubbles=5)

@@ -103,6 +103,7 @@ def sensed() -> Smoothing:
     return smoothed(s2(), "arms", given=True)
 
 
+@pytest.mark.slow
 def test_the_laboratorys_gravity_is_no_bias(sensed: Smoothing) -> None:
     """A run in a laboratory of 9.781 m/s^2 has the biases of the same run at 9.80665 m/s^2."""
     run = s2()

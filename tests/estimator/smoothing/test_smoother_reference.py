@@ -13,7 +13,6 @@ from shake_cases import (
     Runs,
     Scenario,
     generate,
-    middle,
     parts_of,
     reference,
 )
@@ -87,31 +86,3 @@ def test_means_and_covariances_equal_the_reference(name: str, information: str) 
         # a standard deviation's relative error is half of a variance's
         assert mean < MEAN_MM * (10 if what == "velocity" else 1), (what, mean)
         assert sigma < RELATIVE / 2, (what, sigma)
-
-
-TABLE = [
-    ("S0", "one", 114, 8.4),
-    ("S0", "five", 89, 6.5),
-    ("S0", "arms", 60, 4.4),
-    ("S0", "references", 60, 4.4),
-    ("S0", "oracle", 59, 4.4),
-    ("S2", "one", 39, 3.9),
-    ("S2", "references", 13.9, 2.23),
-]
-"""Scenario, information, posterior sd of position (µm) and velocity (mm/s): exact figures."""
-
-
-@pytest.mark.parametrize(("name", "information", "um", "mm_s"), TABLE)
-def test_posteriors_are_those_that_are_possible(
-    name: str, information: str, um: float, mm_s: float
-) -> None:
-    scenario = SCENARIOS[name]
-    runs = generate(scenario, 1, np.random.default_rng(6))
-    model = true_model(scenario, information)
-    found = solve(problem(scenario, information, runs), model, Options(robust=False))
-    assert found.covariances is not None
-    blocks = found.covariances.bubbles[: scenario.frames][middle(scenario.frames)]
-    layout = found.graph.bubble
-    position, velocity = _sigma(UP @ layout.position, blocks), _sigma(UP @ layout.velocity, blocks)
-    assert 1e3 * np.sqrt(np.mean(position**2)) == pytest.approx(um, rel=0.01)
-    assert np.sqrt(np.mean(velocity**2)) == pytest.approx(mm_s, rel=0.01)

@@ -300,30 +300,6 @@ def test_axes_that_gravity_cannot_tell(felt: int, sign: int, told: str, run: Pat
     assert all(f"appears along {told} of the sensor" in w for w in words), words
 
 
-def test_a_table_with_a_sensor_unknown(run: Path) -> None:
-    data = telerig.load_run(run)
-    assert data.accelerometers is not None
-    table = data.accelerometers.assign(sensor="arm_lefd")
-    with pytest.raises(InputError, match="did you mean arm_left"):
-        check_sensors(replace(data, accelerometers=table))
-    with pytest.raises(InputError, match="arm_lefd"):
-        smooth(tracks(data), calibration(), stage=data, accelerometers=table)
-
-
-def test_nan_in_tables_from_memory(run: Path) -> None:
-    data = telerig.load_run(run)
-    assert data.accelerometers is not None and data.stage is not None
-    table, stage = data.accelerometers.copy(), data.stage.copy()
-    table.loc[5, "ay_m_s2"] = np.nan
-    stage.loc[5, "position_mm"] = np.nan
-    with pytest.raises(InputError, match="not finite"):
-        smooth(tracks(data), calibration(), stage=data, accelerometers=table)
-    with pytest.raises(InputError, match="not finite"):
-        smooth(tracks(data), calibration(), stage=stage, t_s=data.t_s)
-    with pytest.raises(InputError, match="not finite"):
-        check_sensors(replace(data, accelerometers=table))
-
-
 def test_a_run_of_two_frames_and_of_one(run: Path) -> None:
     data = telerig.load_run(run)
     table = tracks(data)

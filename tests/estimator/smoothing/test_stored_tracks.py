@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("known_low_passes")
 def test_a_run_is_tracked_and_smoothed_from_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = run_preset("swarm", frames=24, bubbles=3)
+    config = run_preset("swarm", frames=14, bubbles=2)
     telerig.simulate(config, rng=np.random.default_rng(1), out=tmp_path / "data", images=False)
     cameras = list(true_cameras(config.calibration).values())
     calibration = calibration_from_cameras(cameras, name="truth")

@@ -51,6 +51,7 @@ def test_residuals_of_the_right_model_are_as_expected(seed: int, kept: float) ->
         assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_p_is_uniform_where_the_model_is_right() -> None:
     """Residuals drawn from the model itself, judged by others: a false alarm as often as said."""
     problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=1.0, kept=0.7)

@@ -118,11 +118,6 @@ def test_faults_of_the_dots_table_come_up_at_load(folder: Path) -> None:
     assert "dots.csv row 4, column camera" in message and "did you mean right?" in message
 
 
-def test_dots_of_images_are_not_there_yet(folder: Path) -> None:
-    add_images(folder, "left/a.tif")
-    assert "telerig detect" in error_of(load_dataset(folder).dots)
-
-
 def test_images_and_dots_must_be_told_apart(folder: Path) -> None:
     add_images(folder, "left/a.tif", "right/a.tif")
     add_dots(folder)
@@ -147,12 +142,6 @@ def test_views_of_one_camera_alone_are_kept(folder: Path) -> None:
     dataset = load_dataset(folder)
     assert [view.name for view in dataset.views] == ["a", "b", "c", "d"]
     assert list(dataset.views[3].image_paths) == ["right"]
-
-
-def test_one_camera_needs_no_notes(tmp_path: Path) -> None:
-    make_rig(tmp_path, "top")
-    add_images(tmp_path, "top/a.tif")
-    assert load_dataset(tmp_path).notes == []
 
 
 @pytest.mark.parametrize(

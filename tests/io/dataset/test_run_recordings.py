@@ -185,13 +185,13 @@ def paged_tiff(frame: NDArray[np.uint8], count: int) -> bytes:
     return b"".join(out)
 
 
-def test_memory_stays_flat_over_10_000_pages(tmp_path: Path) -> None:
-    (tmp_path / "left.tif").write_bytes(paged_tiff(movie(1)[0], 10_000))
+def test_memory_stays_flat_over_2_500_pages(tmp_path: Path) -> None:
+    (tmp_path / "left.tif").write_bytes(paged_tiff(movie(1)[0], 2_500))
     source = PageFrames(tmp_path / "left.tif")
-    assert len(source) == 10_000
+    assert len(source) == 2_500
     assert [source.read(k)[0, 0] for k in range(100)] == list(range(100))
     tracemalloc.start()
-    for k in range(0, 10_000, 25):
+    for k in range(0, 2_500, 25):
         assert source.read(k)[0, 0] == k % 251
     gc.collect()
     held, _ = tracemalloc.get_traced_memory()

@@ -73,31 +73,6 @@ def test_the_noise_of_the_centres(tmp_path: Path) -> None:
     assert full.loc[0, ["suu_px2", "suv_px2", "svv_px2"]].tolist() == [4.0, -1.0, 2.0]
 
 
-def test_results_read_back_bit_for_bit(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    count = 15
-    sigma = rng.uniform(0.01, 0.03, count)
-    dots = pd.DataFrame(
-        {
-            "view": [f"v{i}" for i in range(count)],
-            "camera": "left",
-            "dot": np.arange(count),
-            "row": np.arange(count) // 5,
-            "column": np.arange(count) % 5,
-            "u_px": rng.uniform(0, 600, count),
-            "v_px": rng.uniform(0, 400, count),
-            "suu_px2": sigma**2,
-            "suv_px2": 0.3 * sigma**2,
-            "svv_px2": sigma**2 * np.pi,
-            "chi2_dof": np.where(np.arange(count) == 3, np.nan, rng.uniform(0.5, 2, count)),
-        }
-    )
-    write_table(dots, tmp_path / "results" / "dots.csv")
-    back = read_dots_csv(tmp_path / "results" / "dots.csv", BOUNDED)
-    for name in dots:
-        np.testing.assert_array_equal(back[name].to_numpy(), dots[name].to_numpy(), str(name))
-
-
 def test_on_an_unbounded_grid_row_and_column_name_the_dot(tmp_path: Path) -> None:
     text = (
         "view,camera,dot,u_px,v_px,row,column\n"
@@ -289,19 +264,3 @@ def test_floats_are_written_with_every_digit(tmp_path: Path) -> None:
     back = read_table(tmp_path / "t.csv", stated, extra=True)
     np.testing.assert_array_equal(back["x"].to_numpy(), values)
     assert back["name"].iloc[0] == 'ä,"b"'
-
-
-def test_a_failed_write_leaves_the_old_table(tmp_path: Path) -> None:
-    file = tmp_path / "t.csv"
-    write_table(pd.DataFrame({"x": [1.0]}), file)
-
-    class Unprintable:
-        def __str__(self) -> str:
-            raise RuntimeError("no text")
-
-        __repr__ = __str__
-
-    with pytest.raises(RuntimeError, match="no text"):
-        write_table(pd.DataFrame({"x": [2.0, Unprintable()]}), file)
-    assert file.read_text() == "x\n1.0\n"
-    assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]

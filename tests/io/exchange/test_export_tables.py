@@ -153,18 +153,6 @@ def test_netcdf_is_a_contiguous_ragged_array(folder: Path, tmp_path: Path) -> No
         check_netcdf({k: v[:] for k, v in file.variables.items()}, results.points)
 
 
-def test_netcdf_by_the_reference_library(folder: Path, tmp_path: Path) -> None:
-    reference = pytest.importorskip("netCDF4")
-    results = read_results(folder)
-    path = tmp_path / "out.nc"
-    write_netcdf(results, path)
-    with reference.Dataset(path) as file:
-        file.set_auto_mask(False)
-        check_netcdf({k: v[:] for k, v in file.variables.items()}, results.points)
-        assert file.verdict == "PARTIAL (LABEL_AMBIGUOUS)" and file.frame == LAB
-        assert list(file["flags"][:]) == list(results.points["flags"])
-
-
 def test_netcdf_by_xarray_and_named_particles(folder: Path, tmp_path: Path) -> None:
     xarray = pytest.importorskip("xarray")
     results = named(read_results(folder))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,25 +102,6 @@ def test_a_recording_is_never_written_over(log: Path) -> None:
         RawLog(log, HEADER)
 
 
-def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writer = RawLog(tmp_path / "recording.raw", HEADER)
-
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    writer.append(entries()[0])
-    with pytest.raises(InputError, match=r"disk is full(.|\n)*make room(.|\n)*--replay"):
-        writer.flush()
-    writer.close()
-
-
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
-    (tmp_path / "run").write_text("a file")
-    with pytest.raises(InputError, match="is a file"):
-        RawLog(tmp_path / "run" / "recording.raw", HEADER)
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [(b"", "no recording"), (b"t_s,position_mm\n1,2\n" * 9, "no recording")],
@@ -135,18 +113,6 @@ def test_what_is_no_log(tmp_path: Path, content: bytes, words: str) -> None:
         scan_log(path)
     with pytest.raises(InputError, match="check the path"):
         scan_log(tmp_path / "absent.raw")
-
-
-@pytest.mark.parametrize(
-    "text",
-    [b"{}", b"[]", b"no JSON", b'{"start_ns":1,"started":"","cameras":[],"devices":[{"new":1}]}'],
-)
-def test_a_sound_header_of_another_version(tmp_path: Path, text: bytes) -> None:
-    path = tmp_path / "x.raw"
-    length, crc = (n.to_bytes(4, "little") for n in (len(text), zlib.crc32(text)))
-    path.write_bytes(b"telerig recording 1\n" + length + text + crc)
-    with pytest.raises(InputError, match="does not know"):
-        scan_log(path)
 
 
 @pytest.mark.parametrize("name", ["a,b\nc", "../x", ""])

@@ -238,33 +238,3 @@ def test_a_port_without_permission_says_how_to_get_it(
     device = DeviceDescription("encoder", "encoder", "/dev/ttyUSB0", counts_per_mm=1.0)
     with pytest.raises(InputError, match=r"no permission(.|\n)*dialout"):
         record([device], tmp_path / "run")
-
-
-def test_a_disk_that_fills_ends_the_recording_with_words(
-    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real, begun = os.fsync, time.monotonic()
-
-    def fills(handle: int) -> None:
-        if time.monotonic() - begun > 1.5:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(handle)
-
-    with SimulatedPorts(practice_devices()[:1], tmp_path / "ports", rng) as ports:
-        monkeypatch.setattr(os, "fsync", fills)
-        with pytest.raises(InputError, match="disk is full"):
-            record(ports.devices, tmp_path / "run", seconds=20.0)
-        monkeypatch.undo()
-    found = replay(tmp_path / "run" / LOG_NAME)
-    assert not found.ended and len(found.records[0].t_s) > 300
-
-
-def test_loopback_url(tmp_path: Path) -> None:
-    device = DeviceDescription("e", "encoder", "loop://", counts_per_mm=1.0)
-    log = record([device], tmp_path / "run", seconds=0.3)
-    assert len(replay(log).records[0].t_s) == 0
-
-
-def test_no_device(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no device(.|\n)*\[devices"):
-        record([], tmp_path / "run")

@@ -7,7 +7,6 @@ import pytest
 from tracked_folder import outline
 
 from telerig.errors import InputError
-from telerig.io.report import overlays
 from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
 
 
@@ -42,18 +41,6 @@ def test_overlay_draws_each_outline_where_it_is() -> None:
     assert half.shape[1] == 150
 
 
-def test_legend_counts_bubbles(monkeypatch: pytest.MonkeyPatch) -> None:
-    legends: list[list[str]] = []
-    draw = overlays._legend
-    monkeypatch.setattr(
-        overlays, "_legend", lambda lines, w: legends.append(lines) or draw(lines, w)
-    )
-    for many in range(3):
-        rings = [outline(20.0 * (k + 1), 30, 8) for k in range(many)]
-        draw_bubble_overlay(np.full((60, 80), 180.0), rings, [""] * many)
-    assert [lines[0].split(",")[0] for lines in legends] == ["0 bubbles", "1 bubble", "2 bubbles"]
-
-
 def test_overlay_tells_why_something_was_rejected() -> None:
     image = np.full((120, 200), 90.0)
     dust = [(50.0, 40.0, 6.0, "too small"), (150.0, 60.0, float("nan"), "too small")]
@@ -66,9 +53,3 @@ def test_overlay_tells_why_something_was_rejected() -> None:
         draw_bubble_overlay(np.zeros((4, 4, 3)), [], [])
     with pytest.raises(InputError, match="1 outlines, 0 labels"):
         draw_bubble_overlay(image, [outline(5, 5, 3)], [])
-
-
-def test_empty_bright_image_stays_bright() -> None:
-    rng = np.random.default_rng(2)
-    image = (200 + rng.standard_normal((80, 90))).astype(np.uint8)
-    assert draw_bubble_overlay(image, [], [])[:80].min() > 150

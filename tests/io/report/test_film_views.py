@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -28,7 +27,6 @@ from telerig.io.report.film.views import (
     view_frames,
     write_views_film,
 )
-from telerig.io.report.overlays import INK, write_label
 from telerig.io.report.run.tracking.results import read_track_results
 
 
@@ -69,12 +67,6 @@ def test_a_broken_off_film_leaves_the_old_one(tmp_path: Path) -> None:
     assert {f.read_text() for f in files} == {"old"}
     with pytest.raises(InputError, match=r"\.mp4 or \.gif"):
         write_film(_few(), 3, [tmp_path / "a.mkv"])
-
-
-def test_progress_counts_every_picture(tmp_path: Path) -> None:
-    told: list[tuple[str, int, int]] = []
-    write_film(_few(), 3, [tmp_path / "a.gif"], what="x", stage=lambda *p: told.append(p))
-    assert told == [("x", 1, 3), ("x", 2, 3), ("x", 3, 3)]
 
 
 def _image(camera: str, frame: int) -> np.ndarray | None:
@@ -120,29 +112,6 @@ def test_outlines_and_tails_are_drawn_where_they_were_found(run: Path) -> None:
     assert np.ptp(draw_views(_image, SIZES, shades, frames[2])[-20:, -60:]) == 0
 
 
-def test_names_of_cameras_in_any_alphabet(monkeypatch: pytest.MonkeyPatch) -> None:
-    ascii_only = []
-    write = cv2.putText
-
-    def of_opencv_4(picture: np.ndarray, text: str, *how: object) -> np.ndarray:
-        ascii_only.append(text)
-        return write(picture, text.encode("ascii", "replace").decode(), *how)
-
-    monkeypatch.setattr(cv2, "putText", of_opencv_4)
-    frame = views.ViewFrame(0, None, ((), ()))
-    strips = [
-        draw_views(
-            lambda *_: np.zeros((80, 300), np.uint8),
-            {name: (300, 80), "right": (300, 80)},
-            {name: (0.0, 255.0), "right": (0.0, 255.0)},
-            frame,
-        )[:30, :150]
-        for name in ("верх", "????")
-    ]
-    assert strips[0].min() < 100 and not np.array_equal(*strips)
-    assert all(text.isascii() for text in ascii_only)
-
-
 def test_outline_is_the_documented_curve() -> None:
     """At phi = 0 the normal is the long axis: c_k add up there; s_3 acts at phi = 30 degrees."""
     row = dict.fromkeys(views._SHAPE, 0.0)
@@ -154,11 +123,3 @@ def test_outline_is_the_documented_curve() -> None:
     np.testing.assert_allclose(bumpy[0], [10, 28.75], atol=1e-12)
     assert np.linalg.norm(turned[6] - plain[6]) == pytest.approx(1.0)
     np.testing.assert_allclose(np.linalg.norm(bare - [10, 20], axis=1), 6.0)
-
-
-def test_dark_words_on_paper_have_no_dark_rim() -> None:
-    written = np.full((30, 200, 3), 255, np.uint8)
-    assert write_label(written, "frame 30, 0.300 s", np.array([100.0, 15.0]), INK)
-    inside = written.min(axis=2) < 128
-    rows, columns = np.nonzero(inside)
-    assert 0.1 < inside[rows.min() : rows.max(), columns.min() : columns.max()].mean() < 0.35

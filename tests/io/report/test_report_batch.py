@@ -109,9 +109,3 @@ def test_links_reach_datasets_of_any_name(tmp_path: Path) -> None:
     found = Page(write_batch_report(_write(tmp_path / "out", [job]))).loads
     links = [unquote(urlsplit(load).path) for load in found if not load.startswith("data:")]
     assert links == ["../tank #2, 50%/results/rise/report.html"]
-
-
-def test_an_axis_without_a_number_is_left_out(tmp_path: Path) -> None:
-    jobs = [_job("smooth", "rise", verdict="RESOLVED", sx_um=None, sy_um=13.0, sz_um=24.0)]
-    page = Page(write_batch_report(_write(tmp_path / "out", jobs)))
-    assert "not available, 13.0, 24.0" in page.spaced

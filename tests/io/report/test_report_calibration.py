@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 from urllib.parse import unquote
@@ -21,12 +19,11 @@ from telerig.estimator.calibration.result.calibration import calibration_from_ca
 from telerig.io.report.calibration.figures import residual_field
 from telerig.io.report.calibration.report import contact_sheet, write_calibration_report
 from telerig.io.report.calibration.results import read_results
-from telerig.io.report.calibration.tables import parameter_rows, pose_rows, worst_rows
+from telerig.io.report.calibration.tables import parameter_rows, worst_rows
 from telerig.io.report.page import contact_sheet as sheets
 from telerig.io.report.remake import ResultsFolder, remake_report
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
-from telerig.short_text import with_sd
 
 SIGMA_PX, BUMP_MM = 0.01, 0.05
 SECTIONS = [
@@ -125,12 +122,6 @@ def test_an_imported_calibration_is_said_to_have_no_report(tmp_path: Path) -> No
     assert "residuals.csv" not in str(caught.value)
 
 
-def test_importing_the_report_draws_in_no_plotting_library() -> None:
-    code = "import sys, telerig.io.report.calibration.report; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"matplotlib", "plotly", "cv2", "jinja2"} & set(done.stdout.split())
-
-
 @pytest.mark.parametrize(
     ("file", "content", "words"),
     [
@@ -181,11 +172,6 @@ def test_whitened_residuals_are_unit_normal(folder: Path) -> None:
     assert abs(np.corrcoef(white.T)[0, 1]) < 0.2
 
 
-def test_gap_between_axes_and_its_deviation(folder: Path) -> None:
-    rows = dict(row.cells for row in pose_rows(read_results(folder)))
-    assert rows["distance between the axes (mm)"] == with_sd(0.3, 5.0)
-
-
 def test_parameter_rows_tell_held_from_free_and_distortion_in_px(folder: Path) -> None:
     rows = {row.cells[0]: row for row in parameter_rows(read_results(folder))}
     assert rows["skew (skew)"].faint and rows["skew (skew)"].cells[1] == "0 (held)"
@@ -219,7 +205,6 @@ def test_pictures_beyond_the_budget_shrink_then_become_links(
     assert contact_sheet(results).shrunk and contact_sheet(results).linked == 0
     monkeypatch.setattr(sheets, "BUDGET_BYTES", 10)
     assert contact_sheet(results).linked == 2
-    assert 'href="overlays/left/view01.jpg"' in write_calibration_report(folder).read_text()
     elsewhere = folder.parent / "else where"
     for out in (None, elsewhere):
         page = remake_report(ResultsFolder(folder, "calibration"), out)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.report.calibration.dot_fit import dot_pictures, edge_distance_px
+from telerig.io.report.calibration.dot_fit import edge_distance_px
 from telerig.io.report.calibration.figures import tilt_angles_rad, trust_pictures
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
@@ -23,7 +23,6 @@ from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Diag
 from telerig.io.results.tracking import TrackingFile
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-from telerig.short_text import nice_below, number, short_names, with_sd
 
 
 def _results() -> CalibrationResults:
@@ -94,16 +93,6 @@ def test_target_shape_finds_a_bump_and_its_deviation() -> None:
     np.testing.assert_allclose(shape.sd_um[:, 2], expected)
 
 
-def test_target_shape_without_nominal_places_knows_only_heights() -> None:
-    shape = target_shape(replace(_results(), row_column=np.full((15, 2), np.nan)))
-    assert shape is not None and not shape.in_plane
-    assert np.argmax(shape.off_um[:, 2]) == 7
-    target = Target(dots=np.arange(4), points_mm=np.eye(4, 3))
-    four = CalibrationFile.model_construct(target=target)
-    few = replace(_results(), file=four, row_column=np.eye(4, 2))
-    assert target_shape(few) is None
-
-
 def test_outline_of_a_field_is_what_the_image_corners_see() -> None:
     results = _results()
     corners = np.array([[-0.5, -0.5], [511.5, -0.5], [511.5, 511.5], [-0.5, 511.5]])
@@ -169,27 +158,6 @@ def test_distance_from_a_circle_is_exact() -> None:
     np.testing.assert_allclose(distance[off_centre], expected[off_centre], atol=1e-9)
 
 
-def test_distance_from_an_ellipse_is_right_near_its_edge() -> None:
-    example = _circle_example() | {"a_px": np.array(12.0), "b_px": np.array(6.0)}
-    v, u = np.mgrid[50:81, 100:141]
-    turn = np.linspace(0, 2 * np.pi, 20001)
-    x, y = 12 * np.cos(turn), 6 * np.sin(turn)
-    edge = np.c_[120 + x * np.cos(0.3) - y * np.sin(0.3), 65 + x * np.sin(0.3) + y * np.cos(0.3)]
-    pixels = np.c_[u.ravel(), v.ravel()]
-    nearest = np.array([np.hypot(*(edge - pixel).T).min() for pixel in pixels])
-    distance = edge_distance_px(example).ravel()
-    near = nearest < 1.5
-    np.testing.assert_allclose(np.abs(distance[near]), nearest[near], atol=0.35)
-
-
-def test_profile_keeps_clear_of_a_neighbour_and_states_the_misfit() -> None:
-    example = _circle_example()
-    patch = example["patch"].copy()
-    patch[:, :6] = 250
-    *_, profile = dot_pictures(example | {"patch": patch})
-    assert "RMS 1.00 grey values, noise 0.500" in profile.caption
-
-
 def _overlay_tables() -> tuple[pd.DataFrame, pd.DataFrame]:
     shape = {"a_px": 40.0, "b_px": 20.0, "angle_rad": 0.0}
     accepted = pd.DataFrame(
@@ -220,25 +188,6 @@ def test_overlay_marks_what_was_found(kind: type) -> None:
     assert (picture[400:].min(axis=2) < 100).any(), "the legend has letters"
 
 
-def test_overlay_keeps_the_index_of_a_dot_inside_a_rejected_outline() -> None:
-    accepted, rejected = _overlay_tables()
-    around = rejected.assign(u_px=100.0, v_px=90.0, a_px=150.0, b_px=70.0)[:1]
-    image = np.zeros((400, 400), np.uint8)
-    alone = draw_overlay(image, accepted, rejected[:0], max_width_px=400)
-    both = draw_overlay(image, accepted, around, max_width_px=400)
-    np.testing.assert_array_equal(both[75:106, 65:136], alone[75:106, 65:136])
-    number = both[80:101, 235:265].astype(int)
-    assert ((number[..., 0] - number[..., 1] > 80).sum(axis=0) > 1).sum() >= 2
-
-
-def test_overlay_shrinks_with_its_marks() -> None:
-    picture = draw_overlay(np.zeros((400, 400), np.uint8), *_overlay_tables(), max_width_px=200)
-    assert picture.shape[1] == 200
-    green = picture[..., 1].astype(int) - picture[..., 0] > 60
-    _, columns = np.nonzero(green[:200])
-    assert 28 <= columns.min() <= 31 and 69 <= columns.max() <= 72
-
-
 def test_overlay_of_nothing_and_of_wrong_things() -> None:
     accepted, rejected = _overlay_tables()
     assert draw_overlay(np.zeros((50, 60)), accepted[:0], rejected[:0]).shape[1] == 60
@@ -246,18 +195,6 @@ def test_overlay_of_nothing_and_of_wrong_things() -> None:
         draw_overlay(np.zeros((5, 5, 3)), accepted, rejected)
     with pytest.raises(InputError, match="lacks reason"):
         draw_overlay(np.zeros((5, 5)), accepted, accepted)
-
-
-def test_numbers_in_words() -> None:
-    assert with_sd(10.000072, 0.00034) == "10.00007 ±\u00a00.00034"
-    assert with_sd(1.2344e-6, 4.5e-8) == "(1.234 ±\u00a00.045)·10⁻⁶"
-    assert with_sd(1.5, None) == "1.500000" and with_sd(None, 1.0) == "not available"
-    assert [number(x) for x in (0, 12345, 0.000123, 1.5e9)] == [
-        "0", "12\u202f345", "0.000123", "1.50·10⁹",
-    ]  # fmt: skip
-    assert [nice_below(x) for x in (0.9, 1, 4.9, 5, 730, 0)] == [0.5, 1, 2, 5, 500, 1]
-    assert short_names(["view09", "view10"]) == ["09", "10"]
-    assert short_names(["a", "a1"]) == ["a", "a1"] and short_names(["one"]) == ["one"]
 
 
 def test_records_take_numpy_scalars_and_write_nan_as_null(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from telerig.io.report.run.smoothing.results import (
     taken_away,
     velocity_spectrum,
 )
-from telerig.io.report.run.smoothing.tables import axis_table, constant_rows, mode_rows
+from telerig.io.report.run.smoothing.tables import axis_table, mode_rows
 
 
 @pytest.fixture(scope="module")
@@ -101,15 +101,6 @@ def test_a_mode_learned_axis_by_axis_is_one_row(folder: Path) -> None:
     assert [row.cells[3] for row in rows] == ["x: 63.0, y: 75.0, z: 64.0"]
 
 
-def test_given_remedies_of_the_modes_are_shown(folder: Path) -> None:
-    row = {"where": "arm left", "frequency_hz": 31.0, "damping": 0.02, "rms_mm": [0.0, 0.02, 0.0],
-           "source": "model", "remedy": "brace it <here>"}  # fmt: skip
-    servo = row | {"where": "servo", "remedy": "less gain", "source": "estimate"}
-    rows, _ = mode_rows(read(changed(folder, modes=[row, servo])))
-    assert [r.cells[0] for r in rows] == ["arm of left", "servo (following error)"]
-    assert [r.cells[4] for r in rows] == ["brace it <here>", "less gain"]
-
-
 def test_evenly_fills_gaps_with_straight_lines() -> None:
     t = np.array([0.0, 0.1, 0.2, 0.5, 0.6])
     even, rate = evenly(t, np.stack([2 * t, np.where(t == 0.2, np.nan, t)], 1))
@@ -118,25 +109,11 @@ def test_evenly_fills_gaps_with_straight_lines() -> None:
     np.testing.assert_allclose(even, np.stack([2 * grid, grid], 1), atol=1e-12)
 
 
-def test_constants_without_sd_are_shown_bare(folder: Path) -> None:
-    sensors = {"a": {"bias_x_mm_s2": 12.345678, "scale": None, "delay_s": 0.0}}
-    rows = constant_rows(read(changed(folder, accelerometers=sensors, encoder={})))
-    assert [row.cells for row in rows] == [
-        ("a", "bias x, mm/s²", "12.35"), ("a", "scale", "not available"), ("a", "delay, ms", "0"),
-    ]  # fmt: skip
-
-
 def test_every_density_is_within_the_limits_of_its_picture() -> None:
     readings, left, noise = np.geomspace(1, 1e-9, 60), np.full(60, 1e-13), np.full(60, 5e-8)
     assert density_limits([readings, left, noise]) == (1e-13, 1.0)
     assert density_limits([readings]) == pytest.approx((1e-6, 1.0))
     assert density_limits([np.zeros(3)]) == (1.0, 1.0)
-
-
-def test_words_and_answers_of_sensors_are_shown(folder: Path) -> None:
-    found = {"scale_from": "assumed", "confirmed": True}
-    rows = constant_rows(read(changed(folder, accelerometers={}, encoder=found)))
-    assert [row.cells[1:] for row in rows] == [("scale from", "assumed"), ("confirmed", "yes")]
 
 
 def test_axis_table_is_complete_without_a_verdict(folder: Path) -> None:

@@ -5,9 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import subprocess
-import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,7 +36,7 @@ from telerig.io.report.run.tracking.results import (
     read_track_results,
 )
 from telerig.io.report.run.tracking.scene import thinned, track_scene_json
-from telerig.io.report.run.tracking.tables import event_words, pair_rows, verdict
+from telerig.io.report.run.tracking.tables import verdict
 
 SECTIONS = [
     *("verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events", "notes"),
@@ -184,26 +181,6 @@ def test_no_rows_for_a_camera_and_no_tracks(folder: Path) -> None:
     assert 'class="verdict rejected"' in (folder / "report.html").read_text(encoding="utf-8")
 
 
-def test_an_offset_that_varies_is_not_a_list_of_offsets(folder: Path) -> None:
-    _edit(folder, pairs={"bias_px": [0.8, 0.21, -0.1, 0.0], "calibration_problem": True})
-    results = read_track_results(folder)
-    where = "in the middle of the paths, different elsewhere"
-    assert f"(offset 0.800 px {where})" in verdict(results).warnings[0]
-    assert pair_rows(results)[0][1] == f"0.800 {where}"
-
-
-def test_scatter_without_the_shake_is_not_called_the_scatter(folder: Path) -> None:
-    _edit(folder, pairs={"bias_px": [0.0], "frame_px": 1.4, "rms_px": [0.04, 0.03, 0.03, 0.03]})
-    rows = dict(pair_rows(read_track_results(folder)))
-    assert rows["RMS without the shift common to a frame, px"] == "0.0400"
-    assert rows["shift common to a frame, px"] == "1.40"
-
-
-def test_one_frame_lasts_no_time(results: TrackResults) -> None:
-    picture = time_series(replace(results, tracks=results.tracks.iloc[:1]), 0)
-    assert picture.caption.startswith("0 s, a colour per track")
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_hostile_names_stay_text(folder: Path) -> None:
     evil = "</script><b>x"
@@ -212,17 +189,6 @@ def test_hostile_names_stay_text(folder: Path) -> None:
     _edit_table(folder, "detections", flags=evil)
     html = write_track_report(folder).read_text(encoding="utf-8")
     assert evil not in html and html.count("&lt;/script&gt;&lt;b&gt;x") > 4
-
-
-def test_importing_the_report_draws_in_no_plotting_library() -> None:
-    code = "import sys, telerig.io.report.run.report, telerig.io.report.overlays;"
-    done = subprocess.run(
-        [sys.executable, "-c", code + "print(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert not {"matplotlib", "plotly", "cv2", "jinja2"} & set(done.stdout.split())
 
 
 @pytest.mark.parametrize(
@@ -301,13 +267,6 @@ def test_up_from_the_file_turns_heights_round(folder: Path) -> None:
     assert "turned round" not in time_series(read_track_results(folder), 1).caption
     with pytest.raises(InputError, match="garbles 'up'"):
         read_track_results(_edit(folder, up=[1, 2]))
-
-
-def test_many_events_are_counted(folder: Path) -> None:
-    table = pd.read_csv(folder / "events.csv")
-    pd.concat([table] * 20).to_csv(folder / "events.csv", index=False)
-    words = event_words(read_track_results(_edit(folder, events={})))
-    assert "break: 20" in words and f"{20 * len(table) - 60} more are in events.csv" in words
 
 
 def test_pictures_beyond_the_budget_shrink_and_the_page_stays_small(

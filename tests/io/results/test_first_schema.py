@@ -16,7 +16,10 @@ import pytest
 import telerig
 from telerig.io.report.remake import remake_report, results_folders
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*there is no manifest.json")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*there is no manifest.json"),
+    pytest.mark.usefixtures("undrawn"),
+]
 FOLDER = Path(__file__).parent / "first_schema"
 
 

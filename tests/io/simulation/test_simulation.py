@@ -15,10 +15,8 @@ from telerig.io.simulation.calibration.scene import (
     hand_held_views,
     true_cameras,
     true_target,
-    wholly_inside,
 )
 from telerig.io.simulation.calibration_files import exact_dots, view_image
-from telerig.io.simulation.config import CameraConfig
 from telerig.io.simulation.images.plates import (
     Plate,
     disc_coverage,
@@ -52,7 +50,7 @@ def tilt_deg(camera, view):
     return np.degrees(np.arccos(axis @ view.rig_from_target.rotation[:, 2]))
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_paper_shows_every_dot_whole_in_every_image(seed):
     _, cameras, target, views = scene("paper", seed)
     assert len(views) == 12 and len(target.ids) == 15
@@ -97,42 +95,6 @@ def test_two_sided_plates_show_one_camera_their_back():
         assert sorted(sides) == [False, True]
 
 
-def test_tilts_and_depths_are_diverse():
-    _, cameras, _, views = scene("paper")
-    tilts = np.array([[tilt_deg(c, v) for c in cameras.values()] for v in views])
-    assert np.all(np.ptp(tilts, axis=0) > 15)
-    places = np.array([v.rig_from_target.apply([[14.0, 7.0, 0.0]])[0] for v in views])
-    assert np.all(places.std(0) > 2)
-    roll = [np.arctan2(*v.rig_from_target.rotation[1, :2]) for v in views]
-    assert np.hypot(np.mean(np.cos(roll)), np.mean(np.sin(roll))) < 0.7
-
-
-@pytest.mark.parametrize("angle", [20.0, 60.0, 110.0])
-def test_stereo_angle_can_be_set(angle):
-    _, cameras, target, views = scene("paper", angle_deg=angle, views=4)
-    axes = [camera.camera_from_rig.rotation[2] for camera in cameras.values()]
-    assert np.degrees(np.arccos(axes[0] @ axes[1])) == pytest.approx(angle, abs=1.0)
-    assert axes[1][0] < 0
-    for view in views:
-        assert all(image_jacobian(c, view, target) > 0 for c in cameras.values())
-        assert all(
-            wholly_inside(c, view.rig_from_target, target, 6.0).all() for c in cameras.values()
-        )
-
-
-def test_rig_origin_is_where_the_axes_come_closest():
-    _, cameras, _, _ = scene("paper")
-    right = cameras["right"].rig_from_camera
-    origin, direction = right.translation_mm, right.rotation[:, 2]
-    normal = np.cross([0, 0, 1.0], direction)
-    gap = origin @ normal / np.linalg.norm(normal)
-    along_left = np.linalg.lstsq(
-        np.stack([[0, 0, 1.0], -direction, normal], 1), origin, rcond=None
-    )[0]
-    assert abs(gap) == pytest.approx(0.3, rel=1e-9)
-    assert along_left[0] == pytest.approx(0, abs=1e-9)
-
-
 def test_print_errors_and_known_distance():
     config = preset("unbounded", print_factor=2.0)
     target = true_target(config, np.random.default_rng(0))
@@ -141,26 +103,6 @@ def test_print_errors_and_known_distance():
     ends = [target.points_mm[target.ids == dot][0] for dot in config.target.scale_dots]
     assert target.scale_distance_mm == pytest.approx(np.linalg.norm(ends[0] - ends[1]), abs=5e-3)
     assert target.scale_distance_mm != np.linalg.norm(ends[0] - ends[1])
-
-
-def test_unbounded_grid_fills_the_image_and_shows_its_marks():
-    config, cameras, target, views = scene("unbounded")
-    for view in views:
-        for camera in cameras.values():
-            inside = wholly_inside(camera, view.rig_from_target, target, 0.0)
-            assert inside[config.target.is_mark(target.ids)].all()
-            row, column = config.target.row_column_from_id(target.ids[inside])
-            assert inside.sum() > 40 and row.min() < 0 and column.max() > 5
-
-
-def test_dense_loses_some_dots_at_the_border():
-    _, cameras, target, views = scene("dense")
-    share = [
-        wholly_inside(c, v.rig_from_target, target, 6.0).mean()
-        for v in views
-        for c in cameras.values()
-    ]
-    assert min(share) >= 0.7 and min(share) < 1
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -260,17 +202,6 @@ def test_same_seed_same_bytes(tmp_path):
     assert (tmp_path / "c" / "truth" / "dots.csv").read_bytes() not in files[0].values()
 
 
-def test_images_and_tables_share_the_scene(tmp_path):
-    config = preset("symmetric", views=1)
-    for name, images in (("a", True), ("b", False)):
-        simulate(config, rng=np.random.default_rng(7), out=tmp_path / name, images=images)
-    assert (tmp_path / "a/truth/truth.json").read_bytes() == (
-        tmp_path / "b/truth/truth.json"
-    ).read_bytes()
-    assert not (tmp_path / "a/calibration/dots.csv").exists()
-    assert not list((tmp_path / "b/calibration").glob("*/*"))
-
-
 def test_one_camera_views_and_bit_depth(tmp_path):
     config = preset("paper", views=3, single_camera_views=2, bit_depth=12)
     simulate(config, rng=np.random.default_rng(0), out=tmp_path)
@@ -278,13 +209,6 @@ def test_one_camera_views_and_bit_depth(tmp_path):
     assert seen == {"left/view00.tif", "right/view00.tif", "right/view01.tif", "left/view02.tif"}
     image = tifffile.imread(tmp_path / "calibration/left/view02.tif")
     assert image.dtype == np.uint16 and 1500 < image.max() < 4096
-
-
-def test_one_camera_alone(tmp_path):
-    config = preset("paper", views=2, cameras=(CameraConfig("mono", scale_px_per_mm=8.0),))
-    dataset = simulate(config, rng=np.random.default_rng(0), out=tmp_path, images=False)
-    assert list(dataset.rig.cameras) == ["mono"]
-    assert dataset.rig.rotvec_from_first_deg == {}
 
 
 def test_outliers(tmp_path):
@@ -296,15 +220,6 @@ def test_outliers(tmp_path):
     )
     error = np.hypot(both["u_px_x"] - both["u_px_y"], both["v_px_x"] - both["v_px_y"])
     assert np.mean(error > 0.1) == pytest.approx(0.1, abs=0.02)
-
-
-def test_missing_marks_are_not_there(tmp_path):
-    base = preset("paper")
-    target = replace(base.target, mark_style="missing", mark_diameter_mm=None)
-    dataset = simulate(
-        replace(base, target=target, views=1), rng=np.random.default_rng(0), out=tmp_path
-    )
-    assert len(dataset.truth["target"]["dot"]) == 12
 
 
 def test_refusals(tmp_path):
@@ -330,14 +245,6 @@ def test_refusals(tmp_path):
 def test_senseless_settings_are_refused_by_name(fault):
     with pytest.raises(InputError, match=next(iter(fault))):
         preset("paper", **fault)
-
-
-def test_exact_dots_for_tests_of_solvers(tmp_path):
-    dataset = simulate(
-        preset("paper", sigma_px=0.0), rng=np.random.default_rng(0), out=tmp_path, images=False
-    )
-    exact = pd.read_csv(tmp_path / "truth/dots.csv")
-    assert np.array_equal(dataset.dots()[["u_px", "v_px"]], exact[["u_px", "v_px"]])
 
 
 def test_the_help_names_all_presets() -> None:

@@ -52,11 +52,14 @@ class Flag(StrEnum):
     SHAKE_BELOW_NOISE : the shake is smaller than the noise of the positions.
     SHAKE_UNMEASURED : nothing but the motion of one bubble at a time shows the shake, so that all
         numbers depend on the priors.
+    ARMS_UNMEASURED : an accelerometer measures the carriage, and nothing but the motion of one
+        bubble at a time shows how the cameras' arms move on it.
     """
 
     LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
     SHAKE_UNMEASURED = "SHAKE_UNMEASURED"
+    ARMS_UNMEASURED = "ARMS_UNMEASURED"
 
 
 class Remedy(StrEnum):

@@ -86,6 +86,10 @@ FLAG_WORDS: dict[str, str] = {
         "data do not say what of it is the rig's. The bands hold if the assumptions about bubbles "
         "and shake are right, which nothing tests."
     ),
+    Flag.ARMS_UNMEASURED: (
+        "The accelerometer on the carriage does not measure how the cameras' arms move on it, and "
+        "one bubble at a time alone shows that. What is taken for this motion may be the bubble's."
+    ),
 }
 
 REMEDY_WORDS = {
@@ -166,6 +170,8 @@ def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
         text += f" The shake ({1e3 * rms:.3g} µm RMS) is below the noise."
     if Flag.SHAKE_UNMEASURED in axis.flags:
         text += " Nothing but the motion of one bubble shows the shake."
+    if Flag.ARMS_UNMEASURED in axis.flags:
+        text += " Nothing but the motion of one bubble shows how the arms move on the carriage."
     if Flag.LABEL_AMBIGUOUS in axis.flags:
         hz = _ambiguous(axis)
         text += f" The oscillation at {hz} could be the bubble's as well as the rig's."
@@ -220,6 +226,8 @@ def _why(name: str, axis: AxisVerdict) -> str:
     """Return why an axis without contradictions is not RESOLVED."""
     if Flag.SHAKE_UNMEASURED in axis.flags:
         return f"nothing but the motion of one bubble shows the shake along {name}"
+    if Flag.ARMS_UNMEASURED in axis.flags:
+        return f"nothing but the motion of one bubble shows how the arms move along {name}"
     if Flag.LABEL_AMBIGUOUS in axis.flags:
         hz = _ambiguous(axis)
         return f"the oscillation at {hz} along {name} could be the bubble's as well as the rig's"

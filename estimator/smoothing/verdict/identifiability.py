@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from enum import IntEnum
 
 import numpy as np
 
@@ -52,6 +53,18 @@ _MOSTLY = 0.5
 """Share of the frames in which a second bubble has to be seen."""
 
 
+class Measured(IntEnum):
+    """Name of what part of the rig the shake is measured, by more than one bubble alone.
+
+    CARRIAGE : of the carriage, without the arms' own motion.
+    CAMERAS : of the cameras.
+    """
+
+    NOTHING = 0
+    CARRIAGE = 1
+    CAMERAS = 2
+
+
 def verdicts(
     solution: Solution,
     shake: Shake | None,
@@ -74,7 +87,7 @@ def verdicts(
     sigma, known, encoder = _sigmas(solution, window)
     eta, rms = shake_share(solution, shake), shake_rms(solution, shake)
     lines = _lines(window.problem, solution.graph.model) if read else []
-    measured, given = axes_with_measured_shake(solution), solution.graph.model.name == "given"
+    measured, given = measured_shake(solution), solution.graph.model.name == "given"
     return {
         name: axis_verdict(
             sigma[:, axis], known[:, axis], encoder[:, axis], eta[axis], rms[axis],
@@ -94,7 +107,7 @@ def axis_verdict(
     lines: tuple[AttributedLine, ...],
     inflation: float = 1.0,
     *,
-    measured: bool = True,
+    measured: Measured = Measured.CAMERAS,
     given: bool = False,
 ) -> AxisVerdict:
     """Return the identifiability along one axis.
@@ -103,16 +116,19 @@ def axis_verdict(
     encoder : (n,) standard deviations (mm) that the encoder's scale and the travel axis add.
     eta, rms, lines : as in `AxisVerdict`.
     inflation : factor of the standard deviations because of contradictions.
-    measured : whether anything but one bubble alone shows the shake. If not, eta does not count.
+    measured : what but one bubble alone shows the shake. Without anything eta does not count; if
+        only the carriage's motion is measured, it cannot make the axis RESOLVED, because the part
+        of the arms in it follows from the priors.
     given : whether the user states the shake's prior. If nothing measures the shake and nobody
         states it, q does not count either.
     """
     q, base = float(np.median(sigma / known)), float(np.median(known))
     ambiguous = any(
-        line.ambiguous and (line.rms_mm or 0.0) > base and (line.owner == "rig" or measured)
+        line.ambiguous and (line.rms_mm or 0.0) > base and (line.owner == "rig" or bool(measured))
         for line in lines
     )
-    agree, known_shake = inflation <= RESOLVED_Q, measured or given
+    agree, known_shake = inflation <= RESOLVED_Q, bool(measured) or given
+    arms = measured != Measured.CARRIAGE or given
     flags = []
     if ambiguous:
         flags.append(Flag.LABEL_AMBIGUOUS)
@@ -121,9 +137,13 @@ def axis_verdict(
     if not known_shake:
         flags.append(Flag.SHAKE_UNMEASURED)
     verdict = Verdict.CONTRADICTED
-    if agree:
+    if agree and known_shake:
         counted = eta if measured else None
-        verdict = rule(q, counted, ambiguous=ambiguous) if known_shake else Verdict.UNRESOLVED
+        verdict = rule(q, counted, ambiguous=ambiguous or not arms)
+    elif agree:
+        verdict = Verdict.UNRESOLVED
+    if not arms and verdict == Verdict.PARTIAL:
+        flags.append(Flag.ARMS_UNMEASURED)
     return AxisVerdict(
         verdict=verdict, flags=tuple(flags), q=q * inflation, eta=eta,
         sigma_mm=float(np.median(sigma)) * inflation, sigma_shake_known_mm=base,
@@ -136,8 +156,9 @@ def rule(q: float, eta: float | None, *, ambiguous: bool) -> Verdict:
     """Return the verdict on an axis whose measurements agree.
 
     q, eta : as in `AxisVerdict`.
-    ambiguous : whether a spectral line that is larger than the noise may be the bubbles' or the
-        rig's. Then the estimate of the shake, and with it eta, may be of the bubbles' motion.
+    ambiguous : whether a part of the shake may be motion of the bubbles: a spectral line that is
+        larger than the noise, or the motion of arms that nothing measures. Then eta alone cannot
+        make the axis RESOLVED.
     """
     share = -np.inf if eta is None else eta
     if q <= RESOLVED_Q or (share >= RESOLVED_ETA and not ambiguous):
@@ -145,26 +166,28 @@ def rule(q: float, eta: float | None, *, ambiguous: bool) -> Verdict:
     return Verdict.PARTIAL if q <= PARTIAL_Q or share >= PARTIAL_ETA else Verdict.UNRESOLVED
 
 
-def axes_with_measured_shake(solution: Solution) -> tuple[bool, bool, bool]:
-    """Return for x, y and z whether the shake is measured.
+def measured_shake(solution: Solution) -> tuple[Measured, Measured, Measured]:
+    """Return for x, y and z what measures the shake.
 
-    It is by a second bubble in most frames, by an accelerometer on the carriage, and, for
-    an axis that a camera sees, by marks in its images or an accelerometer on its arm. The motion of
-    a single bubble does not measure it.
+    A second bubble in most frames shows that of the cameras along all axes. So do, along the axes
+    that a camera sees, marks in its images and an accelerometer on its arm.
     """
     graph, problem = solution.graph, solution.graph.problem
     count = np.bincount(graph.frame_of_row, minlength=len(problem.t_s))
     several = np.count_nonzero(count > 1) > _MOSTLY * np.count_nonzero(count)
     carriage = any(sensor.camera == CARRIAGE for sensor in problem.accelerometers)
-    if several or carriage:
-        return True, True, True
     seen = [
         direction
         for camera in problem.arms_with_sensor | set(problem.references.camera.tolist())
         for direction in graph.shake.seen[camera]
     ]
-    x, y, z = (bool(any(direction[axis] ** 2 > _SEEN for direction in seen)) for axis in range(3))
-    return x, y, z
+
+    def of(axis: int) -> Measured:
+        if several or any(direction[axis] ** 2 > _SEEN for direction in seen):
+            return Measured.CAMERAS
+        return Measured.CARRIAGE if carriage else Measured.NOTHING
+
+    return of(0), of(1), of(2)
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array, Array]:

@@ -20,9 +20,10 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.estimator.smoothing.verdict.evidence import shake_of
 from telerig.estimator.smoothing.verdict.identifiability import (
-    axes_with_measured_shake,
+    Measured,
     axis_verdict,
     expected_shake,
+    measured_shake,
     rule,
     shake_share,
     verdicts,
@@ -183,34 +184,42 @@ def _axis(q: float, eta: float | None = None, **more: object) -> AxisVerdict:
 
 
 def test_without_a_measurement_of_the_shake_only_a_given_prior_counts() -> None:
-    alone = _axis(1.0, 0.99, measured=False)
+    alone = _axis(1.0, 0.99, measured=Measured.NOTHING)
     assert (alone.verdict, alone.flags) == ("UNRESOLVED", ("SHAKE_UNMEASURED",))
-    given = _axis(1.0, 0.99, measured=False, given=True)
+    given = _axis(1.0, 0.99, measured=Measured.NOTHING, given=True)
     assert (given.verdict, given.flags) == ("RESOLVED", ())
-    assert _axis(3.0, 0.99, measured=False, given=True).verdict == "UNRESOLVED"
+    assert _axis(3.0, 0.99, measured=Measured.NOTHING, given=True).verdict == "UNRESOLVED"
     assert _axis(3.0, 0.99).verdict == "RESOLVED"
 
 
+def test_a_sensor_on_the_carriage_does_not_measure_the_arms() -> None:
+    found = _axis(3.0, 0.99, measured=Measured.CARRIAGE)
+    assert (found.verdict, found.flags) == ("PARTIAL", ("ARMS_UNMEASURED",))
+    assert _axis(1.2, 0.5, measured=Measured.CARRIAGE).verdict == "RESOLVED"
+    assert _axis(3.0, 0.99, measured=Measured.CARRIAGE, given=True).verdict == "RESOLVED"
+    assert _axis(3.0, 0.5, measured=Measured.CARRIAGE).verdict == "UNRESOLVED"
+
+
 @pytest.mark.parametrize(
-    ("owner", "rms_mm", "measured", "flags"),
+    ("owner", "rms_mm", "flags"),
     [
-        ("rig", 0.02, True, ("LABEL_AMBIGUOUS",)),
-        ("bubble", 0.02, True, ("LABEL_AMBIGUOUS",)),
-        ("rig", 0.009, True, ()),
+        ("rig", 0.02, ("LABEL_AMBIGUOUS",)),
+        ("bubble", 0.02, ("LABEL_AMBIGUOUS",)),
+        ("rig", 0.009, ()),
     ],
 )
 def test_a_line_above_the_noise_whose_owner_is_unknown_makes_eta_worthless(
-    owner: str, rms_mm: float, measured: bool, flags: tuple[str, ...]
+    owner: str, rms_mm: float, flags: tuple[str, ...]
 ) -> None:
     line = AttributedLine(owner=owner, frequency_hz=9.0, rms_mm=rms_mm, ambiguous=True)
-    found = _axis(3.0, 0.99, lines=(line,), measured=measured)
+    found = _axis(3.0, 0.99, lines=(line,))
     assert (found.verdict, found.flags) == ("PARTIAL" if flags else "RESOLVED", flags)
 
 
 def test_contradicted_comes_before_all() -> None:
     assert _axis(1.0, 1.0, inflation=1.26).verdict == "CONTRADICTED"
     assert _axis(1.0, inflation=1.25).verdict == "RESOLVED"
-    assert _axis(1.0, measured=False, inflation=4.0).verdict == "CONTRADICTED"
+    assert _axis(1.0, measured=Measured.NOTHING, inflation=4.0).verdict == "CONTRADICTED"
 
 
 def test_what_measures_the_shake_along_which_axis() -> None:
@@ -230,16 +239,17 @@ def test_what_measures_the_shake_along_which_axis() -> None:
         return Accelerometer("a", camera, alone.t_s, still, np.eye(3), 10.0)
 
     for problem, measured in (
-        (alone, (False, False, False)),
-        (several, (True, True, True)),
-        (seldom, (False, False, False)),
+        (alone, (0, 0, 0)),
+        (several, (2, 2, 2)),
+        (seldom, (0, 0, 0)),
         (replace(marked, references=marked.references.of(marked.references.camera == 0)),
-         (True, True, False)),
-        (replace(alone, accelerometers=(sensor(1),)), (False, True, True)),
-        (replace(alone, accelerometers=(sensor(CARRIAGE),)), (True, True, True)),
+         (2, 2, 0)),
+        (replace(alone, accelerometers=(sensor(1),)), (0, 2, 2)),
+        (replace(alone, accelerometers=(sensor(CARRIAGE),)), (1, 1, 1)),
+        (replace(alone, accelerometers=(sensor(CARRIAGE), sensor(1))), (1, 2, 2)),
     ):  # fmt: skip
         solution = solve(problem, true_model(), replace(QUIET, covariances=False))
-        assert axes_with_measured_shake(solution) == measured
+        assert measured_shake(solution) == measured
 
 
 def test_one_bubble_alone_is_unresolved_with_default_priors() -> None:

@@ -27,9 +27,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.dots.fit.blurred_ellipse import (
     approximate_distance_px,
-    coverage_near_edge,
     coverage_on_grid,
-    largest_curvature,
     semi_axes,
 )
 from telerig.estimator.images.noise import NoiseModel
@@ -181,9 +179,6 @@ class DotFit:
 _FEW_PIXELS = 1e-9
 """Weight of a prior of 0 for each grey level, relative to one pixel, so that too few pixels still
 have a solution."""
-EDGE_EXPANSION_LIMIT = 0.25
-"""Curvature times sigma up to which the expansion agrees with the exact sum: centres to 1e-5 px,
-coverages to 5e-4."""
 _PRIOR = np.dtype([(f.name, type(f.default)) for f in fields(Prior)])
 _prior_values = attrgetter(*(f.name for f in fields(Prior)))
 
@@ -254,24 +249,6 @@ def gather(
 
 def _coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
     """Return the coverage (D, P) and its derivatives (D, 6, P) by theta (D, 6)."""
-    curved = largest_curvature(theta[:, 2:5]) * theta[:, 5] >= EDGE_EXPANSION_LIMIT
-    if np.all(curved):
-        return _exact_coverage(pixels, theta)
-    smooth = np.flatnonzero(~curved)
-    some, theirs = pixels.of(smooth), theta[smooth]
-    found = coverage_near_edge(
-        some.x - theirs[:, :1], some.y - theirs[:, 1:2], theirs[:, 2:5], theirs[:, 5]
-    )
-    if len(smooth) == len(theta):
-        return found
-    value, gradient = np.empty_like(pixels.x), np.empty((len(theta), 6, pixels.x.shape[1]))
-    value[smooth], gradient[smooth] = found
-    bent = np.flatnonzero(curved)
-    value[bent], gradient[bent] = _exact_coverage(pixels.of(bent), theta[bent])
-    return value, gradient
-
-
-def _exact_coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
     exact, slopes = coverage_on_grid(
         pixels.columns, pixels.rows, theta[:, :2], theta[:, 2:5], theta[:, 5]
     )

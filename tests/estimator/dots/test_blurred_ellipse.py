@@ -10,14 +10,10 @@ from scipy.ndimage import gaussian_filter1d
 from telerig.estimator.dots.fit.blurred_ellipse import (
     approximate_distance_px,
     axes_from_shape,
-    coverage_near_edge,
     coverage_on_grid,
     extent_px,
-    foot_points,
-    largest_curvature,
     shape_from_axes,
 )
-from telerig.estimator.dots.fit.luminance import EDGE_EXPANSION_LIMIT
 
 Array = NDArray[np.float64]
 K = 40  # sub-pixels per pixel
@@ -76,56 +72,6 @@ def test_gradient_is_the_difference_quotient(shape: tuple[float, ...], sigma: fl
         step = 1e-5 * np.eye(6)[i]
         quotient = (value(theta + step) - value(theta - step)) / 2e-5
         np.testing.assert_allclose(gradient[i], quotient, atol=5e-5)
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "angle", "sigma"), [(20, 20, 0.0, 1.0), (30, 20, 0.3, 1.0), (46, 43, -1.2, 2.3)]
-)
-def test_edge_expansion_agrees_with_the_exact_sum(
-    a: float, b: float, angle: float, sigma: float
-) -> None:
-    shape = shape_from_axes(a, b, angle)
-    assert largest_curvature(shape) * sigma < 0.08
-    pixels = np.arange(2 * int(a) + 30, dtype=float)
-    centre = np.array([a + 15.23, a + 14.6])
-    exact, slopes = coverage_on_grid(pixels, pixels, centre, shape, sigma)
-    u, v = np.meshgrid(pixels - centre[0], pixels - centre[1])
-    band = np.abs(approximate_distance_px(shape, u, v)) < 5.0 * sigma
-    coverage, gradient = coverage_near_edge(u[band], v[band], shape, sigma)
-    assert np.max(np.abs(coverage - exact[band])) < 1e-4
-    assert np.max(np.abs(gradient - slopes[:, band])) < 0.01 * np.max(np.abs(slopes))
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "angle"), [(5.0, 4.0, 0.4), (8.0, 5.0, 0.0), (12.0, 6.0, 0.4), (20.0, 9.0, 1.1)]
-)
-def test_edge_expansion_at_its_limit_hardly_moves_a_dot(a: float, b: float, angle: float) -> None:
-    shape, pixels = shape_from_axes(a, b, angle), np.arange(2 * int(a) + 20, dtype=float)
-    sigma = 0.96 * EDGE_EXPANSION_LIMIT / float(largest_curvature(shape))
-    centre = np.array([a + 10.23, a + 9.6])
-    exact, slopes = coverage_on_grid(pixels, pixels, centre, shape, sigma)
-    u, v = np.meshgrid(pixels - centre[0], pixels - centre[1])
-    found, _ = coverage_near_edge(u.ravel(), v.ravel(), shape, sigma)
-    error = found - exact.ravel()
-    assert np.max(np.abs(error)) < 5.5e-4
-    columns = np.vstack([slopes.reshape(6, -1), np.ones(error.size), exact.ravel()])
-    moved = np.linalg.lstsq(columns.T, error, rcond=None)[0]
-    assert np.linalg.norm(moved[:2]) < 2e-5
-
-
-def test_foot_points_are_the_nearest_points() -> None:
-    rng = np.random.default_rng(3)
-    shape = shape_from_axes(30.0, 18.0, 0.8)
-    t = np.linspace(0, 2 * np.pi, 20_001)[:-1]
-    outline = np.stack(
-        [shape[0] * np.cos(t) + shape[1] * np.sin(t), shape[1] * np.cos(t) + shape[2] * np.sin(t)]
-    )
-    away = 1.0 + rng.uniform(-0.15, 0.2, 60)
-    points = outline[:, rng.integers(0, 20_000, 60)] * away
-    nearest = np.min(np.hypot(*(points[:, :, None] - outline[:, None, :])), axis=1)
-    c, s = foot_points(shape, points[0], points[1])
-    gap = np.hypot(points[0] - shape[0] * c - shape[1] * s, points[1] - shape[1] * c - shape[2] * s)
-    np.testing.assert_allclose(gap, nearest, atol=1e-3)
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (4, 3)])

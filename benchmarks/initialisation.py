@@ -22,7 +22,7 @@ import numpy as np
 from calibration_scene import Scene, make_scene
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.self_calibration import best_start, with_plate
+from telerig.estimator.calibration.self_calibration import best_start
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
 from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start import mirror_ambiguity
@@ -103,11 +103,11 @@ def random_config(rng: np.random.Generator, two_sided: bool) -> SimulationConfig
 
 def judge(scene: Scene) -> tuple[str, str]:
     """(cause, detail) of a failure; empty strings for a good start."""
-    problem = with_plate(scene.problem())
+    problem = scene.problem()
     nominal = {1: np.array(scene.nominal_rotvec_deg)}
     truth = scene.true_state(problem)
     try:
-        start = best_start(problem, problem.nominal_mm)
+        problem, start = best_start(problem, problem.nominal_mm)
         start = mirror_ambiguity.choose_solution(start, problem, nominal).state
     except CalibrationError as error:
         return "refused", str(error.what)

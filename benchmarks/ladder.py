@@ -198,13 +198,13 @@ def outcome(rungs: tuple[str, str], weak: bool, rng: np.random.Generator) -> Out
     robust, choice = choose_model(problem, start, ("auto", "auto"))
     seconds = time.process_time() - begun
     points = rng.uniform(-VOLUME_MM, VOLUME_MM, (200, 3))
-    right = robust.problem.with_model([name_of(t) for t in truth])
-    fitted = solve(right, model_start(right, robust.solution.state), relative=1e-8)
-    errors = [
-        space_mm(scene, problem, state, points) for state in (choice.chosen.state, fitted.state)
-    ]
+    errors = []
+    for lenses in (choice.lenses, truth):
+        model = robust.problem.with_model([name_of(lens) for lens in lenses])
+        fitted = solve(model, model_start(model, robust.solution.state), relative=1e-8)
+        errors.append(space_mm(scene, problem, fitted.state, points))
     size = f"{len(problem.views)} views, {len(problem.dot_ids)} dots"
-    return Outcome(choice.chosen.lenses, truth, errors[0] / errors[1], seconds, size)
+    return Outcome(choice.lenses, truth, errors[0] / errors[1], seconds, size)
 
 
 def drawn_rungs(rung: str, rng: np.random.Generator) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.self_calibration import with_plate
+from telerig.estimator.calibration.self_calibration import best_start
 from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.problem import eccentricity_px, held_at_nominal
 from telerig.estimator.calibration.solver.robust_least_squares import linearisation, solve
@@ -152,7 +152,8 @@ def bound_covariance(
     problem = replace(scene, dots=dots).problem()
     if kept is not None:
         problem = replace(problem, weight=kept.astype(float))
-    problem = with_plate(replace(problem, solver="schur")).with_model(model)
+    problem, _ = best_start(replace(problem, solver="schur"), problem.nominal_mm)
+    problem = problem.with_model(model)
     solution = solve(problem, held_at_nominal(problem, scene.true_state(problem)))
     _, covariance = joint_covariance(problem, solution).rig_block()
     first, second = scene.cameras.values()

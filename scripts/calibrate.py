@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 
 _SOURCES = ("images", "dots")
+_POLL_S = 1.0
+"""Time between two looks into the folder that is watched."""
 
 
 @errors_in_words()
@@ -37,7 +39,6 @@ def calibrate(
     dataset: options.Dataset,
     out: options.CalibrationFolder = None,
     model: options.Model = "auto",
-    solver: Annotated[str, typer.Option(help="Solver: auto, gtsam or schur.")] = "auto",
     dots: Annotated[
         str,
         typer.Option(
@@ -80,12 +81,11 @@ def calibrate(
         ),
     ] = None,
     poll: Annotated[
-        float,
-        typer.Option(help="With --watch: seconds between two looks into the folder.", min=0.02),
-    ] = 1.0,
-    seed: Annotated[
-        int, typer.Option(help="Recorded in run.json; the calibration uses no random numbers.")
-    ] = 0,
+        float | None,
+        typer.Option(
+            help="With --watch: seconds between two looks into the folder (1 s).", min=0.02
+        ),
+    ] = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
@@ -109,25 +109,25 @@ def calibrate(
 
     begun = time.perf_counter()
     settings: dict[str, Any] = {
-        "model": model, "solver": solver, "medium": medium, "seed": seed, "dots_free": dots,
-        "outlier_sd": outlier_sd,
+        "model": model, "medium": medium, "dots_free": dots, "outlier_sd": outlier_sd,
     }  # fmt: skip
     check_options(**settings)
     record: dict[str, Any] = {
-        "model": model, "solver": solver, "dots": dots, "medium": medium, "outlier_sd": outlier_sd,
-        "compare": None if compare is None else str(compare), "from": source, "seed": seed,
+        "model": model, "dots": dots, "medium": medium, "outlier_sd": outlier_sd,
+        "compare": None if compare is None else str(compare), "from": source,
     }  # fmt: skip
     with report_beside(report) as write_report:
         earlier = None if compare is None else _earlier(compare, dataset)
         if watch:
-            data, run = _watched(dataset, source, until_um, poll, settings)
+            data, run = _watched(dataset, source, until_um, poll or _POLL_S, settings)
             used = None
             record |= {"watch": True, "until_um": until_um}
         else:
-            if until_um is not None:
-                raise InputError(
-                    "--until-um goes with --watch", todo="add --watch, or leave it out"
-                )
+            for option, value in (("--until-um", until_um), ("--poll", poll)):
+                if value is not None:
+                    raise InputError(
+                        f"{option} goes with --watch", todo="add --watch, or leave it out"
+                    )
             begin = None if write_report is None else write_report.begin
             data = load_dataset(dataset, source=options.chosen("--from", source, _SOURCES))
             used = fingerprints(out or data.results / "calibration", sources(data))

@@ -47,7 +47,7 @@ def demo(
     data = simulate(_config(), rng=np.random.default_rng(seed), out=out)
     simulated = time.perf_counter()
     with progress(quiet) as stage:
-        run = run_calibration(data, seed=seed, stage=stage, pictures=True)
+        run = run_calibration(data, stage=stage, pictures=True)
     seconds = {"simulate": simulated - begun, "calibrate": time.perf_counter() - simulated}
     folder = data.results / "calibration"
     record = {"seed": seed}

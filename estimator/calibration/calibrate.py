@@ -10,7 +10,6 @@ from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.solver.problem import (
     DOTS_FREE,
     OUTLIER_SD,
-    SOLVERS,
     checked_outlier_sd,
 )
 from telerig.io.results.findings import Code, Finding
@@ -50,7 +49,6 @@ def checked_medium(medium: str) -> str:
 def check_options(
     *,
     model: Model = AUTO,
-    solver: str = "auto",
     medium: str = "air",
     dots_free: str = "3d",
     outlier_sd: float = OUTLIER_SD,
@@ -68,9 +66,10 @@ def check_options(
         models_by_camera(model, cameras)
     elif isinstance(model, str):
         checked_model(model)
-    for what, word, known in (("solver", solver, SOLVERS), ("choice", dots_free, DOTS_FREE)):
-        if word not in known:
-            raise CalibrationError(f"unknown {what} {word!r}", todo=f"known: {', '.join(known)}")
+    if dots_free not in DOTS_FREE:
+        raise CalibrationError(
+            f"unknown choice {dots_free!r}", todo=f"known: {', '.join(DOTS_FREE)}"
+        )
 
 
 def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
@@ -92,21 +91,17 @@ def calibrate(
     dataset: Dataset,
     *,
     model: Model = AUTO,
-    solver: str = "auto",
     medium: str = "air",
     outlier_sd: float = OUTLIER_SD,
-    seed: int = 0,
     progress: Progress | bool = False,
 ) -> Calibration:
     """Calibrate a rig from the images or the dots of a dataset; no file is written.
 
     model : "auto" (chosen for each camera), the name of a lens model (none, radial, brown,
         kappa+radial, ...), or one for each camera: {"left": "brown"}, "left=brown,right=auto".
-    solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     medium : "air" or "water", in which the target is. If `rig.toml` has `[walls]` (refractive
         windows), the runs are in water in both cases.
     outlier_sd : a dot that is further from the model than this is left out, in standard deviations.
-    seed : number that is written with the result; the calibration itself uses no random numbers.
     progress : True to show a progress bar; or a function that is called with the name of the step,
         the number done and the total, 0 if it is not known.
 
@@ -115,7 +110,7 @@ def calibrate(
     to do.
     """
     run = run_calibration(
-        dataset, model=model, solver=solver, medium=medium, outlier_sd=outlier_sd, seed=seed,
+        dataset, model=model, medium=medium, outlier_sd=outlier_sd,
         stage=None if isinstance(progress, bool) else progress,
     )  # fmt: skip
     return run.calibration
@@ -125,9 +120,7 @@ def run_calibration(
     dataset: Dataset,
     *,
     model: Model = AUTO,
-    solver: str = "auto",
     medium: str = "air",
-    seed: int = 0,
     dots_free: str = "3d",
     outlier_sd: float = OUTLIER_SD,
     stage: Progress | None = None,
@@ -136,7 +129,7 @@ def run_calibration(
 ) -> CalibrationRun:
     """Calibrate like `calibrate`, with further options, and return the detected dots as well.
 
-    dataset, model, solver, medium, seed, outlier_sd : as for `calibrate`.
+    dataset, model, medium, outlier_sd : as for `calibrate`.
     dots_free : how far the target's dots may move from their nominal positions; "3d" lets them
         move in all three directions. `DOTS_FREE` lists the allowed values.
     stage : function that is called with the name of the step, the number done and the
@@ -148,7 +141,7 @@ def run_calibration(
     Raises the same errors as `calibrate`.
     """
     check_options(
-        model=model, solver=solver, medium=medium, dots_free=dots_free, outlier_sd=outlier_sd,
+        model=model, medium=medium, dots_free=dots_free, outlier_sd=outlier_sd,
         cameras=list(dataset.rig.cameras),
     )  # fmt: skip
     if detected is None:
@@ -157,8 +150,8 @@ def run_calibration(
     read = [Code.NOTE.found(text=note) for note in dataset.notes]
     read += () if detected is None else detected.findings
     calibration = solve_dots(
-        dataset, table, model=model, solver=solver, medium=medium, dots_free=dots_free,
-        outlier_sd=outlier_sd, stage=stage, findings=read,
+        dataset, table, model=model, medium=medium, dots_free=dots_free, outlier_sd=outlier_sd,
+        stage=stage, findings=read,
     )  # fmt: skip
     calibration = replace(_with_stage(dataset, calibration, stage), medium=medium)
     if dataset.rig.walls or medium == "water":
@@ -167,7 +160,7 @@ def run_calibration(
         if medium == "air":
             calibration = behind_windows(calibration, dataset.rig.windows)
         calibration = _with_findings(calibration, window_findings(calibration, dataset.rig))
-    return CalibrationRun(_with_measured(calibration, table, seed), detected)
+    return CalibrationRun(_with_measured(calibration, table), detected)
 
 
 def solve_dots(
@@ -175,7 +168,6 @@ def solve_dots(
     table: pd.DataFrame,
     *,
     model: Model,
-    solver: str,
     medium: str,
     dots_free: str,
     outlier_sd: float = OUTLIER_SD,
@@ -184,8 +176,8 @@ def solve_dots(
 ) -> Calibration:
     """Calibrate the rig from a table of dots, without measuring the stage's axis.
 
-    table : the measured dots, with the columns of dots.csv. model, solver, medium, dots_free,
-    outlier_sd, stage : as for `run_calibration`.
+    table : the measured dots, with the columns of dots.csv. model, medium, dots_free, outlier_sd,
+    stage : as for `run_calibration`.
     findings : what was found while the dots were read.
 
     The refractive windows of rig.toml are part of the model only if ``medium`` is "water". If it is
@@ -203,7 +195,6 @@ def solve_dots(
         nominal_rotvec_deg=rig.rotvec_from_first_deg,
         model=model,
         dots_free=dots_free,
-        solver=solver,
         outlier_sd=outlier_sd,
         progress=None if stage is None else lambda i, _: stage("solve", i, 0),
         findings=findings,
@@ -257,12 +248,12 @@ def _with_findings(calibration: Calibration, more: Sequence[Finding]) -> Calibra
     return replace(calibration, findings=(*(calibration.findings or ()), *more))
 
 
-def _with_measured(calibration: Calibration, table: pd.DataFrame, seed: int) -> Calibration:
-    """Put the covariance and chi-square of the image fit beside the dots; record the seed."""
+def _with_measured(calibration: Calibration, table: pd.DataFrame) -> Calibration:
+    """Put the covariance and chi-square of the image fit beside the dots."""
     columns = ["suu_px2", "suv_px2", "svv_px2", "chi2_dof"]
     measured = table.reindex(columns=["view", "camera", "dot", *columns]).copy()
     measured["view"] = measured["view"].astype(str)
     dots = calibration.dots.merge(measured, on=["view", "camera", "dot"], how="left")
     dots["chi2_dof"] = dots["chi2_dof"].astype(float)
     tables = {"dots.csv": dots, "residuals.csv": calibration.residuals}
-    return replace(calibration, tables=tables, statistics={**calibration.statistics, "seed": seed})
+    return replace(calibration, tables=tables)

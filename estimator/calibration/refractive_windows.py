@@ -25,7 +25,6 @@ from telerig.rig.triangulation import aligned_covariance, triangulate_any, worki
 from telerig.rig.windows import Wall
 
 _NOTABLE_UM = 0.1
-_STEP_MM = 10.0
 
 
 def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
@@ -127,8 +126,6 @@ def window_findings(calibration: Calibration, rig: RigDescription) -> list[Findi
     for camera in cameras:
         found += _implausible(camera)
         found += _uncertain(calibration, camera) + _tilt_sign_ambiguous(calibration, camera)
-        if rig.walls[camera.name].distance_mm is None:
-            found += _without_distance(camera)
     return found
 
 
@@ -184,22 +181,6 @@ def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[Findi
 
 def _angle_rad(a: Array, b: Array) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
-
-
-def _without_distance(camera: Camera) -> list[Finding]:
-    """Return the finding on the effect of 10 mm of a window's unknown distance."""
-    if camera.wall is None:
-        return []
-    farther = replace(camera.wall, distance_mm=camera.wall.distance_mm + _STEP_MM)
-    points = working_volume((camera,))
-    moved = replace(camera, wall=farther).project(points) - camera.project(points)
-    moved = moved / camera["scale_px_per_mm"] * 1e3
-    common = moved.mean(0)
-    shift, rest = float(np.linalg.norm(common)), float(np.abs(moved - common).max())
-    if max(shift, rest) < _NOTABLE_UM:
-        return []
-    numbers = {"step_mm": _STEP_MM, "shift_um": shift, "rest_um": rest}
-    return [Code.NO_DISTANCE.found(numbers, cameras=camera.name)]
 
 
 def window_warnings(rig: RigDescription | None, calibration: Calibration) -> list[str]:

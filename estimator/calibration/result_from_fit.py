@@ -186,7 +186,10 @@ def residual_table(problem: Problem, state: State) -> pd.DataFrame:
 
 def _reason(distance: float, lost_view: bool, limit: float) -> str:
     if lost_view:
-        return "too few dots of this view agree with the model to place the target"
+        return (
+            "the dots of this view that agree with the model are too few, or in one row, to place "
+            "the target"
+        )
     return f"{distance:.1f} standard deviations from the model (limit {limit:g})"
 
 
@@ -380,13 +383,13 @@ def _model(fit: Fit) -> dict[str, Any]:
         "name": fit.model,
         "by_camera": dict(zip(cameras, fit.models)),
         "words": fit.model_words,
-        "ladder": [_step(step, steps[max(k - 1, 0)], cameras) for k, step in enumerate(steps)],
+        "ladder": [_step(step, cameras) for step in steps],
     }
 
 
-def _step(step: Step, before: Step, cameras: list[str]) -> dict[str, Any]:
+def _step(step: Step, cameras: list[str]) -> dict[str, Any]:
     """Return one step of the choice as a row; values that were not computed are None."""
-    row: dict[str, Any] = {
+    return {
         "model": joint_name([name_of(lens) for lens in step.lenses], cameras),
         "camera": cameras[step.camera] if step.camera >= 0 else "",
         "added": list(step.added),
@@ -396,15 +399,6 @@ def _step(step: Step, before: Step, cameras: list[str]) -> dict[str, Any]:
         "p_value": _finite(step.p_value),
         "words": step.words,
     }
-    fit, earlier = step.fit, before.fit
-    if fit is None:
-        return row
-    return row | {
-        "parameters": fit.parameters, "chi2_dof": 2 * fit.cost / fit.rows,
-        "bic": 2 * fit.cost + fit.parameters * float(np.log(fit.rows)), "rms_px": fit.rms_px,
-        "held_out": _finite(fit.left_out),
-        "held_out_before": None if earlier is None else _finite(earlier.left_out),
-    }  # fmt: skip
 
 
 def _finite(value: float) -> float | None:

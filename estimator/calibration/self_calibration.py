@@ -33,7 +33,6 @@ from telerig.estimator.calibration.result_from_fit import (
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import (
     OUTLIER_SD,
-    SOLVERS,
     Problem,
     checked_outlier_sd,
     eccentricity_px,
@@ -83,7 +82,6 @@ def self_calibrate(
     nominal_rotvec_deg: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
     model: Model = AUTO,
     dots_free: str = "3d",
-    solver: str = "auto",
     outlier_sd: float = OUTLIER_SD,
     progress: Progress | None = None,
     findings: Sequence[Finding] = (),
@@ -102,7 +100,6 @@ def self_calibrate(
     dots_free : how the dots may differ from their nominal positions: "3d" (in all directions, as
         far as the target's stated standard deviations allow), "plane" (only within the plane of the
         target) or "nominal" (not at all).
-    solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     outlier_sd : number of standard deviations from the model beyond which a dot is left out.
     findings : what was found while the dots were read; it is added to the result.
     name : name of the rig.
@@ -113,11 +110,9 @@ def self_calibrate(
         todo = f"give one to {MOST_CAMERAS} cameras"
         raise InputError(f"{len(cameras)} cameras", todo=todo)
     models = models_by_camera(model, [c.name for c in cameras])
-    if solver not in SOLVERS:
-        raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     nominal = _nominal(nominal_rotvec_deg, cameras)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
-    problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd), solver=solver)
+    problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd))
     checks.refuse_copies(problem)
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
@@ -127,7 +122,6 @@ def self_calibrate(
         problem, turned = symmetric_target.number_consistently(problem, nominal)
         known += turned
         start_dots = problem.nominal_mm
-    problem = with_plate(problem, nominal)
     try:
         found = _solved(problem, start_dots, nominal, models, pre, known, name, progress)
     except (CalibrationError, GeometryError) as error:
@@ -152,8 +146,7 @@ def _solved(
 
     known : the findings of before.
     """
-    cameras = problem.cameras
-    start = best_start(problem, start_dots, nominal)
+    problem, start = best_start(problem, start_dots, nominal)
     mirror = mirror_ambiguity.choose_start(start, problem, nominal)
     start = mirror_ambiguity.with_tilt_signs(problem, mirror.state)
     problem = _with_origin(problem, start)
@@ -294,51 +287,36 @@ def hold_dots(problem: Problem, dots_free: str) -> Problem:
     return replace(problem, dot_sigma_mm=sigma)
 
 
-def with_plate(problem: Problem, nominal: mirror_ambiguity.Nominal | None = None) -> Problem:
-    """Return the problem in which the views through a two-sided plate are marked as such.
-
-    Which of its two sides carries the dots is not known, so both are tried; the better fit is kept.
-    The problem stays as it is for other targets, and for a single camera.
-
-    nominal : nominal rotation vectors in degrees by the camera's index.
-    """
-    target = problem.target
-    if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
-        return problem
-    hands = np.zeros((len(problem.views), len(problem.cameras)))
-    for image, found in known_target.image_maps(problem, problem.nominal_mm).items():
-        hands[image] = np.sign(np.linalg.det(found.jacobian))
-    options = [replace(problem, plate_shift=np.where(hands == h, -hands, 0.0)) for h in (1, -1)]
-    costs = []
-    for option in options:
-        start = best_start(option, option.nominal_mm, nominal)
-        costs.append(solve(option, start, max_iterations=20).cost)
-    return options[int(np.argmin(costs))]
-
-
 def best_start(
     problem: Problem, dots_mm: Array, nominal: mirror_ambiguity.Nominal | None = None
-) -> State:
+) -> tuple[Problem, State]:
     """Return a start for the calibration: of several closed-form states the one that fits best.
 
-    Each is improved by a few iterations before the costs are compared.
+    Each is improved by a few iterations before the costs are compared. The problem is returned,
+    too, because which side of a two-sided plate carries the dots is decided by the same costs.
 
     dots_mm : (N, 3) positions of the target's dots. nominal : nominal rotation vectors in degrees
     by the camera's index; they decide between states that fit equally well (see
     `mirror_ambiguity.consistent_start`).
     """
     if len(problem.cameras) == 1:
-        return known_target.mono_state(problem, dots_mm)
-    starts = known_target.stereo_states(problem, dots_mm)
-    if np.any(problem.plate_shift):  # refraction distinguishes mirrored solutions
-        starts += [mirror_ambiguity.mirrored_state(start) for start in starts]
-    fits: list[Solution] = []
-    for start in starts:
-        perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)
-        candidate = _with_origin(problem.with_model("kappa" if perspective else "none"), start)
-        fits.append(solve(candidate, start, max_iterations=15, relative=1e-4))
-    states, costs = [f.state for f in fits], [f.cost for f in fits]
-    return mirror_ambiguity.consistent_start(states, costs, problem, nominal or {})
+        return problem, known_target.mono_state(problem, dots_mm)
+    options = []
+    for side in known_target.plate_sides(problem):
+        starts = known_target.stereo_states(side, dots_mm)
+        if np.any(side.plate_shift):  # refraction distinguishes mirrored solutions
+            starts += [mirror_ambiguity.mirrored_state(start) for start in starts]
+        fits = [_rough_fit(side, start) for start in starts]
+        options.append((min(fit.cost for fit in fits), side, fits))
+    _, side, fits = min(options, key=lambda option: option[0])
+    states, costs = [fit.state for fit in fits], [fit.cost for fit in fits]
+    return side, mirror_ambiguity.consistent_start(states, costs, side, nominal or {})
+
+
+def _rough_fit(problem: Problem, start: State) -> Solution:
+    perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)
+    candidate = _with_origin(problem.with_model("kappa" if perspective else "none"), start)
+    return solve(candidate, start, max_iterations=15, relative=1e-4)
 
 
 def _fit(
@@ -354,7 +332,7 @@ def _fit(
     if AUTO in models:
         first, choice = choose_model(problem, start, models, progress)
         weighed = first.problem
-        models, start, words = choice.chosen.names, choice.chosen.state, choice.words
+        models, start, words = choice.names, choice.start, choice.words
         if any("centre" in name for name in models):
             words += (
                 "; because the perspective is strong, the image centre (where the optical axis "
@@ -367,8 +345,7 @@ def _fit(
         begin = robust_solve(final, model_start(final, start)).solution.state
     else:  # without the outliers that are known by now
         sound = replace(final, weight=weighed.weight, covariance_px2=weighed.covariance_px2)
-        start = held_at_nominal(final, start)
-        begin = solve(sound, start, max_iterations=15, relative=1e-5).state
+        begin = solve(sound, held_at_nominal(final, start), max_iterations=15, relative=1e-5).state
     final = replace(final, eccentricity_px=eccentricity_px(final, begin))
     robust = robust_solve(final, begin, progress=progress)
     return Fit(robust, models, words, choice, held)

@@ -229,7 +229,6 @@ def watch(
     """
     check_options(**options, cameras=list(dataset.rig.cameras))
     folder = WatchedFolder(dataset.path, tell)
-    solve = {k: v for k, v in options.items() if k != "seed"}
     known: object = None
     folder.poll(stop)
     while not stop.wait(interval_s):
@@ -237,7 +236,7 @@ def watch(
         version = folder.version()
         if version != known:
             known = version
-            if _solved(folder, dataset, tell, until_um, solve):
+            if _solved(folder, dataset, tell, until_um, options):
                 break
     if stop.is_set():
         tell("stopped; calibrating with the images that have arrived")

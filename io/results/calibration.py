@@ -197,12 +197,6 @@ class LadderStep(Part):
     chi2_gain : decrease of chi-square.
     bic_gain : this decrease minus the penalty of the extended Bayesian information criterion.
     p_value : probability of such a decrease of chi-square if the added parameters were 0.
-    parameters : number of free parameters.
-    chi2_dof : chi-square per degree of freedom.
-    bic : the extended Bayesian information criterion.
-    rms_px : RMS of the residuals in px.
-    held_out, held_out_before : mean squared error of the prediction of views that were left out of
-        the fit, with this model and with the previous one.
     """
 
     model: str = ""
@@ -213,12 +207,6 @@ class LadderStep(Part):
     bic_gain: float | None = None
     p_value: float | None = None
     words: str = ""
-    parameters: int | None = None
-    chi2_dof: float | None = None
-    bic: float | None = None
-    rms_px: float | None = None
-    held_out: float | None = None
-    held_out_before: float | None = None
 
 
 class LensModel(Part):

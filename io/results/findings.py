@@ -117,26 +117,11 @@ class Code(Enum):
         _FALSE_ALARM,
         _OF_ALL_TESTS,
     )
-    DIRECTION = Kind(
-        _USABLE,
-        "{cameras}: residuals are {ratio:.2f} times longer along {angle_deg:.0f} degrees (from u "
-        "towards v)",
-        "Possible causes: motion during the exposure, a sensor read line by line",
-        _FALSE_ALARM,
-        _OF_ALL_TESTS,
-    )
     NEIGHBOURS = Kind(
         _USABLE,
         "{cameras}: residuals of neighbouring dots correlate ({correlation:.2f})",
         "Possible causes: a plate that bends from view to view, refraction, a lens error finer "
         "than the model",
-        _FALSE_ALARM,
-        _OF_ALL_TESTS,
-    )
-    WORSE_VIEWS = Kind(
-        _USABLE,
-        "{cameras}: residuals in {views} are up to {ratio:.1f} times those of the other views",
-        "Is an image blurred or badly lit, or did the target move?",
         _FALSE_ALARM,
         _OF_ALL_TESTS,
     )
@@ -185,7 +170,7 @@ class Code(Enum):
     )
     UNUSED_VIEWS = Kind(
         _NOTE,
-        "no camera has enough dots in {views}",
+        "no camera has enough dots in {views}, or they are all in one row",
         limit=4,
         because="dots: fewer do not determine a pose",
     )
@@ -370,13 +355,6 @@ class Code(Enum):
         "side: with a telecentric lens and the target in the water, images do not show the sign of "
         "the tilt. Points are not affected",
         "If you need the normal itself, state it more precisely in rig.toml",
-    )
-    NO_DISTANCE = Kind(
-        _NOTE,
-        "[walls] has no distance_mm for {cameras}, so the window is taken to be at the camera's "
-        "origin. If it is {step_mm:.0f} mm away from there, all points of this camera are shifted "
-        "by {shift_um:.1f} µm, and single points by up to {rest_um:.1f} µm more",
-        "Add distance_mm if this matters",
     )
     # Sentences without a code: on the files of a dataset, and of versions that had no codes.
     NOTE = Kind(_NOTE, "{text}")

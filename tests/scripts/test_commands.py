@@ -191,7 +191,7 @@ def test_unknown_preset_and_model_are_named(paper_images, tmp_path):
 def test_calibrate_as_a_command_and_from_python_have_the_same_defaults() -> None:
     command = inspect.signature(calibrate_command).parameters
     python = inspect.signature(run_calibration).parameters
-    same = {name: name for name in ("model", "solver", "medium", "outlier_sd", "seed")}
+    same = {name: name for name in ("model", "medium", "outlier_sd")}
     for option, parameter in (same | {"dots": "dots_free"}).items():
         assert command[option].default == python[parameter].default, option
 

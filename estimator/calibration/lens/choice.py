@@ -1,9 +1,7 @@
 """Chooses each camera's lens model by what the data support.
 
 A rich model is fitted once, and the information criterion of `search` selects the best model that
-it contains. The models between the simplest one and the selected one are then fitted, with one more
-group of parameters at each step. Each step is kept only if it predicts left-out views at least as
-well as the step before (cross-validation).
+it contains; the others are not fitted.
 
 A group of parameters that is not worth freeing is not therefore zero. Some groups act like
 parameters that are free: the stretch of one camera's image, for instance, acts like that of the
@@ -21,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc
@@ -29,7 +26,6 @@ from scipy.special import chdtrc
 from telerig.arrays import Array
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
-    Addition,
     Lens,
     Lenses,
     QuadraticCost,
@@ -39,65 +35,19 @@ from telerig.estimator.calibration.lens.search import (
     steps_to,
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
-from telerig.estimator.calibration.solver.problem import (
-    Problem,
-    System,
-    held_at_nominal,
-    images_of,
-    retracted,
+from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
+from telerig.estimator.calibration.solver.robust_least_squares import (
+    UNDAMPED,
+    Solution,
+    linearisation,
+    solve,
 )
-from telerig.estimator.calibration.solver.robust_least_squares import Solution, linearisation, solve
-from telerig.factors.calibration import State, pixels, whitened_error
-from telerig.io.machine.parallel import ordered_map, quick_workers
+from telerig.factors.calibration import State
 from telerig.rig.lens_parameters import AUTO, GROUPS, INDEX, groups_of, joint_name, name_of, ordered
-
-DOTS_FOR_WORKERS = 500
-"""Number of measured dots below which no worker processes are used: four fits then take 0.1 s, and
-starting processes for them 0.05 s."""
-TOO_COSTLY = 10.0
-"""A model is not cross-validated if its cost is more than this many times that of the rich
-model."""
-ROUNDS = 3
-AGREEMENT = 2.0
-"""If the chi-square of a fit differs by more than this from its quadratic prediction, the quadratic
-is recomputed at the fit."""
 
 _TILT = [INDEX["tilt_x"], INDEX["tilt_y"]]
 _SHAPE = [INDEX["aspect"], INDEX["skew"]]
 _SCALE = INDEX["scale_px_per_mm"]
-
-
-@dataclass(frozen=True)
-class FittedModel:
-    """A fitted lens model of all cameras.
-
-    lenses : for each camera the groups of parameters that are free.
-    parameters : number of free intrinsics.
-    cost : half the sum of squared whitened residuals, including those of the priors.
-    rows : number of measured coordinates.
-    rms_px : RMS residual per coordinate.
-    per_view : (V,) for each of the V views the mean squared whitened residual when a fit without
-        this view predicts it; NaN if too few views would remain for the fit, infinite if the model
-        was not cross-validated.
-    """
-
-    lenses: Lenses
-    parameters: int
-    cost: float
-    rows: int
-    rms_px: float
-    per_view: Array
-    state: State
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(name_of(lens) for lens in self.lenses)
-
-    @property
-    def left_out(self) -> float:
-        """The mean of ``per_view``; infinite if no view could be left out."""
-        seen = self.per_view[~np.isnan(self.per_view)]
-        return float(seen.mean()) if len(seen) else float("inf")
 
 
 @dataclass(frozen=True)
@@ -112,7 +62,6 @@ class Step:
     bic_gain : the same minus the penalty of the information criterion.
     taken : whether the group was added.
     words : why not.
-    fit : None if the gain was predicted without a fit.
     undetermined : whether the views do not determine the added parameters.
     """
 
@@ -122,8 +71,7 @@ class Step:
     gain: float
     bic_gain: float
     taken: bool
-    words: str
-    fit: FittedModel | None
+    words: str = ""
     undetermined: bool = False
 
     @property
@@ -140,12 +88,19 @@ class Choice:
     """The chosen lens model.
 
     steps : those that led to the model, then those that were not taken.
+    lenses : for each camera the groups of parameters that are free.
+    start : a state near the minimum of the chosen model.
     words : reasons of the choice, for the user.
     """
 
     steps: tuple[Step, ...]
-    chosen: FittedModel
+    lenses: Lenses
+    start: State
     words: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name_of(lens) for lens in self.lenses)
 
 
 def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
@@ -158,21 +113,16 @@ def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
     allowed = [possible(lens) if m == AUTO else [lens] for lens, m in zip(whole, models)]
     simplest = tuple(min(options, key=len) for options in allowed)
     quadratic = QuadraticCost.of(problem, rich)
-    wanted = _determined(quadratic, allowed)
-    for _ in range(ROUNDS):
-        path = steps_to(quadratic, wanted, simplest)
-        alternatives = _alternatives(quadratic, wanted, allowed)
-        fits = _fits(problem, rich, [simplest, *(step[2] for step in path)], alternatives)
-        fitted, others = fits[: len(path) + 1], fits[len(path) + 1 :]
-        quadratic, better = _revised(problem, quadratic, fitted[-1], others, allowed)
-        if better == wanted:
-            break
-        wanted = better
-    steps = _without_worse_predictions(_taken(quadratic, path, fitted))
-    chosen = [step.fit for step in steps if step.taken and step.fit is not None][-1]
-    refused = [step for step in steps if not step.taken]
-    steps += _not_taken(quadratic, chosen.lenses, allowed, refused)
-    return Choice(tuple(steps), chosen, _words(problem, steps, chosen, others))
+    chosen = _determined(quadratic, allowed)
+    start = rich.state
+    if any("tilt" in lens for lens in chosen):
+        chosen, start = _tilted_or_flat(problem, rich, quadratic, chosen, allowed)
+    steps = [Step(-1, (), simplest, np.nan, np.nan, True)]
+    for camera, group, lenses in steps_to(quadratic, chosen, simplest):
+        steps.append(_step(quadratic, steps[-1].lenses, camera, group, lenses))
+    steps += _not_taken(quadratic, chosen, allowed)
+    words = _words(problem, quadratic, steps, chosen, rich.state)
+    return Choice(tuple(steps), chosen, start, words)
 
 
 def _lens_of(free: Sequence[str]) -> Lens:
@@ -195,47 +145,26 @@ def _determined(quadratic: QuadraticCost, allowed: list[list[Lens]]) -> Lenses:
             allowed[c] = [lens for lens in allowed[c] if group not in lens]
 
 
-def _alternatives(
-    quadratic: QuadraticCost, wanted: Lenses, allowed: list[list[Lens]]
-) -> list[Lenses]:
-    """Return more models to fit: the best without a tilt, and the richest without kappa."""
-    out = []
-    if any("tilt" in lens for lens in wanted):
-        flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
-        out.append(_determined(quadratic, flat))
-    if any("kappa" in lens and len(options) > 1 for lens, options in zip(wanted, allowed)):
-        richest = (max(options, key=len) for options in allowed)
-        out.append(tuple(
-            lens - {"kappa", "centre"} if len(options) > 1 else lens
-            for lens, options in zip(richest, allowed)
-        ))  # fmt: skip
-    return out
+def _tilted_or_flat(
+    problem: Problem,
+    rich: Solution,
+    quadratic: QuadraticCost,
+    tilted_lenses: Lenses,
+    allowed: list[list[Lens]],
+) -> tuple[Lenses, State]:
+    """Return the better one of a model with a tilt and the best model without, both fitted.
 
-
-def _fits(
-    problem: Problem, rich: Solution, path: list[Lenses], alternatives: list[Lenses]
-) -> list[FittedModel]:
-    # a fork of a process that has used GTSAM can hang, because GTSAM's threads are not copied
-    """Return fitted models of the path and the alternatives; only the path is cross-validated."""
-    tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in alternatives]
-    here = problem.solver == "gtsam" or len(problem.uv_px) < DOTS_FOR_WORKERS
-    workers = 1 if here else quick_workers(len(tasks))
-    return list(ordered_map(partial(_fit, problem, rich), tasks, workers))
-
-
-def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> FittedModel:
-    lenses, predict = task
-    problem = problem.with_model([name_of(lens) for lens in lenses])
-    begin = model_start(problem, rich.state)
-    solution = solve(problem, begin, max_iterations=40, relative=1e-7)
-    obs = problem.observations()
-    residual = pixels(solution.state, obs, problem.rho_mm) - obs.uv_px
-    per_view = np.full(len(problem.views), np.inf)
-    if predict and solution.cost < TOO_COSTLY * rich.cost:
-        per_view = cross_validation_chi2(problem, solution.state)
-    count = sum(len(free) for free in problem.free)
-    rms = float(np.sqrt((residual**2).mean()))
-    return FittedModel(lenses, count, solution.cost, residual.size, rms, per_view, solution.state)
+    The quadratic form contains a tilt to first order only.
+    """
+    flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
+    fits = []
+    for lenses in (tilted_lenses, _determined(quadratic, flat)):
+        model = problem.with_model([name_of(lens) for lens in lenses])
+        begin = model_start(model, rich.state)
+        fit = solve(model, begin, max_iterations=40, relative=1e-7)
+        fits.append((quadratic.cost_of_fit(lenses, fit.cost), lenses, fit.state))
+    _, lenses, state = min(fits, key=lambda fit: fit[0])
+    return lenses, state
 
 
 def model_start(problem: Problem, state: State) -> State:
@@ -276,102 +205,60 @@ def tilted(state: State, cameras: Sequence[int]) -> State:
     return replace(state, intrinsics=intrinsics)
 
 
-def _revised(
-    problem: Problem,
-    quadratic: QuadraticCost,
-    fit: FittedModel,
-    others: list[FittedModel],
-    allowed: list[list[Lens]],
-) -> tuple[QuadraticCost, Lenses]:
-    """Return the quadratic and the wanted model, or better ones.
-
-    A better model is an alternative with lower cost, or the best of a new quadratic, which is
-    computed where the predicted cost of the wanted model differs from the fitted one.
-    """
-    fitting = [o for o in others if all(x in options for x, options in zip(o.lenses, allowed))]
-    best = min((fit, *fitting), key=lambda f: quadratic.cost_of_fit(f.lenses, f.cost))
-    if best is not fit:
-        return quadratic, best.lenses
-    predicted = quadratic.least + quadratic.rise(fit.lenses)
-    if any("tilt" in lens for lens in fit.lenses):
-        return quadratic, fit.lenses
-    if abs(2 * fit.cost / quadratic.variance - predicted) < AGREEMENT:
-        return quadratic, fit.lenses
-    there = solve(problem, fit.state, max_iterations=0)
-    quadratic = QuadraticCost.of(problem, there)
-    return quadratic, _determined(quadratic, allowed)
+def _step(
+    quadratic: QuadraticCost, before: Lenses, camera: int, group: str, lenses: Lenses
+) -> Step:
+    """Return the step that adds one group of parameters to the model ``before``."""
+    gain = max(quadratic.rise(before) - quadratic.rise(lenses), 0.0)
+    bic_gain = gain - quadratic.penalty_of(Lens({group}))
+    return Step(camera, GROUPS[group], lenses, gain, bic_gain, True)
 
 
-def _taken(quadratic: QuadraticCost, path: list[Addition], fits: list[FittedModel]) -> list[Step]:
-    """Return the steps along the path of fitted models, all marked as taken."""
-    out = [Step(-1, (), fits[0].lenses, float("nan"), float("nan"), True, "", fits[0])]
-    for (camera, group, lenses), before, after in zip(path, fits, fits[1:]):
-        gain = 2 * (before.cost - after.cost) / quadratic.variance
-        bic_gain = gain - quadratic.penalty_of(Lens({group}))
-        out.append(Step(camera, GROUPS[group], lenses, gain, bic_gain, True, "", after))
-    return out
-
-
-def _without_worse_predictions(steps: list[Step]) -> list[Step]:
-    """Return the steps; those at the end that predict left-out views worse count as not taken."""
-    last = len(steps) - 1
-    while last > 0:
-        before, after = (steps[k].fit for k in (last - 1, last))
-        assert before is not None and after is not None
-        if not after.left_out > before.left_out:
-            break
-        words = (
-            "not added: with it, views that the fit leaves out are predicted "
-            f"{after.left_out / before.left_out - 1:.1%} worse"
-        )
-        steps[last] = replace(steps[last], taken=False, words=words)
-        last -= 1
-    return steps
-
-
-def _not_taken(
-    quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
-) -> list[Step]:
-    """Return what one more group would have gained, except for tilts and refused groups."""
-    known = {(step.camera, step.added) for step in refused}
+def _not_taken(quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens]]) -> list[Step]:
+    """Return what one more group would gain, except for tilts."""
     out = []
     for camera, group, lenses in additions(chosen, allowed):
-        if group == "tilt" or (camera, GROUPS[group]) in known:
+        if group == "tilt":
             continue
-        gain = max(quadratic.rise(chosen) - quadratic.rise(lenses), 0.0)
-        bic_gain = gain - quadratic.penalty_of(Lens({group}))
+        step = _step(quadratic, chosen, camera, group, lenses)
         share = quadratic.sd_over_prior(lenses, camera, group)
         words = (
             "held at nominal: chi-square would fall by less than the penalty of "
-            f"{gain - bic_gain:.1f}"
+            f"{step.gain - step.bic_gain:.1f}"
         )
         if share > UNDETERMINED:
             words = (
                 "held at nominal: these views do not determine it (posterior standard deviation "
                 f"{share:.0%} of the prior one)"
             )
-        out.append(
-            Step(camera, GROUPS[group], lenses, gain, bic_gain, False, words, None,
-                 share > UNDETERMINED)
-        )  # fmt: skip
+        out.append(replace(step, taken=False, words=words, undetermined=share > UNDETERMINED))
     return out
 
 
 def _words(
-    problem: Problem, steps: list[Step], chosen: FittedModel, others: list[FittedModel]
+    problem: Problem, quadratic: QuadraticCost, steps: list[Step], chosen: Lenses, rich: State
 ) -> str:
     """Return the choice in sentences for the user."""
     cameras = [c.name for c in problem.cameras]
-    name = joint_name(chosen.names, cameras)
-    words = f"{name}: {_prediction_words(steps, chosen, cameras)}"
-    without = [fit for fit in others if not any("kappa" in lens for lens in fit.lenses)]
-    if any("kappa" in lens for lens in chosen.lenses) and without:
+    added = [step for step in steps[1:] if step.taken]
+    words = f"{joint_name([name_of(lens) for lens in chosen], cameras)}: "
+    if added:
+        last = f"{', '.join(added[-1].added)} of camera {cameras[added[-1].camera]!r}"
         words += (
-            "; kappa = 0 is rejected: the scale changes with depth, and the best model without "
-            f"it ({joint_name(without[-1].names, cameras)}) leaves {without[-1].rms_px:.3g} px RMS "
-            f"instead of {chosen.rms_px:.3g} px"
+            f"lowest information criterion; chi-square is {sum(s.gain for s in added):.3g} smaller "
+            f"than with the model {joint_name([name_of(x) for x in steps[0].lenses], cameras)}"
         )
-    for camera, lens, intrinsics in zip(cameras, chosen.lenses, chosen.state.intrinsics):
+        if len(added) > 1:
+            words += f", {added[-1].gain:.3g} of it by the parameters added last ({last})"
+    else:
+        words += "no further parameter lowers chi-square by more than its penalty"
+    if any("kappa" in lens for lens in chosen):
+        without = tuple(lens - {"kappa", "centre"} for lens in map(_lens_of, problem.free))
+        words += (
+            "; kappa = 0 is rejected: the scale changes with depth, and chi-square would be at "
+            f"least {quadratic.rise(without):.3g} larger without it"
+        )
+    for camera, lens, intrinsics in zip(cameras, chosen, rich.intrinsics):
         if "affine" in lens:
             words += f"; {_stretch_words(camera, intrinsics)}"
     undetermined = [
@@ -382,32 +269,6 @@ def _words(
         f"; held at nominal because these views do not determine it: {', '.join(undetermined)}"
         if undetermined else ""
     )  # fmt: skip
-
-
-def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]) -> str:
-    """Say how all steps together, and the last one, changed the prediction of left-out views."""
-    taken = [step for step in steps if step.taken]
-    fits = [step.fit for step in taken if step.fit is not None]
-    simpler = [fit for fit in fits[:-1] if np.isfinite(fit.left_out)]
-    if not np.isfinite(chosen.left_out):
-        return (
-            "lowest information criterion; it was not cross-validated, because there are too few "
-            "views"
-        )
-    if not simpler:
-        return "in cross-validation no richer model predicts left-out views better"
-    words = (
-        "in cross-validation the mean square error of left-out views is "
-        f"{simpler[0].left_out / chosen.left_out:.3g} times smaller than with the model "
-        f"{joint_name(simpler[0].names, cameras)}"
-    )
-    if len(simpler) > 1:
-        last = ", ".join(taken[-1].added)
-        words += (
-            f", and {simpler[-1].left_out / chosen.left_out:.4g} times smaller than without the "
-            f"parameters that were added last ({last} of camera {cameras[taken[-1].camera]!r})"
-        )
-    return words
 
 
 def _stretch_words(camera: str, intrinsics: Array) -> str:
@@ -421,70 +282,9 @@ def _stretch_words(camera: str, intrinsics: Array) -> str:
     )
 
 
-FOLDS = 4
-DAMPING = 1e-6
-POSE_STEPS = 3
-"""Number of Gauss-Newton steps of a left-out view's pose, from its pose in the fit to all views."""
-
-
-def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
-    """Return the state in which the pose of the target in every view fits best.
-
-    All other parameters stay as they are. steps : largest number of Gauss-Newton steps.
-    """
-    system = System(problem)
-    for _ in range(steps):
-        normal = np.zeros((len(problem.views), 6, 6))
-        right = np.zeros((len(problem.views), 6))
-        for c, obs in enumerate(system.images):
-            columns = system.columns(state, c)[-7:]
-            for v, a, b in images_of(obs):
-                flat = columns[..., a:b].reshape(7, -1)
-                normal[v] += flat[:-1] @ flat[:-1].T
-                right[v] -= flat[:-1] @ flat[-1]
-        # a view that only one telecentric camera sees has an undetermined depth
-        normal += (1e-9 + 1e-9 * np.trace(normal, axis1=-2, axis2=-1))[:, None, None] * np.eye(6)
-        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
-        state = replace(state, rig_from_target=retracted(state.rig_from_target, step))
-        if np.abs(step).max() < 1e-10:
-            break
-    return state
-
-
-def cross_validation_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
-    """Cross-validate a lens model: predict each of the V views by a fit that leaves it out.
-
-    The views are left out in ``folds`` parts, one after the other. A fit without one part is one
-    Gauss-Newton step from ``state``, the minimum with all views. Only the pose of the target is
-    then fitted to each left-out view.
-
-    Returns the mean squared whitened residual (V,) of each view; NaN if too few views would remain
-    without its part.
-    """
-    views = np.arange(len(problem.views))
-    out = np.full(len(views), np.nan)
-    for fold in range(folds):
-        left_out = views[fold::folds]
-        if len(left_out) == 0 or len(views) - len(left_out) < 2:
-            continue
-        mine = np.isin(problem.view, left_out)
-        system, linearised = linearisation(problem.subset(~mine))
-        step, _ = linearised(state).step(DAMPING)
-        trained = replace(system.moved(state, step), rig_from_target=state.rig_from_target)
-        test = problem.subset(mine)
-        fitted = pose_only(test, trained, steps=POSE_STEPS)
-        obs = test.observations()
-        squares = (whitened_error(fitted, obs, problem.rho_mm) ** 2).sum(-1)
-        for v in left_out:
-            if np.any(obs.view == v):
-                out[v] = squares[obs.view == v].mean()
-    return out
-
-
 CONSIDERED_P_VALUE = 0.01
 """The uncertainty of a group of parameters that are held is considered in the covariance if freeing
 the group improves the fit with a p-value below this."""
-UNDAMPED = 1e-12
 
 
 def considered_groups(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:

@@ -20,8 +20,10 @@ from itertools import product
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.estimator.calibration.solver.covariance import degrees_of_freedom, hat_matrix_blocks
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
+from telerig.estimator.calibration.solver.schur import Posterior
 from telerig.factors.calibration import whitened_error
 from telerig.rig.lens_parameters import GROUPS, INDEX, PLAIN_GROUPS, ordered
 
@@ -105,7 +107,7 @@ class QuadraticCost:
             extend[row, [a, b]] = 1.0
         groups = sum(1 for c in range(len(problem.cameras)) for g in PLAIN_GROUPS
                      if (c, GROUPS[g][0]) in names)  # fmt: skip
-        variance = _variance(problem, solution, posterior.common, posterior.dots)
+        variance = _variance(problem, solution, posterior)
         rows = 2 * int(np.sum(problem.kept))
         return QuadraticCost(
             (*names, *(m[0] for m in more)), extend @ offset, extend @ covariance @ extend.T,
@@ -178,24 +180,15 @@ def _held_by(lens: Lens) -> frozenset[str]:
     return frozenset(held)
 
 
-def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) -> float:
+def _variance(problem: Problem, solution: Solution, posterior: Posterior) -> float:
     """Return the variance of the residuals relative to the stated noise.
 
-    It is chi-square of the images over its expectation, number of residuals - number of parameters
-    + trace(C P) (docs/theory.md); the stated noise adds `NOISE_DOF` degrees of freedom.
+    It is chi-square of the images over its expectation (docs/theory.md); the stated noise adds
+    `NOISE_DOF` degrees of freedom.
     """
     error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
-    shared = sum(len(f) for f in problem.free)
-    weight = np.concatenate([
-        (parameter_unit(k) / problem.prior_sigma(c))[problem.free_indices(c)]
-        for c, k in enumerate(problem.cameras)
-    ])  # fmt: skip
-    by_prior = (np.diag(common)[:shared] * weight**2).sum()
-    by_prior += (np.diagonal(dots, 0, 1, 2) / problem.dot_sigma_mm**2).sum()
-    seen = len(np.unique(problem.view[problem.kept]))
-    numbers = shared + 4 * (len(problem.cameras) - 1) + 6 * seen + 3 * len(problem.dot_ids)
-    dof = max(error.size - numbers + by_prior, 0.0)
-    return float(((error**2).sum() + NOISE_DOF) / (dof + NOISE_DOF))
+    dof = degrees_of_freedom(hat_matrix_blocks(problem, solution, posterior))
+    return float(((error**2).sum() + NOISE_DOF) / (max(dof, 0.0) + NOISE_DOF))
 
 
 def possible(rich: Lens) -> list[Lens]:

@@ -25,6 +25,7 @@ from telerig.estimator.calibration.start.known_target import (
     offset_freedom,
     origin_camera,
     overlap_tree,
+    plate_sides,
     stereo_states,
 )
 from telerig.estimator.dots.grid.numbering import check_handedness
@@ -393,7 +394,10 @@ def _cost(problem: Problem, dots_mm: Array, camera: int, first: int, offset: int
         plate_shift=problem.plate_shift[first:last],
     ).with_model("none")
     try:
-        starts = stereo_states(part, dots_mm)
-        return min(solve(part, s, max_iterations=8, relative=1e-2).cost for s in starts)
+        return min(
+            solve(side, start, max_iterations=8, relative=1e-2).cost
+            for side in plate_sides(part)
+            for start in stereo_states(side, dots_mm)
+        )
     except TelerigError:
         return float(np.inf)

@@ -1,6 +1,6 @@
-"""Is anything left in the residuals? Tests of their places, directions, neighbours and views.
+"""Is anything left in the residuals? Tests of their places in the image and of neighbours.
 
-Residuals of a right model are independent, with the same variance in all directions and everywhere.
+Residuals of a right model are independent, with mean zero everywhere.
 Each is first brought to unit variance with the share of noise that the fit absorbs (the hat
 matrix). The correlations that the fit causes make the tests slightly conservative.
 """
@@ -28,11 +28,9 @@ class ResidualTest:
 
     code : of the finding if the test objects.
     size : size of the effect: for PATTERN the RMS of the mean residuals in parts of the image, in
-        standard deviations of a residual; for DIRECTION the relative difference of the variances;
-        for NEIGHBOURS a correlation; for WORSE_VIEWS the ratio to the other views.
+        standard deviations of a residual; for NEIGHBOURS a correlation.
     p_value : probability that chance alone gives an effect at least as large.
     numbers : of the finding.
-    view : the tested view; "" for all views.
     """
 
     code: Code
@@ -40,7 +38,6 @@ class ResidualTest:
     size: float
     p_value: float
     numbers: dict[str, float]
-    view: str = ""
 
 
 def residual_tests(
@@ -56,7 +53,6 @@ def residual_tests(
     """
     obs = problem.observations()
     standardised = standardised_residuals(whitened, leverage)
-    share = 1 - float(np.trace(leverage, axis1=-2, axis2=-1).mean()) / 2
     tests: list[ResidualTest] = []
     for c, camera in enumerate(problem.cameras):
         mine = obs.camera == c
@@ -65,27 +61,16 @@ def residual_tests(
         values, uv = standardised[mine], obs.uv_px[mine]
         free = len(problem.free[c])
         tests.append(_regions(camera.name, values, uv, camera.image_size_px, free))
-        tests.append(_direction(camera.name, values, share))
         tests.append(_neighbours(camera.name, values, uv, obs.view[mine]))
-        tests += _views(camera.name, values, obs.view[mine], problem.views)
-    shared = {Code.PATTERN: len(problem.cameras)}
-    objecting = [t for t in tests if t.p_value < t.code.limit / shared.get(t.code, len(tests))]
+    objecting = [t for t in tests if t.p_value < t.code.limit / len(problem.cameras)]
     widening = max((t.numbers.get("widening", 1.0) for t in objecting), default=1.0)
     findings = [
-        t.code.found(t.numbers | {"widening": widening}, cameras=t.camera)
-        for t in objecting if not t.view
-    ]  # fmt: skip
-    for name in dict.fromkeys(t.camera for t in objecting if t.view):
-        worse = {t.view: t.size for t in objecting if t.view and t.camera == name}
-        ratio = max(worse.values())
-        findings.append(Code.WORSE_VIEWS.found(cameras=name, views=[*worse], ratio=ratio))
+        t.code.found(t.numbers | {"widening": widening}, cameras=t.camera) for t in objecting
+    ]
     rows = [
-        {
-            "code": t.code.name, "camera": t.camera, "view": t.view, "size": t.size,
-            "p_value": t.p_value,
-        }
+        {"code": t.code.name, "camera": t.camera, "size": t.size, "p_value": t.p_value}
         for t in tests
-    ]  # fmt: skip
+    ]
     return {"tests": rows, "widening": widening}, findings or [Code.NO_STRUCTURE.found()]
 
 
@@ -133,20 +118,6 @@ def _regions(
     return ResidualTest(Code.PATTERN, camera, size, p, numbers)
 
 
-def _direction(camera: str, values: Array, share: float) -> ResidualTest:
-    """Test whether residuals (M, 2) are longer in one direction (vibration, interlaced sensor)."""
-    u, v = values.T
-    mean = 0.5 * float((u**2 + v**2).mean())
-    half, cross = 0.5 * float((u**2 - v**2).mean()) / mean, float((u * v).mean()) / mean
-    length = np.hypot(half, cross)
-    p = float(chdtrc(2, share * len(values) * length**2))
-    numbers = {
-        "angle_deg": float(np.degrees(0.5 * np.arctan2(cross, half)) % 180),
-        "ratio": float(np.sqrt((1 + length) / max(1 - length, 1e-3))),
-    }
-    return ResidualTest(Code.DIRECTION, camera, float(length), p, numbers)
-
-
 def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> ResidualTest:
     """Do residuals of neighbours correlate more than those of any two dots of that image?"""
     from scipy.spatial import cKDTree
@@ -171,18 +142,3 @@ def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> Residua
     sd = float(np.sqrt(np.sum(spread)) / len(spread))
     p = float(ndtr(-excess / sd))
     return ResidualTest(Code.NEIGHBOURS, camera, excess / 2, p, {"correlation": excess / 2})
-
-
-def _views(camera: str, values: Array, view: Ints, names: tuple[str, ...]) -> list[ResidualTest]:
-    """Test for each view whether its residuals are larger than those of the other views."""
-    squares = (values**2).sum(-1)
-    usual = float(np.median(squares)) / (2 * np.log(2))
-    out = []
-    for v in np.unique(view):
-        mine = squares[view == v] / max(usual, 1e-12)
-        if len(mine) < _LEAST_DOTS:
-            continue
-        p = float(chdtrc(2 * len(mine), mine.sum()))
-        size = float(np.sqrt(mine.mean() / 2))
-        out.append(ResidualTest(Code.WORSE_VIEWS, camera, size, p, {"ratio": size}, names[v]))
-    return out

@@ -1,7 +1,8 @@
 """Split-half check: is the calibration as repeatable as its covariance says?
 
-Every second view calibrates the rig anew, and so do the others; the two rigs are compared over the
-working volume like two calibrations of one rig. The covariance does not know of errors that the
+Every second view calibrates the rig anew, and so do the others, each by one Gauss-Newton step from
+the calibration of all views. The two rigs are compared over the working volume like two
+calibrations of one rig. The covariance does not know of errors that the
 views share (a wrong lens model), but they act differently in two halves with other tilts.
 """
 
@@ -20,7 +21,7 @@ from telerig.estimator.calibration.quality.comparison import (
 )
 from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
-from telerig.estimator.calibration.solver.robust_least_squares import LEAST_DOTS, solve
+from telerig.estimator.calibration.solver.robust_least_squares import LEAST_DOTS, one_step
 from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
@@ -104,7 +105,7 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
     if half.scale is not None:
         pair, distance, _ = half.scale
         half = replace(half, scale=(pair, distance, _SCALE * distance))
-    solution = solve(half, state, max_iterations=30, relative=1e-7)
+    solution = one_step(half, state)
     names, covariance = joint_covariance(half, solution).rig_block()
     cameras = cameras_from_state(half, solution.state)
     if not np.isfinite(covariance).all():

@@ -74,8 +74,8 @@ class JointCovariance:
 
     @property
     def effective_dof(self) -> float:
-        """The expected sum of squared whitened residuals, number of residuals - trace(J C J^T)."""
-        return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
+        """The expected sum of squared whitened residuals."""
+        return degrees_of_freedom(self.leverage)
 
     def widened(self, offset: Array) -> JointCovariance:
         """Return the covariance with a further error added, which moves all parameters together.
@@ -95,6 +95,14 @@ class JointCovariance:
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
         """Return the names and the covariance (P, P) of the cameras' parameters."""
         return self.names[: self.rig], self.matrix[: self.rig, : self.rig]
+
+
+def degrees_of_freedom(leverage: Array) -> float:
+    """Return number of residuals - trace(J C J^T), the expected sum of their squares.
+
+    leverage : (M, 2, 2) J C J^T of each used measurement.
+    """
+    return float(2 * len(leverage) - np.trace(leverage, axis1=-2, axis2=-1).sum())
 
 
 def joint_covariance(

@@ -579,6 +579,17 @@ def slots(problem: Problem) -> dict[str, list[slice]]:
     return out
 
 
+LINE_SHARE = 0.01
+"""Dots whose width across is less than this share of their length count as one row; two rows of 40
+dots have 0.09."""
+
+
+def on_a_line(points_mm: Array) -> bool:
+    """Return whether points (n, 2) lie on one line, so that they do not determine a pose."""
+    length, width = np.linalg.svd(points_mm - points_mm.mean(0), compute_uv=False)
+    return bool(width < LINE_SHARE * length)
+
+
 def images_of(obs: Observations) -> list[tuple[int, int, int]]:
     """Return (view, first row, last row + 1) for every image of one camera.
 

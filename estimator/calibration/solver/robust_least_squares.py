@@ -21,7 +21,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.elimination import GraphEquations, GraphLayout
-from telerig.estimator.calibration.solver.problem import Problem, System
+from telerig.estimator.calibration.solver.problem import Problem, System, on_a_line
 from telerig.estimator.calibration.solver.schur import NormalEquations
 from telerig.factors.calibration import State, pixels
 from telerig.factors.robust_loss import calibration_weights, next_limit
@@ -37,6 +37,8 @@ thousandfold rather than tenfold."""
 NEARLY_UNDAMPED = 1e-6
 """With less damping than this, the predicted gain of a step is what Gauss-Newton could still
 gain."""
+UNDAMPED = 1e-12
+"""Damping of a Gauss-Newton step."""
 Progress = Callable[[int, float], None]
 Equations = GraphEquations | NormalEquations
 
@@ -126,6 +128,18 @@ def solve(
     return Solution(point, float(equations.cost), iteration, equations)
 
 
+def one_step(problem: Problem, state: State) -> Solution:
+    """Return the solution after one Gauss-Newton step from the minimum of a similar problem.
+
+    The cost is that before the step. Raises CalibrationError if the measurements do not determine
+    all parameters.
+    """
+    system, linearised = linearisation(problem)
+    equations = linearised(state)
+    step, _ = equations.step(UNDAMPED)
+    return Solution(system.moved(state, step), equations.cost, 1, equations)
+
+
 def _at(linearised: Callable[[State], Equations], state: State) -> Equations | None:
     """Return the equations, or None where the cost is not finite (a window hides a dot)."""
     try:
@@ -136,8 +150,8 @@ def _at(linearised: Callable[[State], Equations], state: State) -> Equations | N
 
 
 LEAST_DOTS = 4
-"""A view in which fewer dots than this are kept is left out, because so few dots do not determine
-the pose of the target."""
+"""A view in which fewer different dots than this are kept is left out, because so few do not
+determine the pose of the target."""
 _MEDIAN = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 
@@ -200,7 +214,9 @@ def dof_per_row(problem: Problem) -> float:
     """
     kept = problem.kept
     rows = int(2 * np.sum(kept))
-    used = float(sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1))
+    # rotation and offset across the axis; of the second camera along the common normal only
+    others = len(problem.cameras) - 1
+    used = float(sum(len(f) for f in problem.free) + 5 * others - (others > 0))
     used += 6 * len(problem.views)
     # an image of a target of any tilt shows two of three directions in space
     scale = np.array([c["scale_px_per_mm"] for c in problem.cameras])[problem.camera]
@@ -222,7 +238,8 @@ def robust_solve(
     set of kept dots no longer changes, after ``rounds`` rounds at the latest.
     """
     base, least = problem.covariance_px2, problem.outlier_sd
-    problem = replace(problem, weight=np.ones(len(problem.view)))
+    begin = _without_lost_views(problem, np.ones(len(problem.view)))
+    problem, placed = replace(problem, weight=begin), begin > 0
     solution = solve(problem, start, progress=progress)
     limit, floor = np.inf, 0.0
     for _ in range(rounds):
@@ -231,10 +248,10 @@ def robust_solve(
         floor = noise_floor_px(residual[sound], base[sound], dof_per_row(problem))
         covariance = base + floor**2 * np.eye(2)
         distance = np.sqrt(squared_distance(residual, covariance))
-        worst = float(distance.max())
+        worst = float(distance[placed].max())
         previous = problem
         limit = next_limit(limit, worst, least)
-        weight = calibration_weights(distance, problem.weight, limit, least)
+        weight = placed * calibration_weights(distance, problem.weight, limit, least)
         if limit == least:
             weight = _without_lost_views(problem, weight)
         problem = replace(problem, weight=weight, covariance_px2=covariance)
@@ -255,9 +272,12 @@ def _without_lost_views(problem: Problem, weight: Array) -> Array:
 
 
 def lost_views(problem: Problem, weight: Array) -> Ints:
-    """Return the indices of the views in which fewer than `LEAST_DOTS` dots are kept.
+    """Return the indices of the views whose kept dots do not determine the pose of the target: they
+    are fewer than `LEAST_DOTS`, or in one row.
 
     weight : (M,) weight of each measurement.
     """
-    kept = np.bincount(problem.view[weight > 0], minlength=len(problem.views))
-    return np.flatnonzero(kept < LEAST_DOTS)
+    plane, kept = problem.nominal_mm[:, :2], weight > 0
+    dots = [np.unique(problem.dot[kept & (problem.view == v)]) for v in range(len(problem.views))]
+    lost = [len(some) < LEAST_DOTS or on_a_line(plane[some]) for some in dots]
+    return np.flatnonzero(lost)

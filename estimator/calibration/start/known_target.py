@@ -9,13 +9,13 @@ rotation that fits all views, for each pair of cameras along a tree of cameras t
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.problem import Problem, nominal_state
+from telerig.estimator.calibration.solver.problem import Problem, nominal_state, on_a_line
 from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
 from telerig.factors.calibration import State
 from telerig.rig.lens_parameters import INDEX
@@ -46,7 +46,7 @@ class ImageMap:
 
 
 def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageMap]:
-    """Return the map of each image that has at least four dots, by (view, camera) indices.
+    """Return the maps by (view, camera) of images with four dots or more that are not in one row.
 
     dots_mm : (N, 3) positions of the target's dots.
     """
@@ -54,9 +54,10 @@ def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageM
     for v in range(len(problem.views)):
         for c, camera in enumerate(problem.cameras):
             rows = (problem.view == v) & (problem.camera == c) & problem.kept
-            if np.sum(rows) >= 4:
+            seen = dots_mm[problem.dot[rows], :2]
+            if len(seen) >= 4 and not on_a_line(seen):
                 centre = (np.array(camera.image_size_px) - 1) / 2
-                out[v, c] = _image_map(dots_mm[problem.dot[rows], :2], problem.uv_px[rows] - centre)
+                out[v, c] = _image_map(seen, problem.uv_px[rows] - centre)
     return out
 
 
@@ -82,6 +83,21 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
     jacobian = (affine[:2].T - np.outer(value, bend)) / depth / size
     offset = value - jacobian @ (middle + at * size)
     return ImageMap(jacobian, offset, bend / depth / size, float(np.sqrt(misfit / spread)))
+
+
+def plate_sides(problem: Problem) -> list[Problem]:
+    """Return the problem for either side of a two-sided plate that may carry the dots.
+
+    In each, the views through the plate are marked as such. For other targets, and for a single
+    camera, it is the problem as it is.
+    """
+    target = problem.target
+    if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
+        return [problem]
+    hands = np.zeros((len(problem.views), len(problem.cameras)))
+    for image, found in image_maps(problem, problem.nominal_mm).items():
+        hands[image] = np.sign(np.linalg.det(found.jacobian))
+    return [replace(problem, plate_shift=np.where(hands == h, -hands, 0.0)) for h in (1, -1)]
 
 
 def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
@@ -122,12 +138,10 @@ def rotation_hypotheses(first: Array, second: Array, count: int = 3) -> list[Arr
     first, second : (V, 3, 3) rotations camera_from_target, each up to its mirror image.
     count : largest number of results; none of them is the mirror image of another.
     """
-    plain = second @ np.swapaxes(first, -1, -2)
-    crossed = mirrored(second) @ np.swapaxes(first, -1, -2)
-    candidates = np.concatenate([plain, crossed])
+    options = either_tilt(first, second)
     found: list[tuple[float, Array]] = []
-    for candidate in candidates:
-        rotation, cost = _refined(candidate, plain, crossed)
+    for candidate in np.concatenate(options[:2]):
+        rotation, cost = refined(candidate, options)
         same = [
             min(angle_between(rotation, r), angle_between(mirrored(rotation), r)) for _, r in found
         ]
@@ -136,8 +150,12 @@ def rotation_hypotheses(first: Array, second: Array, count: int = 3) -> list[Arr
     return [rotation for _, rotation in sorted(found, key=lambda x: x[0])[:count]]
 
 
-def _refined(rotation: Array, plain: Array, crossed: Array) -> tuple[Array, float]:
-    options = np.stack([plain, crossed, mirrored(plain), mirrored(crossed)])
+def refined(rotation: Array, options: Array) -> tuple[Array, float]:
+    """Return the rotation (3, 3) near a given one that one option of each view explains best.
+
+    options : (K, V, 3, 3) the K rotations that are possible in each of V views.
+    Returns also the mean squared angle in rad^2 to the nearest options, each at most 20 degrees.
+    """
     cap = np.radians(20)
     for _ in range(5):
         angles = angle_between(options, rotation)
@@ -147,6 +165,16 @@ def _refined(rotation: Array, plain: Array, crossed: Array) -> tuple[Array, floa
         rotation = nearest_rotation((weight[:, None, None] * best).sum(0))
     angles = np.minimum(angle_between(options, rotation).min(0), cap)
     return rotation, float((angles**2).mean())
+
+
+def either_tilt(first: Array, second: Array) -> Array:
+    """Return the rotations (4, ..., 3, 3) second_from_first for both signs of both tilts.
+
+    first, second : (..., 3, 3) rotations camera_from_target, each up to its mirror image.
+    """
+    plain = second @ np.swapaxes(first, -1, -2)
+    crossed = mirrored(second) @ np.swapaxes(first, -1, -2)
+    return np.stack([plain, crossed, mirrored(plain), mirrored(crossed)])
 
 
 def stereo_states(problem: Problem, dots_mm: Array, count: int = 2) -> list[State]:
@@ -363,7 +391,7 @@ def origin_camera(camera_from_rig: Array) -> int:
 
 
 def offset_freedom(camera_from_rig: Array) -> Array:
-    """Return the offsets (C, 2, 2 C - 3) in mm of C > 2 telecentric cameras by each free number.
+    """Return the offsets (C, 2, 2 C - 3) in mm of C telecentric cameras by each free number.
 
     The offset of the `origin_camera` along the image of the first axis is held at zero.
     camera_from_rig : (C, 3, 3).
@@ -383,8 +411,6 @@ def _place_views(views: Array, shifts: dict[tuple[int, int], Array], cameras: Ar
 
     Along the image of the first axis in the `origin_camera` the offset is held at zero.
     """
-    if len(cameras) == 2:
-        return np.array([np.zeros(2), _place_views_of_two(views, shifts, cameras[1])])
     freedom = offset_freedom(cameras)
     at = 3 * len(views)
     design = np.zeros((len(shifts), 2, at + freedom.shape[-1]))
@@ -395,23 +421,3 @@ def _place_views(views: Array, shifts: dict[tuple[int, int], Array], cameras: Ar
     found, *_ = np.linalg.lstsq(design.reshape(len(right), -1), right, rcond=1e-9)
     views[:, :3, 3] = found[:at].reshape(-1, 3)
     return np.asarray(freedom @ found[at:])
-
-
-def _place_views_of_two(
-    views: Array, shifts: dict[tuple[int, int], Array], second_from_first: Array
-) -> Array:
-    """Do the work of `_place_views` for two cameras: the offset is the median disagreement."""
-    along = second_from_first[:2, 2]
-    length = np.linalg.norm(along)
-    along = along / length
-    across = np.array([-along[1], along[0]])
-    both = [v for v in range(len(views)) if (v, 0) in shifts and (v, 1) in shifts]
-    gap = {v: shifts[v, 1] - second_from_first[:2, :2] @ shifts[v, 0] for v in both}
-    offset = float(np.median([g @ across for g in gap.values()])) if both else 0.0
-    for v in range(len(views)):
-        if (v, 0) in shifts:
-            depth = gap[v] @ along / length if v in gap else 0.0
-            views[v, :3, 3] = np.r_[shifts[v, 0], depth]
-        elif (v, 1) in shifts:
-            views[v, :3, 3] = second_from_first.T @ np.r_[shifts[v, 1] - offset * across, 0]
-    return offset * across

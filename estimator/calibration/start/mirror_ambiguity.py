@@ -20,8 +20,12 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.lens.choice import pose_only
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    System,
+    images_of,
+    retracted,
+)
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.io.results.findings import Code, Finding
@@ -175,8 +179,9 @@ def perspective_sign(state: State, problem: Problem) -> int:
 def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
     """Return which of a state and its mirror image the final fit starts from.
 
-    With one camera nothing decides, and the state is returned. The refraction in a two-sided plate
-    decides if no nominal rotation is given, otherwise `choose_solution`, whose errors are raised.
+    With one camera nothing decides, and the state is returned. The refraction in a two-sided plate,
+    by which the state was chosen, decides if no nominal rotation is given, otherwise
+    `choose_solution`, whose errors are raised.
     """
     if len(problem.cameras) == 1:
         words = (
@@ -186,10 +191,8 @@ def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) ->
         return MirrorChoice(state, "mono", words)
     if nominal_rotvec_deg or not np.any(problem.plate_shift):
         return choose_solution(state, problem, nominal_rotvec_deg)
-    both = (state, mirrored_state(state))
-    costs = [solve(problem, s, max_iterations=20).cost for s in both]
     words = "the plate's refraction, which has the opposite sign in the mirrored solution"
-    return MirrorChoice(both[int(np.argmin(costs))], BY_PLATE, words)
+    return MirrorChoice(state, BY_PLATE, words)
 
 
 def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
@@ -262,12 +265,17 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
 def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
     """Return the cost of the mirror image of a solution.
 
+    Without a plate, refractive windows and a known relief of the target the mirror image is a
+    minimum as well, so nothing has to be solved.
+
     state, cost : the solution. Raises CalibrationError if the mirror image fits far better, because
     the refraction in the plate then contradicts the nominal rotation.
     """
     if len(problem.cameras) == 1:
         return cost
-    other = solve(problem, mirrored_state(state), max_iterations=20).cost
+    broken = np.any(problem.plate_shift) or np.ptp(problem.nominal_mm[:, 2]) > 0
+    steps = 20 if broken or any(c.wall is not None for c in problem.cameras) else 0
+    other = solve(problem, mirrored_state(state), max_iterations=steps).cost
     if np.any(problem.plate_shift) and other < 0.5 * cost - 10:
         raise CalibrationError(
             "the nominal rotation puts the second camera on one side, the refraction in the "
@@ -359,6 +367,30 @@ def _without_plane(relief: Array, seen: NDArray[np.bool_], nominal_mm: Array) ->
         fit, *_ = np.linalg.lstsq(plane[mine], values[mine], rcond=None)
         row[mine] = values[mine] - plane[mine] @ fit
     return out
+
+
+def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
+    """Return the state in which the pose of the target in every view fits best.
+
+    All other parameters stay as they are. steps : largest number of Gauss-Newton steps.
+    """
+    system = System(problem)
+    for _ in range(steps):
+        normal = np.zeros((len(problem.views), 6, 6))
+        right = np.zeros((len(problem.views), 6))
+        for c, obs in enumerate(system.images):
+            columns = system.columns(state, c)[-7:]
+            for v, a, b in images_of(obs):
+                flat = columns[..., a:b].reshape(7, -1)
+                normal[v] += flat[:-1] @ flat[:-1].T
+                right[v] -= flat[:-1] @ flat[-1]
+        # a view that only one telecentric camera sees has an undetermined depth
+        normal += (1e-9 + 1e-9 * np.trace(normal, axis1=-2, axis2=-1))[:, None, None] * np.eye(6)
+        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
+        state = replace(state, rig_from_target=retracted(state.rig_from_target, step))
+        if np.abs(step).max() < 1e-10:
+            break
+    return state
 
 
 def _flipped(state: State, views: Ints, camera: int) -> State:

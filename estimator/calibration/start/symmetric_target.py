@@ -18,7 +18,7 @@ from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.factors.calibration import State, whitened_residuals
 from telerig.io.results.findings import Code, Finding
-from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
+from telerig.rig.pose import rotation_from_rotvec
 
 TIE_DEG = 15.0
 
@@ -122,16 +122,18 @@ def _numbered_alike_in_pair(
     maps = known_target.image_maps(problem, problem.nominal_mm)
     rotation = {k: known_target.rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
     spin = [_spin(k, len(labels)) for k in range(len(labels))]
-    options = np.array(
-        [[_pairs(rotation[v, first], rotation[v, second] @ s) for s in spin] for v in both]
-    )
+    firsts = np.array([rotation[v, first] for v in both])
+    seconds = np.array([[rotation[v, second] @ s for s in spin] for v in both])
+    # (signs of the tilts, turns, views)
+    options = known_target.either_tilt(firsts, np.swapaxes(seconds, 0, 1))
+    every = options.reshape(-1, len(both), 3, 3)
     hypotheses = []
-    for candidate in options.reshape(-1, 3, 3):
-        refined, cost = _consensus(candidate, options)
+    for candidate in every.reshape(-1, 3, 3):
+        refined, cost = known_target.refined(candidate, every)
         distance = _to_nominal_deg(refined, nominal)
-        hypotheses.append((cost + (distance / 60) ** 2, refined))
+        hypotheses.append((cost / np.radians(2) ** 2 + (distance / 60) ** 2, refined))
     best = min(hypotheses, key=lambda h: h[0])[1]
-    angles = known_target.angle_between(options, best).min(2)
+    angles = known_target.angle_between(options, best).min(0).T
     ranked = np.sort(angles, 1)
     close = np.flatnonzero(ranked[:, 1] - ranked[:, 0] < np.radians(TIE_DEG) / 5)
     if len(close):
@@ -155,23 +157,6 @@ def _names(problem: Problem, pair: tuple[int, int]) -> str:
 
 def _spin(k: int, order: int) -> Array:
     return rotation_from_rotvec([0.0, 0.0, 2 * np.pi * k / order])
-
-
-def _pairs(first: Array, second: Array) -> Array:
-    """Return (4, 3, 3) second_from_first for the signs of both tilts."""
-    plain, crossed = second @ first.T, known_target.mirrored(second) @ first.T
-    return np.array([plain, crossed, known_target.mirrored(plain), known_target.mirrored(crossed)])
-
-
-def _consensus(rotation: Array, options: Array) -> tuple[Array, float]:
-    flat = options.reshape(len(options), -1, 3, 3)
-    angles = known_target.angle_between(flat, rotation)
-    for _ in range(4):
-        angles = known_target.angle_between(flat, rotation)
-        best = flat[np.arange(len(flat)), angles.argmin(1)]
-        rotation = nearest_rotation(best.mean(0))
-    worst = np.minimum(angles.min(1), np.radians(20))
-    return rotation, float((worst**2).mean() / np.radians(2) ** 2)
 
 
 def _to_nominal_deg(rotation: Array, nominal: Array | None) -> float:

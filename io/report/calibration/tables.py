@@ -11,7 +11,7 @@ from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.page import Figure, Row
-from telerig.io.results.calibration import CameraRecord, LadderStep
+from telerig.io.results.calibration import CameraRecord
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import LENS_PARAMETERS, PARAMETERS
@@ -202,13 +202,9 @@ def ladder_rows(results: CalibrationResults) -> list[Row]:
         Row(
             (
                 f"+ {', '.join(step.added)} ({step.camera})" if step.added else step.model,
-                _or_blank(step.parameters, 3),
-                _or_blank(step.rms_px, 4),
-                _or_blank(step.chi2_dof, 3),
                 _or_blank(step.chi2_gain, 3),
                 _or_blank(step.bic_gain, 3),
                 _chance(step.p_value),
-                _prediction(step),
                 step.words or ("taken" if step.added else ""),
             ),
             strong=step.model == model.name,
@@ -226,15 +222,6 @@ def _chance(p_value: float | None) -> str:
     if p_value is None:
         return ""
     return "< 10⁻¹²" if p_value < 1e-12 else number(p_value, 2)
-
-
-def _prediction(step: LadderStep) -> str:
-    """Return the prediction errors of left-out views, before and after the step."""
-    if step.held_out is None:
-        return ""
-    after = number(step.held_out)
-    started = step.held_out_before is not None and step.added
-    return f"{number(step.held_out_before)} → {after}" if started else after
 
 
 def worst_rows(results: CalibrationResults) -> list[Row]:

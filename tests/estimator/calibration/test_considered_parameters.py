@@ -11,7 +11,6 @@ import pytest
 from telerig.estimator.calibration.lens.choice import (
     CONSIDERED_P_VALUE,
     Choice,
-    FittedModel,
     Step,
     considered_covariance,
     considered_groups,
@@ -33,18 +32,17 @@ STRETCH = frozenset({"affine"})
 
 
 def left_out(camera: int, added: tuple[str, ...], gain: float, undetermined: bool = False) -> Step:
-    return Step(camera, added, (NONE, NONE), gain, -1.0, False, "", None, undetermined)
+    return Step(camera, added, (NONE, NONE), gain, -1.0, False, "", undetermined)
 
 
 def taken(camera: int, added: tuple[str, ...]) -> Step:
-    return Step(camera, added, (NONE, NONE), 1e3, 1e3, True, "", None)
+    return Step(camera, added, (NONE, NONE), 1e3, 1e3, True)
 
 
 def choice(*steps: Step) -> Choice:
     state: Any = None
-    chosen = FittedModel((NONE, NONE), 0, 0.0, 0, 0.0, np.zeros(0), state)
-    first = Step(-1, (), chosen.lenses, np.nan, np.nan, True, "", chosen)
-    return Choice((first, *steps), chosen, "")
+    first = Step(-1, (), (NONE, NONE), np.nan, np.nan, True)
+    return Choice((first, *steps), (NONE, NONE), state, "")
 
 
 def test_what_another_camera_needs_is_considered_whatever_it_gained() -> None:

@@ -5,16 +5,60 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import gtsam
+import numpy as np
 import pytest
 
+from telerig.estimator.calibration.self_calibration import best_start
 from telerig.estimator.calibration.solver import robust_least_squares as graph
+from telerig.estimator.calibration.solver.covariance import joint_covariance
+from telerig.estimator.calibration.solver.nonlinear_graph import nonlinear_graph
 from telerig.estimator.calibration.solver.problem import (
+    Problem,
     eccentricity_px,
     held_at_nominal,
+    parameter_unit,
     problem_from_dots,
 )
 from telerig.estimator.calibration.start import known_target
 from telerig.io.simulation.presets import preset
+
+
+def by_marginals(problem: Problem, state: Any) -> Any:
+    """Covariance of all variables, in the order and units of `JointCovariance`."""
+    factors, values, keys = nonlinear_graph(problem, state)
+    marginals = gtsam.Marginals(factors, values)
+    ordered = [k for c, k in enumerate(keys.intrinsics) if problem.free[c]]
+    ordered += [*keys.camera[1:], *keys.view, *keys.dots]
+    joint = marginals.jointMarginalCovariance(ordered)
+    blocks = [[joint.at(a, b) for b in ordered] for a in ordered]
+    unit = np.ones(sum(b.shape[1] for b in blocks[0]))
+    lens = [parameter_unit(c)[problem.free_indices(i)] for i, c in enumerate(problem.cameras)]
+    unit[: sum(map(len, lens))] = np.concatenate(lens)
+    return np.block(blocks) * unit[:, None] * unit
+
+
+@pytest.mark.parametrize(
+    ("preset", "model", "solver"),
+    [
+        ("scheimpflug", "affine+radial", "gtsam"),
+        ("two_sided", "radial", "schur"),
+    ],
+)
+def test_it_is_that_of_gtsams_marginals(preset: str, model: str, solver: str, scene: Any) -> None:
+    """To 1e-6 of the standard deviations, element by element."""
+    made = scene(preset, 2, views=8)
+    problem = problem_from_dots(made.dots, made.cameras, made.target)
+    problem, _ = best_start(problem, problem.nominal_mm)
+    problem = problem.with_model(model)
+    start = known_target.stereo_states(problem, problem.nominal_mm)[0]
+    problem = replace(problem, solver=solver)
+    solution = graph.solve(problem, held_at_nominal(problem, start))
+    ours = joint_covariance(problem, solution)
+    theirs = by_marginals(problem, solution.state)
+    sd = np.sqrt(np.diag(theirs))
+    assert ours.matrix.shape == theirs.shape == (len(ours.names),) * 2
+    assert np.abs((ours.matrix - theirs) / np.outer(sd, sd)).max() < 1e-6
 
 
 def test_a_large_problem_is_advised_too(scene: Any, monkeypatch: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,7 @@ import pytest
 
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.lens import choice as model_choice
-from telerig.estimator.calibration.lens.choice import (
-    FOLDS,
-    cross_validation_chi2,
-    model_start,
-    pose_only,
-)
+from telerig.estimator.calibration.lens.choice import model_start
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
     Lens,
@@ -30,7 +25,6 @@ from telerig.estimator.calibration.lens.search import (
 from telerig.estimator.calibration.self_calibration import choose_model
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state, problem_from_dots
 from telerig.estimator.calibration.solver.robust_least_squares import solve
-from telerig.factors.calibration import whitened_error
 from telerig.io.simulation.presets import preset
 from telerig.rig.lens_parameters import GROUPS, name_of, rich_groups
 
@@ -167,42 +161,6 @@ def test_what_the_views_do_not_determine_is_not_chosen(fitted: Any) -> None:
     assert "k2" not in model_choice._determined(vague, options)[0]
 
 
-# --- views that were left out -------------------------------------------------------------------
-
-
-def test_one_step_predicts_like_a_whole_fit(fitted: Any) -> None:
-    problem, rich, _ = fitted
-    model = problem.with_model(("radial", "none"))
-    state = solve(model, model_start(model, rich.state)).state
-    per_view = cross_validation_chi2(model, state)
-    assert np.isfinite(per_view).all()
-    for fold in range(FOLDS):
-        left_out = np.arange(len(model.views))[fold::FOLDS]
-        mine = np.isin(model.view, left_out)
-        trained = solve(model.subset(~mine), state).state
-        test = model.subset(mine)
-        final = pose_only(test, replace(trained, rig_from_target=state.rig_from_target))
-        obs = test.observations()
-        squares = (whitened_error(final, obs, model.rho_mm) ** 2).sum(-1)
-        expected = [squares[obs.view == v].mean() for v in left_out]
-        np.testing.assert_allclose(per_view[left_out], expected, rtol=5e-3)
-
-
-def test_a_last_step_that_predicts_worse_is_taken_back(fitted: Any) -> None:
-    _, rich, _ = fitted
-    held_out = [4.0, 2.0, 1.9, 2.1, 2.2]
-    fits = [
-        model_choice.FittedModel((Lens(), Lens()), 2, 1.0, 10, 0.01, np.full(3, h), rich.state)
-        for h in held_out
-    ]
-    steps = [model_choice.Step(0, ("k1",), f.lenses, 50.0, 40.0, True, "", f) for f in fits]
-    after = model_choice._without_worse_predictions(steps)
-    assert [s.taken for s in after] == [True, True, True, False, False]
-    assert after[3].words == (
-        "not added: with it, views that the fit leaves out are predicted 10.5% worse"
-    )
-
-
 # --- simulated truth ----------------------------------------------------------------------------
 
 
@@ -215,7 +173,7 @@ def test_each_camera_gets_its_own(left: str, right: str, scene: Any) -> None:
     made = made_of(scene, LENS[left], LENS[right])
     problem = problem_of(made)
     _, choice = choose_model(problem, start_of(made, problem), ("auto", "auto"))
-    assert choice.chosen.names == (left, right), choice.words
+    assert choice.names == (left, right), choice.words
     step = choice.steps[-1]
     assert not step.taken and step.bic_gain < 0 and step.words.startswith("held at nominal: ")
 
@@ -276,11 +234,7 @@ def test_the_table_says_what_each_step_bought(scene: Any) -> None:
     assert taken[-1]["model"] == calibration.model["name"] == "left=brown,right=radial"
     added = sorted((row["camera"], *row["added"]) for row in taken[1:])
     assert added == [("left", "k1"), ("left", "k2"), ("left", "p1", "p2"), ("right", "k1")]
-    for before, row in pairwise(taken):
-        assert row["parameters"] == before["parameters"] + len(row["added"])
+    for row in taken[1:]:
         assert row["chi2_gain"] > row["bic_gain"] > 0 and row["p_value"] < 1e-4
-        assert row["held_out_before"] == before["held_out"]
-        assert row["held_out_before"] is None or row["held_out"] < row["held_out_before"]
-        assert row["rms_px"] < before["rms_px"] and row["bic"] < before["bic"]
     for row in rows[len(taken) :]:
-        assert row["bic_gain"] < 0 or "worse" in row["words"]
+        assert row["bic_gain"] < 0 and not row["taken"]

@@ -36,18 +36,18 @@ from telerig.rig.triangulation import aligned_covariance, working_volume
 
 def fitted(scene: Any, model: str = "radial") -> tuple[Any, Any, Any]:
     """Problem, state and covariance of a scene, without the search for a model."""
-    from telerig.estimator.calibration.self_calibration import best_start, with_plate
+    from telerig.estimator.calibration.self_calibration import best_start
     from telerig.estimator.calibration.solver.problem import problem_from_dots
 
     problem = problem_from_dots(scene.dots, scene.cameras, scene.target)
-    start = best_start(problem, problem.nominal_mm)
+    problem, start = best_start(problem, problem.nominal_mm)
     turn = start.rig_from_camera[1, :3, :3].T
     nominal = rotation_from_rotvec(np.radians(scene.nominal_rotvec_deg))
     if np.trace(turn.T @ nominal) < 2.8:
         from telerig.estimator.calibration.start.mirror_ambiguity import mirrored_state
 
         start = mirrored_state(start)
-    problem = with_plate(problem).with_model(model)
+    problem = problem.with_model(model)
     solution = solve(problem, held_at_nominal(problem, start))
     return problem, solution.state, joint_covariance(problem, solution)
 

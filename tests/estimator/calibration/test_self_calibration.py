@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from finding_codes import codes
+from finding_codes import codes, only
 
 from telerig.errors import CalibrationError, InputError
 from telerig.io.results.findings import Code
@@ -282,3 +282,26 @@ def test_noise_floor_with_dots_that_are_well_known(scene: Any, more_px: float) -
     assert calibration.statistics["noise_floor_px"] == pytest.approx(more_px, rel=0.05)
     assert calibration.statistics["chi2_dof"] == pytest.approx(1, abs=0.06)
     assert calibration.verdict["status"] == "GOOD" or more_px
+
+
+def test_one_row_of_the_target_does_not_place_it(paper: Any) -> None:
+    """Seen by both cameras, it was taken for a target at 90 degrees and lost its sound dots."""
+    views = sorted(paper.dots["view"].unique())
+    row = int(paper.dots["row"].median())
+    found = paper.changed(lambda d: d[(d["view"] != views[2]) | (d["row"] == row)]).calibrate(
+        "radial"
+    )
+    left = found.residuals[found.residuals["weight"] == 0]
+    assert set(left["view"]) == {views[2]} and (left["row"] == row).all()
+    assert only(found, Code.UNUSED_VIEWS).views == (views[2],)
+    assert len(found.residuals) - len(left) == (paper.dots["view"] != views[2]).sum()
+
+
+def test_a_row_beside_the_whole_target_in_the_other_camera_counts(paper: Any) -> None:
+    views = sorted(paper.dots["view"].unique())
+    row = int(paper.dots["row"].median())
+    found = paper.changed(
+        lambda d: d[(d["view"] != views[2]) | (d["camera"] != "left") | (d["row"] == row)]
+    ).calibrate("radial")
+    assert (found.residuals["weight"] == 1).all()
+    assert paper.space_rms_um(found) < 1.0

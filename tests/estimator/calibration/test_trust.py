@@ -207,7 +207,7 @@ def test_noise_has_no_structure() -> None:
     assert sum(not f.sound for f in found) <= 1
     assert np.median([f.widening for f in found]) == 1
     assert max(f.widening for f in found) < 1.5
-    chances = np.array([t["p_value"] for f in found for t in f.tests if not t["view"]])
+    chances = np.array([t["p_value"] for f in found for t in f.tests])
     assert 0.35 < np.mean(chances < 0.5) < 0.65
     assert np.mean(chances < 0.05) < 0.09
 
@@ -222,11 +222,6 @@ def test_each_structure_is_named() -> None:
     found = _Structure(dots, region)
     assert 5 < found.widening < 8
     assert _of_left(found, Code.PATTERN).numbers["widening"] == found.widening
-    direction = np.where(left[:, None], noise * [1.6, 1.0], noise)
-    numbers = _of_left(_Structure(dots, direction), Code.DIRECTION).numbers
-    assert numbers["ratio"] == pytest.approx(1.6, rel=0.1)
-    view = noise * np.where((dots.view == 4) & left, 2.0, 1.0)[:, None]
-    assert _of_left(_Structure(dots, view), Code.WORSE_VIEWS).views == ("v4",)
     wave = np.stack([np.sin(dots.uv_px[:, 0] / 30 + dots.view), np.cos(dots.uv_px[:, 1] / 30)], -1)
     together = noise + 1.5 * wave * left[:, None]
     assert _of_left(_Structure(dots, together), Code.NEIGHBOURS).numbers["correlation"] > 0.1
@@ -240,9 +235,9 @@ def test_a_pattern_that_widens_is_named() -> None:
     chances = []
     for size in np.linspace(0.0, 1.0, 21):
         found = _Structure(dots, noise + size * at)
-        chances.append(found.tests[0]["p_value"] * len(found.tests))
+        chances.append(found.tests[0]["p_value"] * 2)
         assert found.sound == (found.widening == 1.0)
-    assert any(1e-3 < p < 1e-3 * len(found.tests) / 2 for p in chances)
+    assert min(chances) < 1e-3 < max(chances)
 
 
 def _of_left(found: _Structure, code: Code) -> Finding:

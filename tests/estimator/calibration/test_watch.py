@@ -66,8 +66,9 @@ class Watching:
         self.stop = threading.Event()
         self.result: Any = None
         self.error: Exception | None = None
-        self._options = {"model": "radial", "solver": "auto", "medium": "air",
-                         "dots_free": "3d", "seed": 0, "interval_s": POLL_S} | options  # fmt: skip
+        self._options = {
+            "model": "radial", "medium": "air", "dots_free": "3d", "interval_s": POLL_S
+        } | options  # fmt: skip
         self._data = load_dataset(folder, need_views=False)
         self.thread = threading.Thread(target=self._run)
 
@@ -304,11 +305,12 @@ def test_ctrl_c_writes_the_results_once_and_ends_well(paper_images: Path, empty:
 
 def test_options_of_watching(empty: Path) -> None:
     runner = CliRunner()
-    result = runner.invoke(app, ["calibrate", str(empty), "--until-um", "0.4"])
-    assert result.exit_code == 2 and "--until-um goes with --watch" in result.stderr
+    for option in ("--until-um", "--poll"):
+        result = runner.invoke(app, ["calibrate", str(empty), option, "0.4"])
+        assert result.exit_code == 2 and f"{option} goes with --watch" in result.stderr
     result = runner.invoke(app, ["calibrate", str(empty), "--watch", "--from", "dots"])
     assert result.exit_code == 2 and "waits for images" in result.stderr
-    for option in ("model", "solver", "medium", "dots"):
+    for option in ("model", "medium", "dots"):
         result = runner.invoke(app, ["calibrate", str(empty), "--watch", f"--{option}", "nonsense"])
         assert result.exit_code == 2 and "unknown" in result.stderr
         assert "watching" not in result.stdout

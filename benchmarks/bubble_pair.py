@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from telerig.estimator.bubbles.detect import detect_bubbles
-from telerig.estimator.bubbles.pairing.groups import Matches, match_tables
+from telerig.estimator.bubbles.pairing.groups import Matches
 from telerig.estimator.bubbles.pairing.learning import learn_rig
 from telerig.estimator.bubbles.pairing.matching import (
     compared,
@@ -37,7 +37,9 @@ from telerig.io.images.read import read_image
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
+from matching_scenes import match_tables
 from pair_scene import CAMERAS, PairScene, random_frame
 
 Array = NDArray[np.float64]

@@ -357,15 +357,16 @@ def on_rays(camera: Camera, uv_px: Array, covariance_px2: Array) -> tuple[Array,
     uv_px, covariance_px2 : (N, 2), (N, 2, 2) pixels.
 
     Returns the points (N, 3) of the rays that are nearest to the rig's origin (mm), covariances
-    (N, 3, 3) (mm^2) with `UNKNOWN_MM` along the ray, and the scale (N,) in px/mm.
+    (N, 3, 3) (mm^2) with `UNKNOWN_MM` along the ray, and derivatives (N, 3, 2) of the points by the
+    pixels (mm/px), across the ray.
     """
     origin, along = camera.unproject(uv_px)
     points = origin - (origin * along).sum(-1, keepdims=True) * along
     _, by_point = stacked_jacobian((camera,), points)
     information = by_point.mT @ np.linalg.solve(covariance_px2, by_point)
     information += along[:, :, None] * along[:, None] / UNKNOWN_MM**2
-    scale = np.linalg.det(by_point @ by_point.mT) ** 0.25
-    return points, np.linalg.inv(information), np.asarray(scale)
+    by_pixel = by_point.mT @ np.linalg.inv(by_point @ by_point.mT)
+    return points, np.linalg.inv(information), np.asarray(by_pixel)
 
 
 def _distance(points: Array, origin: Array, direction: Array) -> Array:

@@ -34,7 +34,7 @@ from telerig.estimator.tracking.filter import (
     birth_covariance,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import UNKNOWN_MM, on_rays, stacked_jacobian
+from telerig.rig.triangulation import UNKNOWN_MM, stacked_jacobian
 
 Tables = tuple["pd.DataFrame", ...]
 """One frame's detections in each camera."""
@@ -67,22 +67,20 @@ class Bubbles(Rows):
     particle: Ints
 
     @staticmethod
-    def on_rays(sight: Sight, offset_px: Array, cameras: Sequence[Camera]) -> Bubbles:
+    def on_rays(sight: Sight, offset_px: Array) -> Bubbles:
         """Return the detections of a frame, camera by camera, each as a bubble that no other camera
         sees: a point of unknown depth.
 
         offset_px : (C, 2) shift of all detections of each camera.
         """
-        found = [
-            on_rays(camera, uv - offset, noise)
-            for camera, (uv, noise), offset in zip(cameras, sight.pixels, offset_px)
-        ]
-        points, covariances, px_per_mm = map(np.concatenate, zip(*found))
+        found = [(x - by @ off, p, by) for (x, p, by), off in zip(sight.rays, offset_px)]
+        points, covariances, by_pixel = map(np.concatenate, zip(*found))
+        mm_per_px = np.linalg.det(by_pixel.mT @ by_pixel) ** 0.25
         many = [len(ids) for ids in sight.given]
         rows = np.full((sum(many), len(many)), -1)
         at = np.arange(len(rows)), np.repeat(np.arange(len(many)), many)
         rows[at] = np.concatenate([np.arange(n) for n in many])
-        sizes = Bodies.sized(np.concatenate(sight.d_eq_px) / px_per_mm, len(many))
+        sizes = Bodies.sized(np.concatenate(sight.d_eq_px) * mm_per_px, len(many))
         return Bubbles(
             rows, np.ones(len(rows)), np.zeros(len(rows), bool), np.concatenate(sight.given),
             points, covariances, sizes, np.full(len(rows), NO_PARTICLE),
@@ -106,7 +104,8 @@ class Bubbles(Rows):
 class Sight:
     """Hold the detections of one frame as arrays; tuples have an entry for each camera.
 
-    pixels : centres and covariances with the share of the unknown shape.
+    pixels : centres and covariances with the share of the unknown shape. rays : these in space, as
+        `triangulation.on_rays` returns them.
     centre_px : (N, 5) the columns CENTRE_PX.
     a_px, d_eq_px : (N,) major semi-axes and equivalent diameters.
     given : (N,) ids given by the user, -1 for none.
@@ -116,6 +115,7 @@ class Sight:
     """
 
     pixels: tuple[Pixels, ...]
+    rays: tuple[tuple[Array, Array, Array], ...]
     centre_px: tuple[Array, ...]
     a_px: tuple[Array, ...]
     d_eq_px: tuple[Array, ...]

@@ -46,7 +46,7 @@ from telerig.estimator.tracking.filter import (
 )
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import stacked_jacobian
+from telerig.rig.triangulation import on_rays, stacked_jacobian
 
 _BUBBLES_AT_ONCE = 512
 _LEAST_FOR_OFFSET = 3
@@ -94,10 +94,19 @@ class RowMaker:
             joined.append(table)
             flags = ["|".join(words) for words in flag_words(table)]
             centre, (uv, covariance) = table[CENTRE_PX].to_numpy(float), pixels[c]
+            rays = on_rays(self.cameras[c], uv, covariance)
             ends = np.cumsum([0, *counts[:, c]]).tolist()
             of_cameras.append(
                 [
-                    ((uv[p], covariance[p]), centre[p], a[p], d_eq[p], ids[c][p], flags[p])
+                    (
+                        (uv[p], covariance[p]),
+                        tuple(r[p] for r in rays),
+                        centre[p],
+                        a[p],
+                        d_eq[p],
+                        ids[c][p],
+                        flags[p],
+                    )
                     for p in (slice(low, high) for low, high in pairwise(ends))
                 ]
             )
@@ -172,7 +181,7 @@ class RowMaker:
         bubbles, offset_px = grouped_frame(sight, self.model, predicted)
         late = np.flatnonzero(bubbles.bodies.used == "none")
         self._fit(bubbles, late, tables, np.zeros_like(bubbles.rows))
-        rays = Bubbles.on_rays(sight, offset_px, self.cameras)
+        rays = Bubbles.on_rays(sight, offset_px)
         bubbles = Bubbles.concat([bubbles, rays.take(_others(rays, bubbles))])
         measured = FrameMeasurements.create(
             bubbles.points_mm, bubbles.covariance_mm2, d_eq_mm=bubbles.d_eq_mm,

@@ -328,10 +328,10 @@ def test_two_points_of_unknown_depth_are_one_of_known_depth(kind: str) -> None:
     np.testing.assert_allclose(found, truth, atol=1e-4)
     covariance = np.linalg.inv(sum(weights))
     np.testing.assert_allclose(covariance, whole.covariance_mm2, rtol=1e-3, atol=1e-7)
-    for camera, (points, _, scale) in zip(cameras, rays):
-        moved = camera.project(points + 0.1 * camera.camera_from_rig.rotation[1])
-        off = np.linalg.norm(moved - camera.project(points), axis=-1)
-        np.testing.assert_allclose(off, 0.1 * scale, rtol=0.1)
+    for camera, uv, (points, _, by_pixel) in zip(cameras, pixels, rays):
+        np.testing.assert_allclose(camera.project(points), uv, atol=1e-6)
+        moved = camera.project(points + by_pixel @ [0.02, -0.01])
+        np.testing.assert_allclose(moved - uv, np.tile([0.02, -0.01], (6, 1)), atol=1e-4)
 
 
 @pytest.mark.parametrize("method", ["ml", "midpoint"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing.evidence import Prediction
-from telerig.estimator.bubbles.pairing.groups import Matches, RigModel, match_tables
+from telerig.estimator.bubbles.pairing.groups import Matches, RigModel, candidates_of, match
 from telerig.estimator.bubbles.pairing.matching import (
     PairModel,
     View,
@@ -54,6 +55,14 @@ def geometry(first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, C
     """Of each of N1 first with each of N2 second detections: arrays (N1, N2)."""
     one, two = views(first, second, cameras)
     return compared(cameras, one.take(np.s_[:, None]), two.take(None))
+
+
+def match_tables(
+    tables: Sequence[pd.DataFrame], model: RigModel, predicted: Prediction | None = None
+) -> Matches:
+    """The groups of one frame, from the tables of all cameras."""
+    _, _, (found,) = candidates_of([tables], model)
+    return match(found, model, predicted)
 
 
 def match_pairs(

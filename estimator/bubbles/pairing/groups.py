@@ -214,28 +214,14 @@ class Matches:
         return len(self.candidate)
 
 
-def match_tables(
-    tables: Sequence[pd.DataFrame], model: RigModel, predicted: Prediction | None = None
-) -> Matches:
-    """Find the groups among the detections of one frame.
-
-    tables : of `detect_bubbles` for each camera. Their row labels are not used; the result contains
-        positions.
-    model : result of `learn_rig`.
-    predicted : where tracks are expected; None if there are no tracks.
-
-    Raises InputError for tables without centres or covariances.
-    """
-    _, _, (found,) = candidates_of([tables], model)
-    return match(found, model, predicted)
-
-
 def candidates_of(
     frames: Sequence[Sequence[pd.DataFrame]], model: RigModel, unsure_px: float = 0.0
 ) -> tuple[list[pd.DataFrame], Ints, list[Candidates]]:
     """Return the detections of all frames by camera, their numbers (F, C), and `candidates`.
 
-    frames : for each frame the tables of all cameras.
+    frames : for each frame the tables of `detect_bubbles` for all cameras.
+
+    Raises InputError for tables without centres or covariances.
     """
     tables = [pd.concat(own, ignore_index=True) for own in zip(*frames)]
     pixels = [(columns(t, CENTRE_COLUMNS), centre_covariances(t)) for t in tables]
@@ -537,7 +523,10 @@ def deviation(
 
 
 def match(found: Candidates, model: RigModel, predicted: Prediction | None = None) -> Matches:
-    """Find the most probable groups among the possible ones of a frame, as `match_tables` does."""
+    """Find the most probable groups among the possible ones of a frame.
+
+    predicted : where tracks are expected; None if there are no tracks.
+    """
     from telerig.estimator.bubbles.pairing import kernels
 
     groups = found.groups

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 import pytest
-from matching_scenes import Array, match_pairs, table
+from matching_scenes import Array, match_pairs, match_tables, table
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing import kernels
@@ -17,7 +17,6 @@ from telerig.estimator.bubbles.pairing.groups import (
     best_groups,
     candidates_of,
     deviation,
-    match_tables,
 )
 from telerig.estimator.bubbles.pairing.learning import default_model, learn_rig
 from telerig.estimator.bubbles.pairing.matching import NEGLIGIBLE

@@ -20,8 +20,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.bubbles.pairing.evidence import Evidence, Prediction, evidence, gate2
@@ -223,16 +221,14 @@ class Broken:
     A conflict is a run of frames in which several tracks compete for the same measurements.
 
     track : the track with its most probable continuation.
-    entries : its measurements in the conflict, as (frame, index of the measurement in the frame).
-    kept : the unambiguous ones at the beginning, which remain with the track.
+    kept : its unambiguous measurements at the beginning, which remain with the track.
     new : those at the end that unambiguously belong together and form a new track. The measurements
         in between belong to no track.
     """
 
     track: Track
-    entries: list[tuple[int, int]]
-    kept: list[tuple[int, int]]
-    new: list[tuple[int, int]]
+    kept: list[Entry]
+    new: list[Entry]
 
 
 @dataclass(frozen=True)
@@ -246,12 +242,12 @@ class Decision:
     """
 
     still: Cluster | None
-    free: list[tuple[Track, list[tuple[int, int]]]]
+    free: list[tuple[Track, list[Entry]]]
     broken: list[Broken]
     runner_up_log_ratio: float
 
 
-def recent(entries: Sequence[tuple[int, int]], depth: int) -> list[tuple[int, int]]:
+def recent(entries: Sequence[Entry], depth: int) -> list[Entry]:
     """Return the last ``depth`` of a track's entries (frame, column) with a measurement."""
     return [e for e in entries if e[1] >= 0][-depth:]
 
@@ -335,7 +331,7 @@ def decide(
     return Decision(None, free, broken, runner_up)
 
 
-def _leave(best: Branch, tracks: list[Track]) -> list[tuple[Track, list[tuple[int, int]]]]:
+def _leave(best: Branch, tracks: list[Track]) -> list[tuple[Track, list[Entry]]]:
     return [(t, best.history.get(t.particle, [])) for t in tracks]
 
 
@@ -376,11 +372,11 @@ def _break(close: list[Branch], tracks: list[Track]) -> list[Broken]:
                 break
             kept.append(entries[0])
         new = [e for e in paths[0][i] if e[0] >= start and e[1] >= 0]
-        out.append(Broken(track, paths[0][i], [e for e in kept if e[0] < start], new))
+        out.append(Broken(track, [e for e in kept if e[0] < start], new))
     return out
 
 
-def _agreed_links_from(paths: list[list[list[tuple[int, int]]]]) -> int:
+def _agreed_links_from(paths: list[list[list[Entry]]]) -> int:
     """Return the first frame from which all branches tie the same measurements together."""
     frames = sorted({frame for path in paths for h in path for frame, _ in h})
     by_frame = [[dict(h) for h in path] for path in paths]
@@ -434,8 +430,10 @@ class Association:
         self.picked = np.flatnonzero(first[pairs.row] & (chosen[pairs.row] == pairs.column))
         closed = np.array([not c.open for c in clusters], bool)[self.cluster_of]
         missed = own & measured.alone & (closed & (chosen < 0))[:, None]
-        alone = gated_pairs(where, measured, missed, self.common, scan.settings, misses)
-        self.pairs = Evidence.concat([pairs, alone])
+        if missed.any():
+            alone = gated_pairs(where, measured, missed, self.common, scan.settings, misses)
+            pairs = Evidence.concat([pairs, alone])
+        self.pairs = pairs
         self.owner = self.cluster_of[self.pairs.row]
         self.edges = self._allowed()
 
@@ -472,15 +470,16 @@ class Association:
         Each is given by the indices of the earlier groups that it joins, and the indices of its
         pairings.
         """
-        count = len(self.clusters)
-        owner, columns = self.owner[self.edges], count + self.pairs.column[self.edges]
-        size = count + len(self.scan.measured)
-        joined = coo_array((np.ones(len(owner)), (owner, columns)), shape=(size, size))
-        label = connected_components(joined, directed=False)[1].tolist()
+        owner, columns = self.owner[self.edges].tolist(), self.pairs.column[self.edges].tolist()
+        label, first = list(range(len(self.clusters))), dict[int, int]()
+        for cluster, column in zip(owner, columns):
+            low, high = sorted((label[cluster], label[first.setdefault(column, cluster)]))
+            if low != high:
+                label = [low if own == high else own for own in label]
         groups: dict[int, tuple[list[int], list[int]]] = {}
-        for cluster in range(count):
-            groups.setdefault(label[cluster], ([], []))[0].append(cluster)
-        for edge, cluster in zip(self.edges.tolist(), owner.tolist()):
+        for cluster, group in enumerate(label):
+            groups.setdefault(group, ([], []))[0].append(cluster)
+        for edge, cluster in zip(self.edges.tolist(), owner):
             groups[label[cluster]][1].append(edge)
         return list(groups.values())
 

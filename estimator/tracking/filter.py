@@ -315,21 +315,6 @@ def birth_covariance(settings: TrackerSettings, measured: Array, encoder: bool) 
     return out
 
 
-@dataclass(frozen=True)
-class StageStep:
-    """Describe the stage's motion over one interval.
-
-    moved_mm : travel of the stage along its axis.
-    known : whether the encoder gave it.
-    found_speed_mm_s : the stage's speed in the one interval that ends with the second reading of
-        the encoder, otherwise 0. Before that reading, velocities are relative to the rig.
-    """
-
-    moved_mm: float
-    known: bool
-    found_speed_mm_s: float
-
-
 @dataclass
 class StageMotion:
     """Follow the stage's motion, which is the known input of all filters, with and without an
@@ -348,8 +333,12 @@ class StageMotion:
     assumed_mm: float = float("nan")
     speed_mm_s: float = 0.0
 
-    def step(self, position_mm: float | None, t_s: float, dt_s: float) -> StageStep:
+    def step(self, position_mm: float | None, t_s: float, dt_s: float) -> tuple[float, bool, float]:
         """Return the stage's motion over one interval and remember the reading.
+
+        Returns the travel along the axis (mm), whether the encoder gave it, and the stage's speed
+        (mm/s) in the one interval that ends with the second reading, otherwise 0: before that
+        reading, velocities are relative to the rig.
 
         position_mm : reading of the encoder at the end of the interval. If it is None or NaN, the
             last speed is assumed to continue, and the next reading corrects the position.
@@ -359,16 +348,16 @@ class StageMotion:
         if position_mm is None or not np.isfinite(position_mm):
             moved = self.speed_mm_s * dt_s if self.in_lab else 0.0
             self.assumed_mm += moved
-            return StageStep(moved, False, 0.0)
+            return moved, False, 0.0
         if not np.isfinite(self.read_mm):
             self._read(position_mm, t_s)
-            return StageStep(0.0, False, 0.0)
+            return 0.0, False, 0.0
         speed = (position_mm - self.read_mm) / (t_s - self.read_t_s)
         moved = position_mm - self.assumed_mm if self.in_lab else speed * dt_s
         found = 0.0 if self.in_lab else speed
         self.in_lab, self.speed_mm_s = True, speed
         self._read(position_mm, t_s)
-        return StageStep(moved, True, found)
+        return moved, True, found
 
     def _read(self, position_mm: float, t_s: float) -> None:
         self.read_mm = self.assumed_mm = float(position_mm)

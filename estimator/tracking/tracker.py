@@ -63,18 +63,13 @@ class OpenFrames:
         self._frames[frame] = (t_s, np.full(count, NO_PARTICLE))
 
     def write(self, entries: Iterable[tuple[int, int]], particle: int) -> None:
-        """Set the id of a track in some frames; the track's earlier entries in these frames are
-        removed.
+        """Set the id of a track in some frames.
 
         entries : (frame, index of the measurement); the index is -1 where the track was missed.
-        particle : id of the track, or -1 to remove the ids of these measurements.
         """
         for frame, column in entries:
-            ids = self._frames[frame][1]
-            if particle != NO_PARTICLE:
-                ids[ids == particle] = NO_PARTICLE
             if column >= 0:
-                ids[column] = particle
+                self._frames[frame][1][column] = particle
 
     def close(
         self, before_frame: int, alive: set[int]
@@ -388,12 +383,12 @@ class Tracker:
         dt = t_s - self.last[1]
         if not dt > 0:
             raise InputError(f"time {t_s} s after {self.last[1]} s", todo="times must increase")
-        moved = stage.step(position_mm, t_s, dt)
+        moved_mm, known, found_mm_s = stage.step(position_mm, t_s, dt)
         axis = np.array(self.axis)
-        step = transition(self.settings, self.axis, round(dt, 12), moved.known)
+        step = transition(self.settings, self.axis, round(dt, 12), known)
         control = np.zeros(STATES)
-        control[POSITION] -= axis * moved.moved_mm
-        return step, control, axis * moved.found_speed_mm_s
+        control[POSITION] -= axis * moved_mm
+        return step, control, axis * found_mm_s
 
     def _predict_all(self, t_s: float, position_mm: float | None) -> Motion | None:
         if self.last is None:
@@ -435,14 +430,11 @@ class Tracker:
                 out += [Cluster.of(t) for t in self._broken(decision, scan)]
             if decision.still is not None:
                 out.append(decision.still)
-                for particle, entries in decision.still.branches[0].history.items():
-                    self.frames.write(entries[-1:], particle)
         self.clusters = out
         return np.unique(np.array(claimed, np.int64))
 
     def _broken(self, decision: Decision, scan: Scan) -> list[Track]:
         """New ids for the tracks that go on behind a conflict."""
-        self.frames.write((e for b in decision.broken for e in b.entries), NO_PARTICLE)
         old = [b.track.particle for b in decision.broken]
         going_on = []
         for broken in decision.broken:

@@ -215,36 +215,20 @@ class Cluster:
 
 
 @dataclass(frozen=True)
-class Broken:
-    """Hold a track that is cut where its continuation is ambiguous.
+class Decided:
+    """Hold a track about which a conflict is decided.
 
     A conflict is a run of frames in which several tracks compete for the same measurements.
 
-    track : the track with its most probable continuation.
-    kept : its unambiguous measurements at the beginning, which remain with the track.
-    new : those at the end that unambiguously belong together and form a new track. The measurements
-        in between belong to no track.
+    kept : its measurements in the conflict; of a track that is cut those before it is ambiguous.
+    new : of a track that is cut, the measurements at the end that unambiguously belong together and
+        form a new track, which this one becomes; those in between belong to no track. None for a
+        track that goes on.
     """
 
     track: Track
     kept: list[Entry]
-    new: list[Entry]
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What was decided about a conflict in one frame.
-
-    still : the tracks that remain undecided; None if there are none.
-    free : tracks that are decided, with their measurements (frame, column).
-    broken : tracks that are cut.
-    runner_up_log_ratio : log-likelihood ratio of the best to the second-best hypothesis.
-    """
-
-    still: Cluster | None
-    free: list[tuple[Track, list[Entry]]]
-    broken: list[Broken]
-    runner_up_log_ratio: float
+    new: list[Entry] | None = None
 
 
 def recent(entries: Sequence[Entry], depth: int) -> list[Entry]:
@@ -311,28 +295,29 @@ def disputed(branches: Sequence[Branch], depth: int) -> set[int]:
 
 def decide(
     cluster: Cluster, frame: int, settings: TrackerSettings, *, at_once: bool = False
-) -> Decision:
-    """Decide which tracks of a conflict are safe in this frame; all of them if ``at_once``."""
-    branches = cluster.branches
-    if not cluster.open:
-        return Decision(None, _leave(branches[0], cluster.tracks), [], np.inf)
-    runner_up = -branches[1].weight
-    over = frame - cluster.since_frame + 1 >= settings.window_frames
-    if not (over or at_once):
+) -> tuple[Cluster | None, list[Decided]]:
+    """Decide which tracks of a conflict are safe in this frame; all of them if ``at_once``.
+
+    Returns the tracks that remain undecided, None if there are none, and the others.
+    """
+    branches, still = cluster.branches, None
+    over = at_once or frame - cluster.since_frame + 1 >= settings.window_frames
+    open_ids, close = set[int](), branches
+    if cluster.open and not over:
         open_ids = disputed(branches, _MERGE_FRAMES)
         still = _remaining(cluster, open_ids, settings)
         open_ids = open_ids if still else set()
-        free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in open_ids])
-        return Decision(still, free, [], runner_up)
-    close = [b for b in branches if b.weight >= -settings.margin_log_ratio]
-    open_ids = disputed(close, 1)
-    free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in open_ids])
-    broken = _break(close, [t for t in cluster.tracks if t.particle in open_ids])
-    return Decision(None, free, broken, runner_up)
-
-
-def _leave(best: Branch, tracks: list[Track]) -> list[tuple[Track, list[Entry]]]:
-    return [(t, best.history.get(t.particle, [])) for t in tracks]
+    elif cluster.open:
+        close = [b for b in branches if b.weight >= -settings.margin_log_ratio]
+        open_ids = disputed(close, 1)
+    safe = [
+        Decided(t, branches[0].history.get(t.particle, []))
+        for t in cluster.tracks
+        if t.particle not in open_ids
+    ]
+    if still is not None:
+        return still, safe
+    return None, safe + _break(close, [t for t in cluster.tracks if t.particle in open_ids])
 
 
 def _remaining(cluster: Cluster, open_ids: set[int], settings: TrackerSettings) -> Cluster | None:
@@ -357,22 +342,17 @@ def _remaining(cluster: Cluster, open_ids: set[int], settings: TrackerSettings) 
     return Cluster(out) if len(out) > 1 else None
 
 
-def _break(close: list[Branch], tracks: list[Track]) -> list[Broken]:
+def _break(close: list[Branch], tracks: list[Track]) -> list[Decided]:
     if not tracks:
         return []
-    particles = [t.particle for t in tracks]
-    paths = [[b.history[p] for p in particles] for b in close]
+    paths = [[b.history[t.particle] for t in tracks] for b in close]
     start = _agreed_links_from(paths)
     out = []
-    for i, track in enumerate(tracks):
-        mine = [path[i] for path in paths]
-        kept = []
-        for entries in zip(*mine):
-            if len(set(entries)) > 1:
-                break
-            kept.append(entries[0])
-        new = [e for e in paths[0][i] if e[0] >= start and e[1] >= 0]
-        out.append(Broken(track, [e for e in kept if e[0] < start], new))
+    for track, best, mine in zip(tracks, paths[0], zip(*paths)):
+        same = [len(set(entries)) == 1 for entries in zip(*mine)]
+        agreed = best[: same.index(False)] if False in same else best
+        kept = [e for e in agreed if e[0] < start]
+        out.append(Decided(track, kept, [e for e in best if e[0] >= start and e[1] >= 0]))
     return out
 
 

@@ -17,7 +17,6 @@ from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.tracking.association import (
     Cluster,
-    Decision,
     Scan,
     advance,
     assigned_with_shift,
@@ -99,24 +98,6 @@ _TOUCHING = 1.5
 """Largest distance of two centres, in diameters, of bubbles that may have been one."""
 
 
-def born(
-    scan: Scan, column: int, velocity_mm_s: Array, encoder: bool, tracks: Sequence[Track]
-) -> Track:
-    """Return a tentative track that starts at a measurement.
-
-    velocity_mm_s : (3,) first velocity. encoder : whether an encoder has given the stage's speed.
-    tracks : confirmed tracks; the nearest one is noted as a possible parent.
-    """
-    point = scan.measured.points_mm[column]
-    covariance = birth_covariance(scan.settings, scan.measured.covariance_mm2[column], encoder)
-    x = np.zeros(STATES)
-    x[POSITION], x[VELOCITY] = point, velocity_mm_s
-    out = Track(x, covariance, born_frame=scan.frame, history=[(scan.frame, column)])
-    out.saw(scan.frame, scan.t_s, float(scan.measured.d_eq_mm[column]))
-    out.parent = Neighbours(tracks).beside(point)
-    return out
-
-
 def extend(
     tentative: Sequence[Track], scan: Scan, free: Bools, common: Common, mean_gain: Array | None
 ) -> tuple[list[Track], Common, Array | None]:
@@ -159,20 +140,28 @@ def hopeless(track: Track, frame: int, settings: TrackerSettings) -> bool:
     return missed > settings.confirm_frames - settings.confirm_hits
 
 
-def split_off(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[TrackEvent]:
+def related(kind: str, track: Track, confirmed: Sequence[Track], scan: Scan) -> list[TrackEvent]:
     """Return a "split" event if a newly confirmed track is a part of the track beside which it was
-    born.
+    born, or a "merge" event if a lost track is a part of the one beside which it was lost.
 
-    The list is empty if the volumes before and after do not agree.
+    There is none unless the volumes before and after agree within the tolerance.
     """
-    parents = {t.particle: t for t in confirmed}
-    if track.parent is None or track.parent[0] not in parents:
+    noted = track.parent if kind == "split" else track.near
+    other = next((t for t in confirmed if noted is not None and t.particle == noted[0]), None)
+    if noted is None or other is None:
         return []
-    parent, before = parents[track.parent[0]], track.parent[1]
-    if not _volumes_balance(before, parent.d_last_mm, track.d_last_mm, scan.settings):
+    whole, *parts = (
+        (noted[1], other.d_last_mm, track.d_last_mm)
+        if kind == "split"
+        else (other.d_last_mm, noted[1], track.d_eq_mm)
+    )
+    off = abs(parts[0] ** 3 + parts[1] ** 3 - whole**3)
+    if not off <= scan.settings.balance_tolerance * whole**3:
         return []
-    reason = f"d_eq {before:.2f} mm became {parent.d_last_mm:.2f} and {track.d_last_mm:.2f} mm"
-    return [TrackEvent("split", scan.frame, scan.t_s, (parent.particle, track.particle), reason)]
+    both, one = f"{parts[0]:.2f} and {parts[1]:.2f} mm", f"{whole:.2f} mm"
+    before, after = (one, both) if kind == "split" else (both, one)
+    ids = other.particle, track.particle
+    return [TrackEvent(kind, scan.frame, scan.t_s, ids, f"d_eq {before} became {after}")]
 
 
 def ended(
@@ -194,21 +183,10 @@ def ended(
         unseen, frames = scan.t_s - track.seen_t_s, scan.frame - track.seen_frame
         if unseen > scan.settings.gap_s and frames > scan.settings.gap_frames:
             dead.add(track.particle)
-            events += _merged_into(track, confirmed, scan)
+            events += related("merge", track, confirmed, scan)
             reason = f"not seen since frame {track.seen_frame}, {unseen:.3f} s"
             events.append(TrackEvent("death", scan.frame, scan.t_s, (track.particle,), reason))
     return dead, events
-
-
-def _merged_into(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[TrackEvent]:
-    others = {t.particle: t for t in confirmed}
-    if track.near is None or track.near[0] not in others:
-        return []
-    other, before = others[track.near[0]], track.near[1]
-    if not _volumes_balance(other.d_last_mm, before, track.d_eq_mm, scan.settings):
-        return []
-    reason = f"d_eq {before:.2f} and {track.d_eq_mm:.2f} mm became {other.d_last_mm:.2f} mm"
-    return [TrackEvent("merge", scan.frame, scan.t_s, (other.particle, track.particle), reason)]
 
 
 class Neighbours:
@@ -231,18 +209,6 @@ class Neighbours:
                 near = away[k] <= _TOUCHING * track.d_eq_mm
                 return (track.particle, before) if near else None
         return None
-
-
-def _volumes_balance(
-    whole_mm: float, part_a_mm: float, part_b_mm: float, settings: TrackerSettings
-) -> bool:
-    """Return whether the volumes of two parts add up to the volume of the whole, within the
-    tolerance.
-
-    The arguments are equivalent diameters in mm.
-    """
-    off = abs(part_a_mm**3 + part_b_mm**3 - whole_mm**3)
-    return bool(off <= settings.balance_tolerance * whole_mm**3)
 
 
 class Tracker:
@@ -401,9 +367,19 @@ class Tracker:
         return Motion(step.matrix, step.noise, step.matrix[:, VELOCITY] @ found + control)
 
     def _new(self, scan: Scan, column: int) -> Track:
-        """Start a track at a measurement, with the mean rise if velocities are the lab's."""
-        velocity = np.array(self.axis) * (self.settings.rise_mm_s if self.stage.in_lab else 0.0)
-        return born(scan, column, velocity, self.stage.in_lab, self._confirmed())
+        """Start a tentative track at a measurement, with the mean rise if velocities are the lab's.
+
+        The nearest confirmed track is noted as a possible parent.
+        """
+        measured, in_lab = scan.measured, self.stage.in_lab
+        x = np.zeros(STATES)
+        x[POSITION] = measured.points_mm[column]
+        x[VELOCITY] = np.array(self.axis) * (self.settings.rise_mm_s if in_lab else 0.0)
+        p = birth_covariance(self.settings, measured.covariance_mm2[column], in_lab)
+        out = Track(x, p, born_frame=scan.frame, history=[(scan.frame, column)])
+        out.saw(scan.frame, scan.t_s, float(measured.d_eq_mm[column]))
+        out.parent = Neighbours(self._confirmed()).beside(out.point_mm)
+        return out
 
     def _event(self, kind: str, scan: Scan, particles: tuple[int, ...], reason: str) -> None:
         self.events.append(TrackEvent(kind, scan.frame, scan.t_s, particles, reason))
@@ -418,37 +394,35 @@ class Tracker:
         for cluster in grown:
             histories = [h for b in cluster.branches for h in b.history.values()]
             claimed += [c for h in histories for f, c in h[-1:] if f == scan.frame and c >= 0]
-            decision = decide(cluster, scan.frame, self.settings, at_once=at_once)
-            for track, entries in decision.free:
-                self.frames.write(entries, track.particle)
-                out.append(Cluster.of(track))
-            waited = {t.particle: len(h) for t, h in decision.free if len(h) > 1}
+            still, decided = decide(cluster, scan.frame, self.settings, at_once=at_once)
+            waited, old, new = dict[int, int](), [], []
+            for one in decided:
+                track = one.track
+                self.frames.write(one.kept, track.particle)
+                if one.new is None:
+                    waited |= {track.particle: len(one.kept)} if len(one.kept) > 1 else {}
+                else:
+                    old.append(track.particle)
+                if one.new:
+                    track.particle = self._take_id()
+                    self.frames.write(one.new, track.particle)
+                    new.append(track.particle)
+                if one.new != []:
+                    out.append(Cluster.of(track))
             if waited:
                 reason = f"conflict of {max(waited.values())} frames decided"
                 self._event("resolved", scan, tuple(waited), reason)
-            if decision.broken:
-                out += [Cluster.of(t) for t in self._broken(decision, scan)]
-            if decision.still is not None:
-                out.append(decision.still)
+            if old:
+                behind = -cluster.branches[1].weight
+                reason = (
+                    f"continuation not safe: the log-likelihood ratio to the runner-up is "
+                    f"{behind:.1f}, less than {self.settings.margin_log_ratio:g}"
+                )
+                self._event("break", scan, (*old, *new), reason)
+            if still is not None:
+                out.append(still)
         self.clusters = out
         return np.unique(np.array(claimed, np.int64))
-
-    def _broken(self, decision: Decision, scan: Scan) -> list[Track]:
-        """New ids for the tracks that go on behind a conflict."""
-        old = [b.track.particle for b in decision.broken]
-        going_on = []
-        for broken in decision.broken:
-            self.frames.write(broken.kept, broken.track.particle)
-            if broken.new:
-                broken.track.particle = self._take_id()
-                self.frames.write(broken.new, broken.track.particle)
-                going_on.append(broken.track)
-        reason = (
-            f"continuation not safe: the log-likelihood ratio to the runner-up is "
-            f"{decision.runner_up_log_ratio:.1f}, less than {self.settings.margin_log_ratio:g}"
-        )
-        self._event("break", scan, (*old, *(t.particle for t in going_on)), reason)
-        return going_on
 
     def _births(self, scan: Scan, claimed: Ints, common: Common, gain: Array | None) -> None:
         """Tentative tracks go on, are confirmed or given up; what is left starts new ones."""
@@ -477,7 +451,7 @@ class Tracker:
     def _confirm(self, track: Track, scan: Scan, reason: str) -> None:
         self.frames.write(track.history, track.particle)
         self._event("birth", scan, (track.particle,), reason)
-        self.events += split_off(track, self._confirmed(), scan)
+        self.events += related("split", track, self._confirmed(), scan)
         track.history, track.parent = [], None
         self.clusters.append(Cluster.of(track))
 

@@ -43,14 +43,12 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     points_on,
     rough_distance,
 )
-from telerig.estimator.bubbles.outline.kernels import Outlines
 from telerig.estimator.bubbles.outline.outline_fit import (
+    Outlines,
     blur_px,
     fit_outlines,
-    joined,
     radius_px,
     start_outlines,
-    taken,
 )
 from telerig.estimator.bubbles.outline.rims import Rims
 
@@ -236,20 +234,21 @@ def _found(
     if found:
         every = Rims.concat(found)
         own_start = start_outlines(every.ellipse, every.blur_px, every.inner)
-        fit = fit_outlines(ratio, joined(taken(start, known), own_start), noise, shadows=True)
-        last = np.arange(np.count_nonzero(known), len(fit.inner))
-        start = joined(taken(start, kept), own_start)
-        outlines = joined(taken(outlines, kept), settled(taken(fit, last), every))
+        both = Outlines.concat([start.take(known), own_start])
+        fit = fit_outlines(ratio, both, noise, shadows=True)
+        last = np.arange(np.count_nonzero(known), len(fit))
+        start = Outlines.concat([start.take(kept), own_start])
+        outlines = Outlines.concat([outlines.take(kept), settled(fit.take(last), every)])
         merged = np.concatenate([merged[kept], np.zeros(len(last), np.bool_)])
     elif whole:
-        start, outlines = taken(start, kept), taken(outlines, kept)
+        start, outlines = start.take(kept), outlines.take(kept)
         merged = merged[kept]
-    if not len(start.inner):
+    if not len(start):
         nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
         return replace(nothing, clusters=clusters)
     # All that is known of a bubble of a merged outline is that it is somewhere in it.
     within = np.where(merged, radius_px(outlines) ** 2 / 4.0, 0.0)[:, None, None] * np.eye(2)
-    outlines = outlines._replace(covariance_px2=outlines.covariance_px2 + within)
+    outlines = outlines.changed(covariance_px2=outlines.covariance_px2 + within)
     defocused = _defocused(outlines)
     judged = {"defocus": defocused, "merged": merged}
     columns = _columns(outlines, judged, image.shape, field, clipped)
@@ -271,7 +270,7 @@ def load_compiled_loops() -> None:
     """Load or compile the loops that the detection of bubbles uses.
 
     This is done before copies of this process are made, so that it is done only once. The first
-    time on a computer it takes some 10 s.
+    time in an installation it takes some 15 s.
     """
     image = np.full((64, 96), 200, np.uint8)
     for u in (36, 56):

@@ -6,8 +6,29 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from numba import njit
+from numba.core import event
+
+from telerig.progress import tell
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+class _FirstCompilation(event.Listener):  # type: ignore[misc]
+    """Tell the user why the first call of a new installation takes long."""
+
+    told = False
+
+    def on_start(self, started: event.Event) -> None:
+        if not self.told and started.data["dispatcher"].py_func.__module__.startswith("telerig."):
+            self.told = True
+            tell("compiling loops, once for this installation")
+
+    def on_end(self, _ended: event.Event) -> None:
+        pass
+
+
+FIRST = _FirstCompilation()
+event.register("numba:compile", FIRST)
 
 
 def compiled(function: _Function) -> _Function:
@@ -19,8 +40,14 @@ def compiled(function: _Function) -> _Function:
 
     Sums may be reordered. NaN and infinity keep their meaning in comparisons, so write
     ``abs(x) < np.inf``: ``np.isfinite`` of a sum may be simplified to True.
+
+    The function cannot be passed to other compiled ones, and expressions of arrays are not merged:
+    that makes compiling faster.
     """
-    options = {"fastmath": {"reassoc", "contract", "nsz", "arcp"}, "error_model": "numpy"}
+    options = {
+        "fastmath": {"reassoc", "contract", "nsz", "arcp"}, "error_model": "numpy",
+        "no_cfunc_wrapper": True, "no_rewrites": True,
+    }  # fmt: skip
     try:
         kept: _Function = njit(cache=True, **options)(function)
     except RuntimeError:  # no folder for the cache

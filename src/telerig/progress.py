@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,15 @@ T = TypeVar("T")
 Progress = Callable[[str, float, int], None]
 """Called with the name of a step, the number done and the total number. Where nothing is counted,
 these are the share that is done, from 0 to 1, and 1."""
+
+
+_tellers: list[Callable[[str], None]] = []
+
+
+def tell(line: str) -> None:
+    """Print a line beside the progress that is shown; nothing where none is."""
+    for say in _tellers[-1:]:
+        say(line)
 
 
 class Steps:
@@ -76,9 +86,19 @@ def steps_shown() -> Iterator[Steps]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    if not (console.is_jupyter or sys.stderr.isatty()):
-        yield Steps(_plain_lines())
-        return
+    _tellers.append(console.print)
+    try:
+        with contextlib.ExitStack() as stack:
+            if console.is_jupyter or sys.stderr.isatty():
+                yield Steps(stack.enter_context(_bar(console)))
+            else:
+                yield Steps(_plain_lines())
+    finally:
+        _tellers.pop()
+
+
+@contextmanager
+def _bar(console: Any) -> Iterator[Callable[[str, float, int, float, float], None]]:
     from rich.progress import BarColumn, Progress, TextColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
@@ -92,7 +112,7 @@ def steps_shown() -> Iterator[Steps]:
                 tasks[what] = bar.add_task(what, total=of or None, words=words)
             bar.update(tasks[what], completed=done, words=words, refresh=True)
 
-        yield Steps(update)
+        yield update
 
 
 _PLAIN_S = 2.0

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numba
 import pytest
 
-from telerig import progress
+from telerig import compiled, progress
 from telerig.errors import InputError
 from telerig.scripts import console
 
@@ -30,6 +31,20 @@ def test_lines_say_how_many_of_all_how_fast_and_how_long(
         "tracks: 0 of 7",
     ]
     assert stage.words() == "detection 29 s, pair model 300 s"
+
+
+def test_the_first_compilation_is_told(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def twice(value: float) -> float:
+        return 2.0 * value
+
+    monkeypatch.setattr(compiled.FIRST, "told", False)
+    monkeypatch.setattr(twice, "__module__", "telerig.example")
+    function = numba.njit(twice)
+    with console.progress(quiet=False):
+        assert function(1.5) == function(1) + 1.0
+    assert capsys.readouterr().err == "compiling loops, once for this installation\n"
 
 
 def test_quiet_says_nothing_but_takes_the_time(capsys: pytest.CaptureFixture[str]) -> None:

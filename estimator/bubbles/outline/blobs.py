@@ -22,8 +22,12 @@ from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     rough_distance,
 )
-from telerig.estimator.bubbles.outline.kernels import Outlines, disc_counts, fitted_arcs
-from telerig.estimator.bubbles.outline.outline_fit import radius_px, shape_oddity
+from telerig.estimator.bubbles.outline.outline_fit import (
+    Outlines,
+    ellipses_along,
+    radius_px,
+    shape_oddity,
+)
 from telerig.estimator.images.noise import clipped_sigma, high_pass
 
 _NOISE_SAMPLES = 40_000
@@ -367,14 +371,8 @@ def _trimmed(points: Array, bounds: list[int]) -> list[Array]:
 
 
 def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
-    """Fit an ellipse robustly to each of B arcs of points.
-
-    Returns the ellipses (B, 5) and the RMS distance (B,) of their points. A prior of 12 % of the
-    radius on a - b and on the shear keeps ellipses through short arcs nearly circular.
-    """
-    sizes = np.array([len(arc) for arc in arcs])
-    ellipses, rms = fitted_arcs(np.concatenate(arcs), sizes)
-    return ellipses, rms
+    """Return the ellipses (B, 5) along B arcs of points, and the RMS distances (B,) of these."""
+    return ellipses_along(np.concatenate(arcs), np.array([len(arc) for arc in arcs]))
 
 
 _CLEAN_PX, _CLEAN_SHARE = 0.15, 0.012
@@ -562,9 +560,10 @@ def _dark(ellipse: Array, contour: Array, shape: tuple[int, ...]) -> bool:
     (left, top), (right, bottom) = begin - low, end - low
     source = blob[begin[1] - first[1] : end[1] - first[1], begin[0] - first[0] : end[0] - first[0]]
     seen_blob[top:bottom, left:right] = source
-    disc, dark = disc_counts(ellipse, low, seen_blob)
-    seen = disc / (np.pi * ellipse[2] * ellipse[3])
-    return bool(seen > _LEAST_IN_IMAGE and dark > _MIN_COVERED * disc)
+    u, v = np.arange(low[0], high[0]), np.arange(low[1], high[1])[:, None]
+    disc = rough_distance(ellipse, u, v) < 0.0
+    seen = np.count_nonzero(disc) / (np.pi * ellipse[2] * ellipse[3])
+    return bool(seen > _LEAST_IN_IMAGE and np.mean(seen_blob[disc]) > _MIN_COVERED)
 
 
 def _covered(ellipses: Array, contour: Array) -> float:

@@ -20,13 +20,7 @@ from telerig.estimator.bubbles.outline.blobs import (
     implausible_outlines,
 )
 from telerig.estimator.bubbles.outline.ellipse_geometry import rough_distance
-from telerig.estimator.bubbles.outline.kernels import Outlines
-from telerig.estimator.bubbles.outline.outline_fit import (
-    radius_px,
-    start_outlines,
-    taken,
-    updated,
-)
+from telerig.estimator.bubbles.outline.outline_fit import Outlines, radius_px, start_outlines
 from telerig.estimator.bubbles.outline.rims import (
     Rims,
     are_bubbles,
@@ -206,11 +200,11 @@ def settled(fitted: Outlines, rims: Rims) -> Outlines:
     sound = near & (fitted.coverage > _LEAST_COVERAGE) & ~implausible_outlines(fitted)
     distance = np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away)
     apart = np.where((distance > _DISAGREE)[:, None, None], away[:, :, None] * away[:, None], 0.0)
-    along = start_outlines(rims.ellipse, rims.blur_px, rims.inner)._replace(
+    along = start_outlines(rims.ellipse, rims.blur_px, rims.inner).changed(
         outer=rims.outer,
         covariance_px2=covariance,
-        chi2_dof=np.full(len(rims), np.nan),
+        chi2_dof=np.nan,
         coverage=np.mean(rims.used, axis=1),
     )
-    fitted = fitted._replace(covariance_px2=fitted.covariance_px2 + apart)
-    return updated(fitted, ~sound, taken(along, ~sound))
+    fitted = fitted.changed(covariance_px2=fitted.covariance_px2 + apart)
+    return fitted.updated(~sound, along.take(~sound))

@@ -29,15 +29,22 @@ def rough_distance(ellipse: Array, u: Floats, v: Floats) -> Array:
     """Return the approximate distance of points from ellipses (px), positive outside.
 
     ellipse : (..., 5) ellipses; u, v : (...) pixels of the points. The shapes are broadcast.
-    It is the first-order value (g - 1) / |grad g|, where g is 1 on the ellipse.
     """
     cos, sin = np.cos(ellipse[..., 4]), np.sin(ellipse[..., 4])
-    a, b = ellipse[..., 2], ellipse[..., 3]
     du, dv = u - ellipse[..., 0], v - ellipse[..., 1]
-    x, y = (du * cos + dv * sin) / a, (dv * cos - du * sin) / b
+    x, y = du * cos + dv * sin, dv * cos - du * sin
+    return np.asarray(axis_distance(ellipse[..., 2], ellipse[..., 3], x, y))
+
+
+def axis_distance(a: Any, b: Any, x: Any, y: Any) -> Any:
+    """Return the approximate distance of a point (x, y) along an ellipse's axes from it.
+
+    It is the first-order value (g - 1) / |grad g|, where g is 1 on the ellipse.
+    """
+    x, y = x / a, y / b
     level = np.sqrt(x * x + y * y) + 1e-12
-    slope = np.sqrt((x / a) ** 2 + (y / b) ** 2) + 1e-12
-    return np.asarray((level - 1.0) * level / slope)
+    x, y = x / a, y / b
+    return (level - 1.0) * level / (np.sqrt(x * x + y * y) + 1e-12)
 
 
 def harmonic_basis(cos: Floats, sin: Floats) -> Floats:
@@ -47,14 +54,8 @@ def harmonic_basis(cos: Floats, sin: Floats) -> Floats:
 
     Returns (8, N): cosine and sine of order 3, then of orders 4, 5 and 6.
     """
-    basis = np.empty((2 * len(HARMONICS), cos.size), dtype=cos.dtype)
-    real, imaginary = cos, sin
-    for order in range(2, HARMONICS[-1] + 1):
-        real, imaginary = real * cos - imaginary * sin, real * sin + imaginary * cos
-        if order >= HARMONICS[0]:
-            basis[2 * (order - HARMONICS[0])] = real
-            basis[2 * (order - HARMONICS[0]) + 1] = imaginary
-    return basis
+    turns = (cos + 1j * sin) ** np.array(HARMONICS)[:, None]
+    return np.stack([turns.real, turns.imag], axis=1).reshape(-1, cos.size)
 
 
 def points_on(ellipse: Array, harmonics: Array, phi: Array) -> Array:

@@ -15,17 +15,101 @@ part is hidden it does, and the harmonics of the frame's whole outlines serve as
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from telerig.arrays import Array, Bools, Float32
+from telerig.arrays import Array, Bools, Float32, Ints, Rows
 from telerig.estimator.bubbles.outline import kernels
 from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS, Index
-from telerig.estimator.bubbles.outline.kernels import Outlines, Prior
 from telerig.statistics import robust_sd
 
 _NODES = 96
+
+
+@dataclass(frozen=True)
+class Outlines(Rows):
+    """Hold the outlines of B bubbles: their parameters, and what a fit has shown of them.
+
+    parameters : (B, 16) ellipse, blur, outer and inner level, harmonics; see `kernels`.
+    shown : (B, 9).
+    """
+
+    parameters: Array
+    shown: Array
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def ellipse(self) -> Array:
+        """(B, 5) ellipses."""
+        return self.parameters[:, : kernels.ELLIPSE]
+
+    @property
+    def sigma_px(self) -> Array:
+        """(B,) standard deviation of the blur of optics and pixel together (px)."""
+        return self.parameters[:, kernels.BLUR]
+
+    @property
+    def outer(self) -> Array:
+        """(B,) grey level outside, as a share of the background."""
+        return self.parameters[:, kernels.OUTER]
+
+    @property
+    def inner(self) -> Array:
+        """(B,) grey level inside, as a share of the background."""
+        return self.parameters[:, kernels.INNER]
+
+    @property
+    def harmonics(self) -> Array:
+        """(B, 8) coefficients (px); 0 where they are not resolved."""
+        return self.parameters[:, kernels.HARMONIC :]
+
+    @property
+    def covariance_px2(self) -> Array:
+        """(B, 2, 2) covariance of the ellipse's centre (px^2)."""
+        return self.shown[:, kernels.COVARIANCE : kernels.SIGMA_OUTLINE].reshape(-1, 2, 2)
+
+    @property
+    def sigma_outline_px(self) -> Array:
+        """(B,) standard deviation of a harmonic's coefficient (px), NaN if the bubble is too small
+        for its blur to have harmonics."""
+        return self.shown[:, kernels.SIGMA_OUTLINE]
+
+    @property
+    def chi2_dof(self) -> Array:
+        """(B,) chi-square per degree of freedom."""
+        return self.shown[:, kernels.CHI2]
+
+    @property
+    def coverage(self) -> Array:
+        """(B,) share of the outline that is visible, 0 to 1."""
+        return self.shown[:, kernels.COVERAGE]
+
+    @property
+    def misfit_px(self) -> Array:
+        """(B,) RMS distance between the rim in the image and the outline, beyond the noise."""
+        return self.shown[:, kernels.MISFIT]
+
+    @property
+    def shift_px(self) -> Array:
+        """(B,) largest displacement since the linearisation (px)."""
+        return self.shown[:, kernels.SHIFT]
+
+    def changed(self, **values: Array | float) -> Outlines:
+        """Return a copy with other values of some properties."""
+        copy = Outlines(self.parameters.copy(), self.shown.copy())
+        for name, value in values.items():
+            getattr(copy, name)[:] = value
+        return copy
+
+    def updated(self, index: Index | Bools, other: Outlines) -> Outlines:
+        """Return a copy with the outlines at the positions ``index`` replaced by ``other``."""
+        copy = Outlines(self.parameters.copy(), self.shown.copy())
+        copy.parameters[index], copy.shown[index] = other.parameters, other.shown
+        return copy
 
 
 def blurred_disc(distance: Array, radius: Array) -> Array:
@@ -82,31 +166,16 @@ _STEPS = 3
 def start_outlines(ellipse: Array, blur_px: Array, inner: Array) -> Outlines:
     """Return outlines (B,) before the fit: ellipses (B, 5), blur of the optics (B,) in px, and grey
     level inside (B,), as a share of the background."""
-    many, zero = len(ellipse), np.zeros(len(ellipse))
+    many = len(ellipse)
     sigma = np.sqrt(blur_px**2 + kernels.PIXEL_VARIANCE_PX2)
-    return Outlines(
-        ellipse.astype(np.float64), np.zeros((many, 2 * len(HARMONICS))), sigma, np.ones(many),
-        inner.astype(np.float64), np.full((many, 2, 2), np.nan), np.full(many, np.nan),
-        zero, zero, zero, zero,
-    )  # fmt: skip
+    levels, harmonics = [sigma, np.ones(many), inner], np.zeros((many, 2 * len(HARMONICS)))
+    return Outlines(np.column_stack([ellipse, *levels, harmonics]), _nothing_shown(many))
 
 
-def taken(outlines: Outlines, index: Index | Bools) -> Outlines:
-    """Return the outlines at the positions ``index``."""
-    return Outlines(*(values[index] for values in outlines))
-
-
-def joined(first: Outlines, last: Outlines) -> Outlines:
-    """Return the outlines of both."""
-    return Outlines(*(np.concatenate(both) for both in zip(first, last, strict=True)))
-
-
-def updated(outlines: Outlines, index: Index | Bools, other: Outlines) -> Outlines:
-    """Return a copy with the outlines at the positions ``index`` replaced by ``other``."""
-    copy = Outlines(*(values.copy() for values in outlines))
-    for values, new in zip(copy, other, strict=True):
-        values[index] = new
-    return copy
+def _nothing_shown(many: int) -> Array:
+    shown = np.zeros((many, kernels.SHOWN))
+    shown[:, kernels.SIGMA_OUTLINE] = np.nan
+    return shown
 
 
 def blur_px(outlines: Outlines) -> Array:
@@ -127,8 +196,8 @@ def shape_spread(outlines: Outlines) -> Array | None:
     """Return the standard deviation (4,) of the coefficients of each order over the whole outlines
     of an image, as shares of the radius; None if these are too few.
     """
-    whole = taken(outlines, _whole(outlines))
-    if len(whole.chi2_dof) < _ENOUGH_WHOLE:
+    whole = outlines.take(_whole(outlines))
+    if len(whole) < _ENOUGH_WHOLE:
         return None
     square = np.median(_power(whole), axis=0) / _MEDIAN_OF_TWO
     return np.maximum(np.sqrt(square), _LEAST)
@@ -151,27 +220,27 @@ def shape_oddity(outlines: Outlines) -> Array:
     return np.where(whole, odd, 0.0)
 
 
-def learnt_prior(outlines: Outlines, inner: Array) -> Prior:
-    """Return a prior of each outline's shape.
+def learnt_prior(outlines: Outlines, inner: Array, partial: Bools) -> Array:
+    """Return a prior of each outline's shape (B, 8), see `kernels`.
 
     That of outlines that are partly hidden is learnt from the whole ones of the same image, order
     by order, because the coefficients fall with the order. All others have a weak prior.
 
-    inner : (B,) prior mean of the grey level inside.
+    inner : (B,) prior mean of the grey level inside; partial : (B,) which are partly hidden.
     """
-    many, partial = len(inner), outlines.coverage < _WHOLE
-    prior = Prior(
-        inner, np.full((many, len(HARMONICS)), _FREE), np.zeros((many, 2)), np.full(many, np.inf)
-    )
-    prior.harmonics[partial], prior.flattening_spread[partial] = _UNLEARNT, _UNLEARNT_FLATTENING
+    prior = np.zeros((len(inner), kernels.PRIOR_HARMONICS + len(HARMONICS)))
+    flattening = slice(kernels.PRIOR_FLATTENING, kernels.PRIOR_SPREAD)
+    prior[:, kernels.PRIOR_INNER] = inner
+    prior[:, kernels.PRIOR_SPREAD] = np.where(partial, _UNLEARNT_FLATTENING, np.inf)
+    prior[:, kernels.PRIOR_HARMONICS :] = np.where(partial, _UNLEARNT, _FREE)[:, None]
     spread = shape_spread(outlines)
     if spread is not None:
-        prior.harmonics[partial] = _WIDENED * spread
+        prior[partial, kernels.PRIOR_HARMONICS :] = _WIDENED * spread
         a, b, angle = outlines.ellipse[_whole(outlines), 2:].T
         own = np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], 1) * ((a - b) / (a + b))[:, None]
         middle = np.median(own, axis=0)
         sd = max(_WIDENED * float(robust_sd(own - middle)), _LEAST_FLATTENING)
-        prior.flattening[partial], prior.flattening_spread[partial] = middle, sd
+        prior[partial, flattening], prior[partial, kernels.PRIOR_SPREAD] = middle, sd
     return prior
 
 
@@ -191,19 +260,39 @@ def fit_outlines(
     The fit to all pixels is repeated for outlines that moved far or are partly hidden. The
     covariance of the latter has what their residuals show of neighbours that mislead them.
     """
-    image, table = np.ascontiguousarray(ratio, np.float32), profile_table()
-    own, below = np.arange(len(start.inner)), 2.0 if shadows else _WHOLE
-    whole = start._replace(coverage=np.ones(own.size))
-    prior = learnt_prior(whole, start.inner)
-    fit = kernels.fitted(image, table, noise, start, own, prior, 0, below)
-    fit = kernels.fitted(image, table, noise, fit, own, prior, _STEPS, below)
+    image, below = np.ascontiguousarray(ratio, np.float32), 2.0 if shadows else _WHOLE
+
+    def fitted(outlines: Outlines, own: Index, prior: Array, steps: int) -> Outlines:
+        fit = Outlines(outlines.parameters[own], _nothing_shown(len(own)))
+        rims = np.ascontiguousarray(outlines.parameters[:, : kernels.BLUR + 1])
+        kernels.fitted(
+            image, profile_table(), noise, rims, own, prior[own], fit.parameters, fit.shown,
+            steps, below,
+        )  # fmt: skip
+        return fit
+
+    own = np.arange(len(start))
+    prior = learnt_prior(start, start.inner, np.zeros(own.size, np.bool_))
+    fit = fitted(fitted(start, own, prior, 0), own, prior, _STEPS)
     again = (fit.coverage < _WHOLE) | (fit.shift_px > _FAR_SHIFT_PX)
     for _ in range(2):
         own = np.flatnonzero(again)
         if own.size == 0:
             break
-        prior = learnt_prior(fit, start.inner)
-        near = kernels.fitted(image, table, noise, fit, own, prior, _STEPS, below)
-        fit = updated(fit, own, near)
+        prior = learnt_prior(fit, start.inner, fit.coverage < _WHOLE)
+        fit = fit.updated(own, fitted(fit, own, prior, _STEPS))
         again = fit.shift_px > _FAR_SHIFT_PX
     return fit
+
+
+def ellipses_along(points: Array, sizes: Ints) -> tuple[Array, Array]:
+    """Fit an ellipse robustly to each of B arcs of points.
+
+    points : (N, 2) the arcs' points (px), one arc after the other; sizes : (B,) their numbers.
+
+    Returns the ellipses (B, 5) and the RMS distance (B,) of their points. A prior of 12 % of the
+    radius on a - b and on the shear keeps ellipses through short arcs nearly circular.
+    """
+    ellipses, rms = np.empty((len(sizes), kernels.ELLIPSE)), np.empty(len(sizes))
+    kernels.fitted_arcs(points, sizes, ellipses, rms)
+    return ellipses, rms

@@ -21,9 +21,9 @@ import numpy as np
 from scipy import fft, ndimage, special
 
 from telerig.arrays import Array, Bools, Float32, Rows
-from telerig.estimator.bubbles.outline import rim_kernels
+from telerig.estimator.bubbles.outline import rim_rays
 from telerig.estimator.bubbles.outline.ellipse_geometry import Index, rough_distance
-from telerig.estimator.bubbles.outline.kernels import fitted_arcs
+from telerig.estimator.bubbles.outline.outline_fit import ellipses_along
 
 _LEAST_RADIUS_SHARE, _LEAST_DIAMETER_PX, _LEAST_SIDE = 0.4, 6.0, 16
 _RADII_PER_OCTAVE, _LEAST_VOTES = 7, 0.4
@@ -168,8 +168,8 @@ def _followed(
     Returns the points (N, RAYS, 2), which of them the fits used, and which candidates are left.
     """
     many = len(ellipse)
-    points = np.empty((many, rim_kernels.RAYS, 2))
-    used = np.zeros((many, rim_kernels.RAYS), np.bool_)
+    points = np.empty((many, rim_rays.RAYS, 2))
+    used = np.zeros((many, rim_rays.RAYS), np.bool_)
     alive, began = np.ones(many, np.bool_), ellipse.copy()
     for finer, window, stiffness in _PASSES:
         level = np.maximum(octave - finer, 0)
@@ -179,14 +179,14 @@ def _followed(
             local = ellipse[own]
             local[:, :2] = (local[:, :2] - offset) / size
             local[:, 2:4] /= size
-            rim, strength = rim_kernels.closed_rims(calm[k], local, window, floors[k], stiffness)
+            rim, strength = rim_rays.closed_rims(calm[k], local, window, floors[k], stiffness)
             seen = strength > _SEEN_STRENGTH
             enough = seen.sum(axis=1) >= _LEAST_SEEN
             alive[own[~enough]] = False
             if not np.any(enough):
                 continue
             own, rim, seen = own[enough], rim[enough], seen[enough]
-            fitted = fitted_arcs(rim[seen], seen.sum(axis=1))[0]
+            fitted = ellipses_along(rim[seen], seen.sum(axis=1))[0]
             fitted[:, :2] = fitted[:, :2] * size + offset
             fitted[:, 2:4] *= size
             change = np.abs(np.log(np.sqrt(fitted[:, 2] * fitted[:, 3]) / began[own, 2]))
@@ -201,9 +201,7 @@ def rims_along(ratio: Float32, sigma: float, ellipse: Array) -> Rims:
     """Return candidates that were found in another way: the rims along ellipses (N, 5)."""
     calm = _blurred(np.ascontiguousarray(ratio, np.float32), _CALM_CELLS)
     _, window, stiffness = _PASSES[-1]
-    points, strength = rim_kernels.closed_rims(
-        calm, ellipse, window, _NOISE_SLOPE * sigma, stiffness
-    )
+    points, strength = rim_rays.closed_rims(calm, ellipse, window, _NOISE_SLOPE * sigma, stiffness)
     used = strength > _SEEN_STRENGTH
     used[used.sum(axis=1) < _LEAST_SEEN] = True
     return measured_rims(calm, sigma, ellipse, points, used)
@@ -211,7 +209,7 @@ def rims_along(ratio: Float32, sigma: float, ellipse: Array) -> Rims:
 
 def measured_rims(calm: Float32, sigma: float, ellipse: Array, points: Array, used: Bools) -> Rims:
     """Return what an image, slightly blurred, shows along the rims of ellipses (N, 5)."""
-    seen = rim_kernels.judged(calm, ellipse, _NOISE_SLOPE * sigma)
+    seen = rim_rays.judged(calm, ellipse, _NOISE_SLOPE * sigma)
     strong = (seen.agreement > _STRONG) & (seen.fall > _LEAST_FALL)
     inside = np.isfinite(seen.agreement)
     agreement = np.sum(seen.agreement, axis=1, where=inside, initial=0.0)
@@ -246,9 +244,9 @@ def sole_owners(rims: Rims, evidence: Array, sure: int = 0) -> Index:
     """
     rank = evidence + np.where(np.arange(len(rims)) < sure, 2.0, 0.0)
     order = np.argsort(-rank, kind="stable")
-    least = _OWN_SHARE * rim_kernels.RAYS * rims.inside
+    least = _OWN_SHARE * rim_rays.RAYS * rims.inside
     least[:sure] = 0.0
-    own = rim_kernels.owners(order, rims.ellipse, rims.places, rims.strong, least)
+    own = rim_rays.owners(order, rims.ellipse, rims.places, rims.strong, least)
     return np.asarray(order[own[order]])
 
 
@@ -285,7 +283,7 @@ def refitted(rims: Rims) -> Rims:
             used[k] = own
     points = rims.points[used]
     if len(rims):
-        ellipse = fitted_arcs(points, used.sum(axis=1))[0]
+        ellipse = ellipses_along(points, used.sum(axis=1))[0]
     return replace(rims, ellipse=ellipse, used=used)
 
 
@@ -297,10 +295,10 @@ def rim_covariance(rims: Rims) -> Array:
     share of the rim that is not seen, times the radius, squared. The last two were found on
     rendered swarms.
     """
-    sector = np.arange(rim_kernels.RAYS) * _SECTORS // rim_kernels.RAYS
+    sector = np.arange(rim_rays.RAYS) * _SECTORS // rim_rays.RAYS
     without = [rims.used & (sector != k) for k in range(_SECTORS)]
     centres = np.stack(
-        [fitted_arcs(rims.points[part], part.sum(axis=1))[0][:, :2] for part in without]
+        [ellipses_along(rims.points[part], part.sum(axis=1))[0][:, :2] for part in without]
     )
     away = centres - np.mean(centres, axis=0)
     spread = np.einsum("sni,snj->nij", away, away) * (_SECTORS - 1.0) / _SECTORS

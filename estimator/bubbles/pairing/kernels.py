@@ -1,4 +1,5 @@
-"""Compiled loops over the pairs and larger groups of a frame's detections."""
+"""Sums over the pairs and larger groups of a frame's detections, where they are many in compiled
+loops."""
 
 from __future__ import annotations
 
@@ -17,7 +18,6 @@ _LARGEST_EXPONENT = 600.0
 SHIFT_PASSES = 4
 
 
-@compiled
 def gap_log_odds(
     gap: Array, variance: Array, shift: float, uncertainty: float, span_px: float, out: Array
 ) -> None:
@@ -27,35 +27,45 @@ def gap_log_odds(
     The density of a true pair's gap is normal with wider tails (for disturbed outlines), and 0
     beyond a limit. It is compared with a uniform density over the span that both images cover.
     """
-    for e in range(gap.size):
-        own = variance[e] + uncertainty
-        square = (gap[e] - shift) ** 2
-        wide = own + min(max(3.0 * own, _LEAST_TAIL_PX2), MOST_TAIL_PX2)
-        if not square < GATE_SIGMA**2 * wide:
-            out[e] = NEVER
-            continue
-        core = np.exp(-0.5 * square / own)
-        tail = np.exp(-0.5 * square / wide) * np.sqrt(own / wide)
-        density = ((1.0 - TAIL) * core + TAIL * tail) / np.sqrt(2.0 * np.pi * own)
-        out[e] = np.log(max(density * span_px, 1e-300))
+    own = variance + uncertainty
+    square = (gap - shift) ** 2
+    wide = own + np.clip(3.0 * own, _LEAST_TAIL_PX2, MOST_TAIL_PX2)
+    core = np.exp(-0.5 * square / own)
+    tail = np.exp(-0.5 * square / wide) * np.sqrt(own / wide)
+    density = ((1.0 - TAIL) * core + TAIL * tail) / np.sqrt(2.0 * np.pi * own)
+    odds = np.log(np.maximum(density * span_px, 1e-300))
+    out[:] = np.where(square < GATE_SIGMA**2 * wide, odds, NEVER)
 
 
 @compiled
-def _components(rows: Ints, counts: Ints, possible: Bools) -> Ints:
-    """Return for each group (E,) a number that all possible groups have in common which
-    detections connect; -1 for others."""
-    first = np.cumsum(counts) - counts
-    parent = np.arange(counts.sum())
-    out = np.full(len(rows), -1)
+def _linked(keys: Ints, many: int) -> tuple[Ints, Ints]:
+    """Return lists (many,), (E,) of the items with each key: the first of them, and after each item
+    the next one; -1 at the end. Items with the key -1 are in none."""
+    head, following = np.full(many, -1), np.full(keys.size, -1)
+    for e in range(keys.size - 1, -1, -1):
+        if keys[e] >= 0:
+            following[e] = head[keys[e]]
+            head[keys[e]] = e
+    return head, following
+
+
+@compiled
+def _components(places: Ints, possible: Bools, many: int) -> Ints:
+    """Return for each group (E,) a detection that all possible groups have in common which
+    detections connect; -1 for others.
+
+    places : (E, C) positions of the groups' detections among all ``many``; -1 for none.
+    """
+    parent, out = np.arange(many), np.full(possible.size, -1)
     for turn in range(2):
-        for e in range(len(rows)):
+        for e in range(possible.size):
             if not possible[e]:
                 continue
             root = -1
-            for c in range(rows.shape[1]):
-                if rows[e, c] < 0:
+            for c in range(places.shape[1]):
+                own = places[e, c]
+                if own < 0:
                     continue
-                own = first[c] + rows[e, c]
                 while parent[own] != own:
                     parent[own] = parent[parent[own]]
                     own = parent[own]
@@ -76,26 +86,30 @@ def _exact(weight: Array, alone: Array, choice: Ints, mask: Ints, columns: int) 
     alone : (n,) odds of a row that takes none. Dynamic programming over the subsets of columns that
     the first rows have taken.
     """
-    n = alone.size
-    forward, backward = np.zeros((n + 1, 1 << columns)), np.ones((n + 1, 1 << columns))
+    n, sets = alone.size, 1 << columns
+    forward, backward = np.zeros((n + 1, sets)), np.ones((n + 1, sets))
     forward[0, 0] = 1.0
-    ends = np.searchsorted(choice, np.arange(n + 1))
+    head, following = _linked(choice, n)
     for i in range(n):
         last = n - 1 - i
-        for taken in range(1 << columns):
+        for taken in range(sets):
             forward[i + 1, taken] += alone[i] * forward[i, taken]
-            for e in range(ends[i], ends[i + 1]):
+            e = head[i]
+            while e >= 0:
                 if forward[i, taken] > 0.0 and not taken & mask[e]:
                     forward[i + 1, taken | mask[e]] += weight[e] * forward[i, taken]
+                e = following[e]
             total = alone[last] * backward[last + 1, taken]
-            for e in range(ends[last], ends[last + 1]):
+            e = head[last]
+            while e >= 0:
                 if not taken & mask[e]:
                     total += weight[e] * backward[last + 1, taken | mask[e]]
+                e = following[e]
             backward[last, taken] = total
     out = np.zeros(weight.size)
     for e in range(weight.size):
         total, i = 0.0, choice[e]
-        for taken in range(1 << columns):
+        for taken in range(sets):
             if not taken & mask[e]:
                 total += forward[i, taken] * backward[i + 1, taken | mask[e]]
         out[e] = weight[e] * total / backward[0, 0]
@@ -103,6 +117,81 @@ def _exact(weight: Array, alone: Array, choice: Ints, mask: Ints, columns: int) 
 
 
 @compiled
+def _joint(log_odds: Array, places: Ints, own: Ints, many: int, out: Array) -> bool:
+    """Write the probabilities of the groups ``own`` (n,) of a component into ``out`` (E,).
+
+    places : (E, C) positions of the groups' detections among all ``many``; -1 for none.
+    Returns whether the component is small enough.
+    """
+    if own.size == 1:
+        out[own[0]] = 1.0 / (1.0 + np.exp(-log_odds[own[0]]))
+        return True
+    cameras = places.shape[1]
+    seen, number = np.zeros(cameras, np.int64), np.full(many, -1)
+    for e in own:
+        for c in range(cameras):
+            if places[e, c] >= 0 and number[places[e, c]] < 0:
+                number[places[e, c]] = seen[c]
+                seen[c] += 1
+    leading = columns = 0
+    for c in range(cameras):
+        columns += seen[c]
+        if seen[c] > seen[leading]:
+            leading = c
+    columns -= seen[leading]
+    if columns > _EXACT_SIDE:
+        return False
+    choice, mask = np.empty(own.size, np.int64), np.zeros(own.size, np.int64)
+    rows = seen[leading]
+    for k in range(own.size):
+        first_bit = 0
+        for c in range(cameras):
+            if c != leading:
+                if places[own[k], c] >= 0:
+                    mask[k] |= 1 << (first_bit + number[places[own[k], c]])
+                first_bit += seen[c]
+        choice[k] = rows
+        if places[own[k], leading] >= 0:
+            choice[k] = number[places[own[k], leading]]
+        else:  # it is in no group of the leading camera: a row of its own
+            rows += 1
+    peak, weight = np.zeros(rows), np.empty(own.size)
+    for k in range(own.size):
+        limit = _LARGEST_EXPONENT / rows
+        peak[choice[k]] = min(max(peak[choice[k]], log_odds[own[k]]), limit)
+    for k in range(own.size):
+        weight[k] = np.exp(log_odds[own[k]] - peak[choice[k]])
+    for i in range(rows):
+        peak[i] = np.exp(-peak[i])
+    found = _exact(weight, peak, choice, mask, columns)
+    for k in range(own.size):
+        out[own[k]] = found[k]
+    return True
+
+
+@compiled
+def _marginals(log_odds: Array, places: Ints, many: int, negligible: float, out: Array) -> None:
+    waiting, left = np.ones(log_odds.size, np.bool_), log_odds.size
+    buffer = np.empty(log_odds.size, np.int64)
+    while left > 0:
+        for e in range(log_odds.size):
+            waiting[e] = waiting[e] and log_odds[e] > negligible
+        head, following = _linked(_components(places, waiting, many), many)
+        left = 0
+        for root in range(many):
+            size, e = 0, head[root]
+            while e >= 0:
+                buffer[size] = e
+                size += 1
+                e = following[e]
+            if size > 0:
+                small = _joint(log_odds, places, buffer[:size], many, out)
+                for k in range(size):
+                    waiting[buffer[k]] = not small
+                left += 0 if small else size
+        negligible += 1.0
+
+
 def marginals(log_odds: Array, rows: Ints, counts: Ints, negligible: float) -> Array:
     """Return the posterior probability (E,) of each group.
 
@@ -114,69 +203,13 @@ def marginals(log_odds: Array, rows: Ints, counts: Ints, negligible: float) -> A
     component the least likely groups are left out, one unit of log odds after the other, until it
     falls apart.
     """
-    out = np.zeros(log_odds.size)
-    waiting = np.ones(log_odds.size, dtype=np.bool_)
-    first = np.cumsum(counts) - counts
-    place = np.empty(counts.sum(), dtype=np.int64)
-    while waiting.any():
-        possible = waiting & (log_odds > negligible)
-        waiting[:] = False
-        component = _components(rows, counts, possible)
-        order = np.argsort(component, kind="mergesort")
-        low = np.searchsorted(component[order], 0)
-        while low < order.size:
-            high = low + 1
-            while high < order.size and component[order[high]] == component[order[low]]:
-                high += 1
-            mine = order[low:high]
-            low = high
-            if mine.size == 1:
-                out[mine[0]] = 1.0 / (1.0 + np.exp(-log_odds[mine[0]]))
-                continue
-            seen = np.zeros(counts.size, dtype=np.int64)
-            for e in mine:
-                for c in range(counts.size):
-                    if rows[e, c] >= 0:
-                        place[first[c] + rows[e, c]] = -1
-            for e in mine:
-                for c in range(counts.size):
-                    if rows[e, c] >= 0 and place[first[c] + rows[e, c]] < 0:
-                        place[first[c] + rows[e, c]] = seen[c]
-                        seen[c] += 1
-            leading = np.argmax(seen)
-            columns = seen.sum() - seen[leading]
-            if columns > _EXACT_SIDE:
-                waiting[mine] = True
-                continue
-            bit = np.cumsum(seen) - seen
-            bit[leading + 1 :] -= seen[leading]
-            choice, mask = np.empty(mine.size, np.int64), np.zeros(mine.size, np.int64)
-            count = seen[leading]
-            for k in range(mine.size):
-                choice[k] = -1
-                for c in range(counts.size):
-                    if rows[mine[k], c] >= 0:
-                        at = place[first[c] + rows[mine[k], c]]
-                        if c == leading:
-                            choice[k] = at
-                        else:
-                            mask[k] |= 1 << (bit[c] + at)
-                if choice[k] < 0:  # it is in no group of the leading camera: a row of its own
-                    choice[k] = count
-                    count += 1
-            peak = np.zeros(count)
-            for k in range(mine.size):
-                peak[choice[k]] = max(peak[choice[k]], log_odds[mine[k]])
-            peak = np.minimum(peak, _LARGEST_EXPONENT / count)
-            by_row = np.argsort(choice, kind="mergesort")
-            mine, choice, mask = mine[by_row], choice[by_row], mask[by_row]
-            weight = np.exp(log_odds[mine] - peak[choice])
-            out[mine] = _exact(weight, np.exp(-peak), choice, mask, columns)
-        negligible += 1.0
+    counts = np.asarray(counts, np.int64)
+    out, first = np.zeros(log_odds.size), np.cumsum(counts) - counts
+    places = np.ascontiguousarray(np.where(rows < 0, -1, rows + first), np.int64)
+    _marginals(np.ascontiguousarray(log_odds), places, int(counts.sum()), negligible, out)
     return out
 
 
-@compiled
 def common_shift(
     gap: Array,
     variance: Array,
@@ -201,15 +234,10 @@ def common_shift(
     odds += appearance
     for _ in range(SHIFT_PASSES if frame_px > 0.0 else 0):
         probability = marginals(odds, rows, counts, least)
-        total, pull = 1.0 / (frame_px * frame_px), 0.0
-        for e in range(gap.size):
-            if probability[e] > 0.0:
-                off = (gap[e] - shift) ** 2
-                weight = probability[e] / variance[e]
-                weight /= 1.0 + off / (4.0 * (variance[e] + uncertainty))
-                total += weight
-                pull += weight * gap[e]
-        shift, uncertainty = pull / total, 1.0 / total
+        off = (gap - shift) ** 2
+        weight = probability / variance / (1.0 + off / (4.0 * (variance + uncertainty)))
+        uncertainty = 1.0 / (1.0 / (frame_px * frame_px) + float(weight.sum()))
+        shift = float(weight @ gap) * uncertainty
         gap_log_odds(gap, variance, shift, uncertainty, span_px, odds)
         odds += appearance
     return odds, shift, uncertainty

@@ -10,14 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
 
 from telerig.arrays import Array
 
 PIXEL_VARIANCE_PX2 = 1.0 / 12.0
-_FOURTH = -1.0 / 120.0 / 24.0
-_ROOT_2PI = float(np.sqrt(2.0 * np.pi))
-_NODE_SPACING_SIGMA = 1.1
 
 
 def shape_from_axes(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> Array:
@@ -68,39 +64,12 @@ def _columns(shape_px: Array) -> tuple[Array, Array, Array]:
     return shape_px[..., :1], shape_px[..., 1:2], shape_px[..., 2:]
 
 
-def _column_kernel(z: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    """Return one-dimensional point spread at ``sigma z``: its integral, itself, its derivative."""
-    k = _FOURTH / sigma**4
-    z2 = z * z
-    g = np.exp(-0.5 * z2) * (1.0 / (_ROOT_2PI * sigma))
-    integral = ndtr(z) - (k * sigma) * (z * (z2 - 3.0)) * g
-    derivative = (g * (-1.0 / sigma)) * z * (1.0 + k * (z2 * (z2 - 10.0) + 15.0))
-    return integral, g * (1.0 + k * (z2 * (z2 - 6.0) + 3.0)), derivative
-
-
-def _row_kernel(z: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return the one-dimensional point spread at ``sigma z`` and its second derivative."""
-    k = _FOURTH / sigma**4
-    z2 = z * z
-    g = np.exp(-0.5 * z2) * (1.0 / (_ROOT_2PI * sigma))
-    bent = z2 - 1.0 + k * (z2 * (z2 * (z2 - 15.0) + 45.0) - 15.0)
-    return g * (1.0 + k * (z2 * (z2 - 6.0) + 3.0)), (g / sigma**2) * bent
-
-
-def quadrature_nodes(a_sigma: float) -> int:
-    """Return the number of nodes round a contour that make the trapezoid rule exact to about 1e-6.
-
-    a_sigma : longest semi-axis in units of the blur's sigma.
-    """
-    return max(24, int(np.ceil(2.0 * np.pi * a_sigma / _NODE_SPACING_SIGMA)))
-
-
 def coverage_on_grid(
     u_px: Array, v_px: Array, centre_px: ArrayLike, shape_px: ArrayLike, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
     """Return how much of each pixel's blurred footprint an ellipse covers, exactly.
 
-    u_px, v_px : columns (..., U) and rows (..., V) of the pixels.
+    u_px, v_px : columns (..., U) and rows (..., V) of the pixels, in steps of 1.
     centre_px : (..., 2).
     shape_px : (..., 3).
     sigma_px : (...) standard deviation of the blur.
@@ -110,39 +79,19 @@ def coverage_on_grid(
 
     By Gauss's theorem with the field (P(x - u) p(y - v), 0), p the one-dimensional point spread and
     P its integral, the convolution over the ellipse's area is an integral round its contour of a
-    smooth periodic function: the trapezoid rule converges exponentially, and the sum of products of
-    row and column functions is a matrix product.
+    smooth periodic function: the trapezoid rule converges exponentially, here to about 1e-6.
     """
-    centre, shape = np.asarray(centre_px, dtype=np.float64), np.asarray(shape_px, dtype=np.float64)
-    sigma = np.asarray(sigma_px, dtype=np.float64)
-    count = quadrature_nodes(float(np.max(semi_axes(shape)[0] / sigma)))
-    t = 2.0 * np.pi / count * np.arange(count)
-    c, s = np.cos(t), np.sin(t)
-    m11, m12, m22 = (shape[..., i, None] for i in range(3))
-    normal_u = (m22 * c - m12 * s) * (2.0 * np.pi / count)
-    normal_v = (m11 * s - m12 * c) * (2.0 * np.pi / count)
-    sigma3 = sigma[..., None, None]
-    x = centre[..., 0, None] + m11 * c + m12 * s
-    y = centre[..., 1, None] + m12 * c + m22 * s
-    column_p, column_d, column_d1 = _column_kernel(
-        (x[..., None, :] - u_px[..., None]) / sigma3, sigma3
-    )
-    row_d, row_d2 = _row_kernel((y[..., None, :] - v_px[..., None]) / sigma3, sigma3)
+    from telerig.estimator.dots.fit.kernels import coverages
 
-    motions = np.stack(
-        (normal_u, normal_v, normal_u * c, normal_u * s + normal_v * c, normal_v * s), axis=-2
-    )
-    weighted = row_d[..., None, :, :] * motions[..., :, None, :]
-    sizes = (v_px.shape[-1], u_px.shape[-1])
-    moved = weighted.reshape(*weighted.shape[:-3], -1, count) @ column_d.mT
-    flux = normal_u[..., None, :]
-    integral = column_p.mT
-    row = row_d * flux
-    coverage = row @ integral
-    gradient = np.empty((*coverage.shape[:-2], 6, *sizes))
-    gradient[..., :5, :, :] = moved.reshape(*moved.shape[:-2], 5, *sizes)
-    gradient[..., 5, :, :] = sigma3 * (row @ column_d1.mT + (row_d2 * flux) @ integral)
-    return coverage, gradient
+    centre, shape = np.asarray(centre_px, dtype=np.float64), np.asarray(shape_px, dtype=np.float64)
+    sigma = np.asarray(sigma_px, dtype=np.float64)[..., None]
+    theta = np.concatenate([centre, shape, sigma], -1)
+    batch, size = theta.shape[:-1], (v_px.shape[-1], u_px.shape[-1])
+    first = np.stack([u_px[..., 0], v_px[..., 0]], -1)
+    first = np.array(np.broadcast_to(first, (*batch, 2)), np.float64).reshape(-1, 2)
+    value, gradient = np.zeros((len(first), *size)), np.zeros((len(first), 6, *size))
+    coverages(first, np.ascontiguousarray(theta.reshape(-1, 6)), value, gradient)
+    return value.reshape(*batch, *size), gradient.reshape(*batch, 6, *size)
 
 
 def semi_axes(shape_px: Array) -> tuple[Array, Array]:

@@ -14,8 +14,11 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freedom
-from telerig.estimator.calibration.start.mirror_ambiguity import ENTOCENTRIC
+from telerig.estimator.calibration.solver.problem import (
+    STRONG_PERSPECTIVE,
+    prior_sigma,
+    wall_freedom,
+)
 from telerig.io.results.findings import Code, Finding
 from telerig.io.rig_file.description import RigDescription
 from telerig.rig.camera import Camera
@@ -166,7 +169,7 @@ def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[Findi
     Only the tilt's square shows.
     """
     free, wall = wall_freedom(camera), camera.wall
-    weak = abs(camera["kappa_per_mm"]) * camera.rho_mm < ENTOCENTRIC
+    weak = abs(camera["kappa_per_mm"]) * camera.rho_mm < STRONG_PERSPECTIVE
     if calibration.medium == "air" or not free or wall is None or not weak:
         return []
     normal = turned_wall(camera.intrinsics, wall).normal

@@ -33,6 +33,7 @@ from telerig.estimator.calibration.result_from_fit import (
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import (
     OUTLIER_SD,
+    STRONG_PERSPECTIVE,
     Problem,
     checked_outlier_sd,
     eccentricity_px,
@@ -388,7 +389,7 @@ def _strong(fit: RobustFit) -> NDArray[np.bool_]:
     """Return (C,) whether a camera's perspective is too strong for a telecentric lens."""
     problem, kappa = fit.problem, INDEX["kappa_per_mm"]
     strength = np.abs(fit.solution.state.intrinsics[:, kappa]) * np.array(problem.rho_mm)
-    out = np.asarray(strength > mirror_ambiguity.ENTOCENTRIC)
+    out = np.asarray(strength > STRONG_PERSPECTIVE)
     if not out.any():
         return out
     variance = iter(np.diag(fit.solution.equations.posterior(whole=False).common))

@@ -17,7 +17,12 @@ from scipy.special import gammaincinv
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, TelerigError
 from telerig.estimator.calibration.solver.covariance import JointCovariance
-from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
+from telerig.estimator.calibration.solver.problem import (
+    LEAST_DOTS,
+    STRONG_PERSPECTIVE,
+    Problem,
+    prior_sigma,
+)
 from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start.known_target import (
     ImageMap,
@@ -34,11 +39,7 @@ from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
 
 RECOMMENDED_VIEWS = int(Code.FEW_VIEWS.limit)
-MINIMUM_DOTS = int(Code.UNUSED_VIEWS.limit)
 PARALLEL_DEG = 3.0
-PERSPECTIVE = 0.01
-"""If kappa * rho (no unit) exceeds this, the image shows the depth of a view. Rho is half
-the diagonal of the field of view, in mm."""
 CLEAR_MISFIT = 0.1
 """Largest accepted distance of an image's dots from the map of the target's plane, as a share of
 the dots' spread."""
@@ -112,11 +113,11 @@ def _refuse_too_few(
         (problem.views[v], problem.cameras[c].name): int(np.sum(rows))
         for v in range(len(problem.views))
         for c in range(len(problem.cameras))
-        if (rows := (problem.view == v) & (problem.camera == c)).sum() < MINIMUM_DOTS
+        if (rows := (problem.view == v) & (problem.camera == c)).sum() < LEAST_DOTS
     }
     poor = "; ".join(f"view {v}, camera {c}: {n} dots" for (v, c), n in list(counts.items())[:6])
     raise CalibrationError(
-        f"{len(usable)} view(s) with {MINIMUM_DOTS} or more dots{both}; a target of {kind} dots "
+        f"{len(usable)} view(s) with {LEAST_DOTS} or more dots{both}; a target of {kind} dots "
         f"needs at least {needed}. Undetermined with fewer: {undetermined}."
         + (f" Too few dots in: {poor}." if poor else ""),
         todo=f"take at least {RECOMMENDED_VIEWS} views at different tilts, seen by "
@@ -154,14 +155,14 @@ def loose_offsets(problem: Problem, state: State) -> list[Finding]:
     """
     count = len(problem.cameras)
     kappa_rho = state.intrinsics[:, INDEX["kappa_per_mm"]] * np.array(problem.rho_mm)
-    if count < 3 or np.all(np.abs(kappa_rho) > PERSPECTIVE):
+    if count < 3 or np.all(np.abs(kappa_rho) > STRONG_PERSPECTIVE):
         return []
     turns = np.swapaxes(state.rig_from_camera[:, :3, :3], -1, -2)
     free = offset_freedom(turns)
     normal = np.zeros((free.shape[-1],) * 2)
     for v in range(len(problem.views)):
         mine = (problem.view == v) & problem.kept
-        seen = np.flatnonzero(np.bincount(problem.camera[mine], minlength=count) >= MINIMUM_DOTS)
+        seen = np.flatnonzero(np.bincount(problem.camera[mine], minlength=count) >= LEAST_DOTS)
         if len(seen) > 1:
             place, rows = np.concatenate(turns[seen, :2]), np.concatenate(free[seen])
             left = rows - place @ np.linalg.lstsq(place, rows, rcond=1e-9)[0]
@@ -323,7 +324,7 @@ def refuse_copies(problem: Problem) -> None:
         squares = ((uv[i + 1 :] - uv[i]) ** 2).sum(-1) / (variance[i + 1 :] + variance[i])
         common = np.isfinite(squares).sum(-1)
         total = np.nansum(squares, axis=-1)
-        copies = (common >= MINIMUM_DOTS) & (total < 2 * gammaincinv(common, COPY_CHANCE))
+        copies = (common >= LEAST_DOTS) & (total < 2 * gammaincinv(common, COPY_CHANCE))
         if copies.any():
             (a, v), (b, w) = images[i], images[i + 1 + int(np.argmax(copies))]
             names = [

@@ -20,8 +20,12 @@ from telerig.estimator.calibration.quality.comparison import (
     field_difference,
 )
 from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
-from telerig.estimator.calibration.solver.robust_least_squares import LEAST_DOTS, one_step
+from telerig.estimator.calibration.solver.problem import (
+    LEAST_DOTS,
+    Problem,
+    cameras_from_state,
+)
+from telerig.estimator.calibration.solver.robust_least_squares import one_step
 from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding

@@ -30,6 +30,7 @@ from telerig.factors.calibration import (
     place_residual,
 )
 from telerig.io.machine.parallel import keep_freed_memory
+from telerig.io.results.findings import Code
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX, LENS_PARAMETERS, parameters_of
 from telerig.rig.pose import Pose, rotation_from_rotvec
@@ -579,6 +580,12 @@ def slots(problem: Problem) -> dict[str, list[slice]]:
     return out
 
 
+LEAST_DOTS = int(Code.UNUSED_VIEWS.limit)
+"""Number of different dots that a view or an image needs: fewer do not determine the pose of the
+target."""
+STRONG_PERSPECTIVE = 0.01
+"""A lens with a larger kappa * rho counts as a perspective lens, whose images show the depth of a
+view: the rays of a telecentric lens do not deviate from its axis by 0.6 degrees."""
 LINE_SHARE = 0.01
 """Dots whose width across is less than this share of their length count as one row; two rows of 40
 dots have 0.09."""

@@ -21,7 +21,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.elimination import GraphEquations, GraphLayout
-from telerig.estimator.calibration.solver.problem import Problem, System, on_a_line
+from telerig.estimator.calibration.solver.problem import LEAST_DOTS, Problem, System, on_a_line
 from telerig.estimator.calibration.solver.schur import NormalEquations
 from telerig.factors.calibration import State, pixels
 from telerig.factors.robust_loss import calibration_weights, next_limit
@@ -149,9 +149,6 @@ def _at(linearised: Callable[[State], Equations], state: State) -> Equations | N
     return equations if np.isfinite(equations.cost) else None
 
 
-LEAST_DOTS = 4
-"""A view in which fewer different dots than this are kept is left out, because so few do not
-determine the pose of the target."""
 _MEDIAN = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 

@@ -15,16 +15,21 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.problem import Problem, nominal_state, on_a_line
+from telerig.estimator.calibration.solver.problem import (
+    LEAST_DOTS,
+    STRONG_PERSPECTIVE,
+    Problem,
+    nominal_state,
+    on_a_line,
+)
 from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
 from telerig.factors.calibration import State
+from telerig.io.results.findings import Code
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import nearest_rotation
 
-NEAR_PARALLEL = 0.17
+NEAR_PARALLEL = float(np.sin(np.radians(Code.NEAR_PARALLEL.limit)))
 """Sine of the angle between two optical axes below which they are nearly parallel."""
-STRONG_PERSPECTIVE = 0.01
-"""If kappa * rho exceeds this, the start uses the perspective that the views show."""
 _FLIP = np.array([1.0, 1.0, -1.0])
 _MIRROR = np.outer(_FLIP, _FLIP)
 
@@ -55,7 +60,7 @@ def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageM
         for c, camera in enumerate(problem.cameras):
             rows = (problem.view == v) & (problem.camera == c) & problem.kept
             seen = dots_mm[problem.dot[rows], :2]
-            if len(seen) >= 4 and not on_a_line(seen):
+            if len(seen) >= LEAST_DOTS and not on_a_line(seen):
                 centre = (np.array(camera.image_size_px) - 1) / 2
                 out[v, c] = _image_map(seen, problem.uv_px[rows] - centre)
     return out

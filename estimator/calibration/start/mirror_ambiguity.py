@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import (
+    STRONG_PERSPECTIVE,
     Problem,
     System,
     images_of,
@@ -43,9 +44,6 @@ ALIKE_FACTOR, ALIKE_COST = 1.5, 20.0
 """A start fits as well as the best one if its cost is below this factor times the cost of the best
 one plus this constant."""
 
-ENTOCENTRIC = 0.01
-"""A lens with a larger kappa * rho counts as a perspective lens: the rays of a telecentric lens do
-not deviate from its axis by 0.6 degrees."""
 TIE_DEG = 10.0
 BY_PLATE = "refraction in the plate"
 """``decided_by`` for a two-sided target when no nominal rotation is given."""
@@ -169,9 +167,9 @@ def perspective_sign(state: State, problem: Problem) -> int:
     A true kappa is positive, so a strong negative one shows that the state is the mirror image.
     """
     strength = state.intrinsics[:, _KAPPA] * np.array(problem.rho_mm)
-    if np.all(strength > ENTOCENTRIC):
+    if np.all(strength > STRONG_PERSPECTIVE):
         return 1
-    if np.all(strength < -ENTOCENTRIC):
+    if np.all(strength < -STRONG_PERSPECTIVE):
         return -1
     return 0
 

@@ -158,7 +158,7 @@ def _head(*cells: str) -> list[str]:
 
 
 def found_by_telerig(image: NDArray[np.generic]) -> pd.DataFrame:
-    table = find_bubbles(image, everywhere=True).accepted
+    table = find_bubbles(image).accepted
     return table[~table["flags"].str.contains("defocus")]
 
 
@@ -237,7 +237,7 @@ def render_rows(pictures: int) -> list[str]:
         scenes = [swarm(covered, hearts, np.random.default_rng(seed)) for seed in seeds]
         counts, errors, z, clusters = [], [], [], 0
         for image, truth in scenes:
-            bubbles = find_bubbles(image, everywhere=True)
+            bubbles = find_bubbles(image)
             table = bubbles.accepted[~bubbles.accepted["flags"].str.contains("defocus")]
             found = table[ELLIPSE].to_numpy(float)
             counts.append(scored(found, truth))

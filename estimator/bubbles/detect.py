@@ -117,7 +117,6 @@ def detect_bubbles(
     background: NDArray[Any] | None = None,
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
-    everywhere: bool = False,
 ) -> pd.DataFrame:
     """Find all bubbles in a backlit grey image.
 
@@ -127,7 +126,6 @@ def detect_bubbles(
         surround of the screen is then left out.
     min_diameter_px : least equivalent diameter of a bubble, in px; at least 4.
     min_contrast : least depth of a bubble's shadow, as a share of the background.
-    everywhere : for crowds of bubbles, see :func:`find_bubbles`.
 
     Returns a table with a row for each bubble, in no particular order, and the columns
     DETECTION_COLUMNS. If there is no bubble, the table is empty and its ``attrs["reason"]`` says
@@ -140,7 +138,6 @@ def detect_bubbles(
         background=background,
         min_diameter_px=min_diameter_px,
         min_contrast=min_contrast,
-        everywhere=everywhere,
     ).accepted
 
 
@@ -151,20 +148,20 @@ def find_bubbles(
     field: Bools | None = None,
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
-    everywhere: bool = False,
 ) -> Bubbles:
     """Find all bubbles like :func:`detect_bubbles`, and return the rejected shadows as well.
 
     field : (rows, columns) where bubbles are looked for. Without it and without a background, a
         dark surround of the lit screen is found and left out.
-    everywhere : look for the rims of bubbles in the whole image, besides dark regions. This takes
-        some 2 s for a megapixel, and finds bubbles that are faint or in front of others. Without
-        it that is done if bubbles cover more than 15 % of the image, and around dark regions that
-        are no single bubble and could not be divided.
+    Dark regions that are single bubbles, or that could be divided into bubbles, need no more. The
+    rims of bubbles are looked for around the others, among them those within a bright heart, and in
+    the whole image if bubbles cover more than 15 % of it; this takes some 2 s for a megapixel.
+    Without a background the covariances allow for light that shadows of other bubbles make uneven.
 
     The other arguments and the errors are those of :func:`detect_bubbles`.
     """
     image = checked_image(image, min_diameter_px, min_contrast)
+    shadows = background is None
     reason = nothing_to_see(image)
     if reason:
         return _bubbles({}, [], np.nan, reason)
@@ -180,7 +177,7 @@ def find_bubbles(
         background = screen_level(image, field) if background is None else background
         outside = np.minimum(background, image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
-    found = _found(image, background, field, min_diameter_px, min_contrast, everywhere)
+    found = _found(image, background, field, min_diameter_px, min_contrast, shadows)
     area = float(found.accepted["area_px2"].sum())
     area += sum(cv2.contourArea(line.astype(np.float32)) for line in found.clusters)
     looked_at = max(image.size if field is None else np.count_nonzero(field), 1)
@@ -193,26 +190,28 @@ def _found(
     field: Bools | None,
     min_diameter_px: float,
     min_contrast: float,
-    everywhere: bool,
+    shadows: bool,
 ) -> Bubbles:
     ratio, clipped = normalised(image, background)
     sigma = max(noise_share(ratio, field), 1e-4)
     blobs, rejected = find_blobs(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
+    hearts = [blob for blob in blobs if blob.within]
+    blobs = [blob for blob in blobs if not blob.within]
     parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
     parts, slender = _without_slender(parts)
     rejected += slender
     clusters: list[Array] = []
     noise = np.array([sigma, max(dark_noise_share(ratio, blobs, sigma), 1e-4)])
     start = _start(parts, blobs)
-    outlines = fit_outlines(ratio, start, noise, shadows=everywhere)
+    outlines = fit_outlines(ratio, start, noise, shadows=shadows)
     merged = _merged(outlines, parts)
     known = ~merged & np.isfinite(outlines.ellipse).all(axis=1)
     known &= outlines.coverage > _KNOWN_COVERAGE
     seen = ratio.size if field is None else np.count_nonzero(field)
     covered = np.pi * float(np.nansum(radius_px(outlines) ** 2)) / max(seen, 1)
-    whole = everywhere or is_crowded(covered, len(blobs), _RIMS_PAY)
+    whole = is_crowded(covered, len(blobs), _RIMS_PAY)
     sure, crowds, kept = outlines.ellipse[known], [], known
     look = partial(
         resolved_crowd, ratio, sigma, min_diameter_px=min_diameter_px, min_contrast=min_contrast
@@ -226,10 +225,14 @@ def _found(
         for k in np.unique(own[merged]).tolist():
             crowd = look([blobs[k]], [], sure, around(blobs[k], ratio.shape))
             crowds.append(crowd)
+            clusters += crowd.clusters
             sure = np.concatenate([sure, crowd.rims.ellipse])
             left = sum(cv2.contourArea(line.astype(np.float32)) for line in crowd.clusters)
             if len(crowd.rims) and left < _LEFT_SHARE * np.prod(blobs[k].box[2:]):
                 kept &= known | (own != k)
+        for blob in hearts:
+            crowds.append(look([], [], sure, around(blob, ratio.shape)))
+            sure = np.concatenate([sure, crowds[-1].rims.ellipse])
     found = [crowd.rims for crowd in crowds if len(crowd.rims)]
     if found:
         every = Rims.concat(found)

@@ -75,7 +75,7 @@ def write_bubbles(
         image = read_image(file)
         shape = (image.shape[0], image.shape[1])
         field = described_field(shape, region_px, mask, f"--region, {file.name}")
-        bubbles = find_bubbles(image, field=field, min_diameter_px=min_diameter_px, everywhere=True)
+        bubbles = find_bubbles(image, field=field, min_diameter_px=min_diameter_px)
         _draw(image, bubbles, folder / "overlays" / f"{file.stem}.jpg")
         found.append(_found(file.stem, bubbles))
         words.append(found[-1].words)
@@ -94,7 +94,7 @@ def _found(name: str, bubbles: Bubbles) -> Found:
         for number, line in enumerate(_closed(outline) for outline in clusters)
     ]
     table = pd.concat(corners) if corners else pd.DataFrame(columns=list(CLUSTER_COLUMNS))
-    words = f"{name}: {_count(len(single), 'bubble')}, {_count(len(clusters), 'cluster')}"
+    words = f"{name}: {_counted(bubbles)}"
     if bubbles.reason and not len(single):
         words += f" ({bubbles.reason})"
     found = len(single) + len(clusters)
@@ -114,6 +114,13 @@ def _closed(outline: Array) -> Array:
     length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(known, axis=0), axis=1))]
     first = np.unique(np.floor(length / 2.0), return_index=True)[1]
     return np.round(known[first], 2)
+
+
+def _counted(bubbles: Bubbles) -> str:
+    """Number of bubbles and of clusters; the ellipse of a region of several counts as none."""
+    single = ~bubbles.accepted["flags"].astype(str).str.contains("merged")
+    bubble = _count(int(single.sum()), "bubble")
+    return f"{bubble}, {_count(len(bubbles.clusters), 'cluster')}"
 
 
 def _count(number: int, what: str) -> str:
@@ -143,8 +150,7 @@ def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
         outlines += [np.asarray(edge[:, 0], float) for edge in edges]
         words += ["the field"] * len(edges)
         colours += [(90, 160, 250)] * len(edges)
-    single, clusters = len(bubbles.accepted), len(bubbles.clusters)
-    found = f"{_count(single, 'bubble')}, {_count(clusters, 'cluster')} not resolved"
+    found = f"{_counted(bubbles)} not resolved"
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks, found=found)
     path.parent.mkdir(parents=True, exist_ok=True)
     written, encoded = cv2.imencode(path.suffix, picture[..., ::-1])

@@ -50,6 +50,7 @@ class Blob:
     blur_px : standard deviation of the edge's blur.
     box : (u, v, width, height) of the region.
     touches_border : whether it touches the image's border.
+    within : whether another region surrounds it: it may be a bubble in front of a bright heart.
     """
 
     contour_px: Array
@@ -57,6 +58,7 @@ class Blob:
     blur_px: float
     box: tuple[int, int, int, int]
     touches_border: bool
+    within: bool = False
 
 
 class Rejected(NamedTuple):
@@ -130,12 +132,12 @@ def find_blobs(
     """
     low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
     mask = cv2.compare(ratio, low, cv2.CMP_LT)
-    regions, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    regions, tree = cv2.findContours(mask, cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
     traced: list[_Traced] = []
     rejected: list[Rejected] = []
     too_small = f"smaller than {min_diameter_px:g} px"
-    for region in regions:
-        if len(region) < _LEAST_OUTLINE:
+    for region, depth in zip(regions, _depths(tree), strict=True):
+        if len(region) < _LEAST_OUTLINE or depth % 2:
             continue
         x, y, width, height = cv2.boundingRect(region)
         found: list[_Traced] = []
@@ -143,19 +145,33 @@ def find_blobs(
         if max(width, height) >= min_diameter_px:
             box = (x, y, width, height)
             found, reason = _trace(ratio, region, box, low, min_contrast, min_diameter_px)
-        traced += found
+        traced += [one._replace(within=depth > 0) for one in found]
         if not found:
             radius = 0.5 * float(np.sqrt(width * height))
             rejected.append(Rejected(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
     return _refined(ratio, traced), rejected
 
 
+def _depths(tree: NDArray[np.int32] | None) -> list[int]:
+    """Return how many outlines are around each one: 0 for regions, odd for their bright holes."""
+    parents = [] if tree is None else tree[0, :, 3].tolist()
+    depths = []
+    for parent in parents:
+        depth = 0
+        while parent >= 0:
+            depth, parent = depth + 1, parents[parent]
+        depths.append(depth)
+    return depths
+
+
 class _Traced(NamedTuple):
-    """An outline of pixels (n, 2), the level inside, and the box of the region it came from."""
+    """An outline of pixels (n, 2), the level inside, the box of the region it came from, and
+    whether another region surrounds it."""
 
     pixels: NDArray[np.int_]
     inner: float
     box: tuple[int, int, int, int]
+    within: bool = False
 
 
 def _trace(
@@ -239,7 +255,8 @@ def _refined(ratio: Float32, traced: list[_Traced]) -> list[Blob]:
         steepest = float(np.sqrt(np.partition(square[part], place)[place]))
         blur = (1.0 - one.inner) / (np.sqrt(2.0 * np.pi) * max(steepest, 1e-6))
         blur = float(np.sqrt(max(blur**2 - 0.6, 0.15)))
-        blobs.append(Blob(moved[part], one.inner, blur, one.box, bool(edge[part].any())))
+        at_border = bool(edge[part].any())
+        blobs.append(Blob(moved[part], one.inner, blur, one.box, at_border, one.within))
         first += size
     return blobs
 

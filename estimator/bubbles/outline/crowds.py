@@ -34,7 +34,7 @@ from telerig.estimator.bubbles.outline.rims import (
 
 _LARGEST_SHARE = 6.0
 """The image is so many times as wide as the largest radius of a bubble in a crowd."""
-_AROUND_PX = 10
+_AROUND_PX, _GRID_PX = 10, 16
 _OPENED, _LEFT_AREA = 0.75, 0.5
 _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
@@ -141,12 +141,14 @@ def _drawn(contour: Array) -> NDArray[np.float32]:
 
 
 def around(blob: Blob, shape: tuple[int, ...]) -> Window:
-    """Return the window of an image in which a blob and the surroundings of its rim are."""
+    """Return the window of an image in which a blob and the surroundings of its rim are.
+
+    It begins at multiples of 16 px, so that its halved images are parts of those of the whole.
+    """
     x, y, width, height = blob.box
-    return (
-        slice(max(y - _AROUND_PX, 0), min(y + height + _AROUND_PX, shape[0])),
-        slice(max(x - _AROUND_PX, 0), min(x + width + _AROUND_PX, shape[1])),
-    )
+    left, top = (max(low - _AROUND_PX, 0) // _GRID_PX * _GRID_PX for low in (x, y))
+    bottom, right = min(y + height + _AROUND_PX, shape[0]), min(x + width + _AROUND_PX, shape[1])
+    return slice(top, bottom), slice(left, right)
 
 
 def _explained(shape: tuple[int, ...], ellipses: Array) -> NDArray[np.uint8]:

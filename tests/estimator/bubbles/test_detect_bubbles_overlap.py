@@ -74,23 +74,6 @@ def test_touching_bubbles_stay_exact() -> None:
     assert np.max(misses(table, bubbles)) < 0.05
 
 
-def test_blob_that_cannot_be_split_is_called_merged() -> None:
-    """At most in one of eight heaps is an ellipse over several discs taken for a bubble."""
-    large = 0
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        middle = np.array([60.0, 60.0])
-        heap = [
-            Drawn((*(middle + rng.uniform(-22, 22, 2)), *(2 * (rng.uniform(4.0, 6.0),)), 0.0))
-            for _ in range(40)
-        ]
-        table = seen(heap, (120, 120))
-        merged = table["flags"].str.contains("merged")
-        assert merged.any()
-        large += int((table["a_px"][~merged] > 13.0).sum())
-    assert large <= 1
-
-
 def test_close_pair_that_shows_no_notch_is_no_clean_single() -> None:
     bubbles = [
         Drawn((48.0, 50.0, 12.0, 12.0, 0.0)),

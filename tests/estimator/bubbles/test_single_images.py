@@ -11,7 +11,7 @@ import pytest
 from places import REAL
 
 from telerig.errors import InputError
-from telerig.estimator.bubbles.detect import find_bubbles
+from telerig.estimator.bubbles.detect import detect_bubbles, find_bubbles
 from telerig.estimator.bubbles.field import lit_field, mask_field, region_field
 from telerig.estimator.bubbles.single_images import CLUSTER_COLUMNS, write_bubbles
 
@@ -98,7 +98,11 @@ def test_tables_clusters_and_overlays_are_written(tmp_path: Path) -> None:
     words = write_bubbles(files, tmp_path)
     assert words[0] == "plain: 4 bubbles, 0 clusters"
     found = pd.read_csv(tmp_path / "detections.csv")
-    assert found.groupby("image").size().to_dict() == {"clustered": 4, "plain": 4}
+    assert found.groupby("image").size().to_dict() == {"clustered": 5, "plain": 4}
+    assert (found["flags"] == "merged").sum() == 1 and "4 bubbles, 1 cluster" in words[1]
+    alone = detect_bubbles(image)[["u_px", "v_px", "suu_px2", "flags"]]
+    own = found[found["image"] == "clustered"].fillna({"flags": ""})[[*alone]]
+    pd.testing.assert_frame_equal(own.reset_index(drop=True), alone, check_dtype=False, rtol=1e-4)
     clusters = pd.read_csv(tmp_path / "clusters.csv")
     assert tuple(clusters.columns) == CLUSTER_COLUMNS
     assert set(clusters["image"]) == {"clustered"} and clusters["u_px"].between(55, 185).all()
@@ -128,7 +132,7 @@ def test_real_bubbles_behind_a_window() -> None:
     assert field is not None and 0.6 < field.mean() < 0.75
     labels = pd.read_csv(REAL / "bubbles_microgravity" / "labels" / "objects.csv")
     mine = labels[labels["image"].str.endswith("img006001") & (labels["d_px"] > 12)]
-    found = find_bubbles(image, everywhere=True)
+    found = find_bubbles(image)
     sharp = found.accepted[~found.accepted["flags"].str.contains("defocus")]
     away = mine[["u_px", "v_px"]].to_numpy()[:, None] - sharp[["u_px", "v_px"]].to_numpy()
     assert np.mean(np.linalg.norm(away, axis=2).min(axis=1) < 3.0) > 0.6

@@ -22,7 +22,13 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.estimator.bubbles.pairing.evidence import Evidence, Prediction, evidence, gate2
+from telerig.estimator.bubbles.pairing.evidence import (
+    DETECTION_PROBABILITY,
+    Evidence,
+    Prediction,
+    evidence,
+    gate2,
+)
 from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
     POSITION,
@@ -35,6 +41,8 @@ from telerig.estimator.tracking.filter import (
 from telerig.estimator.tracking.ranked_ways import alternatives
 
 _SHIFT_ROUNDS = 5
+"""Largest number of assignments and common shifts in turn."""
+
 _JOINTLY_SCORED = 10
 """For each hypothesis that is kept, so many ways to continue are scored with the common shift."""
 
@@ -69,7 +77,7 @@ def gated_pairs(
         predicted, measured.points_mm, measured.covariance_mm2, measured.d_eq_mm, allowed=allowed,
         certain=given, shift_mm=common.shift_mm, unsure_mm2=common.covariance_mm2,
     )  # fmt: skip
-    seen = settings.detection_probability
+    seen = DETECTION_PROBABILITY
     prior = np.log(np.clip(measured.confidence[pairs.column], 1e-3, 1.0))
     prior += np.log(seen / (1 - seen) / settings.new_per_mm3)
     if misses is not None:
@@ -80,7 +88,7 @@ def gated_pairs(
 
 def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
     """Return the log probability (K,) that a track unseen for so many frames is not gone."""
-    missed = (1 - settings.detection_probability) * settings.missed_again_probability ** (
+    missed = (1 - DETECTION_PROBABILITY) * settings.missed_again_probability ** (
         np.maximum(misses, 1) - 1.0
     )
     return -np.log1p(misses * settings.end_probability / missed)
@@ -161,6 +169,7 @@ def joint_scores(pairs: Evidence, ways: Sequence[Sequence[int]], common: Common)
 
 
 _MERGE_FRAMES = 2
+"""Hypotheses that agree on so many last frames are one."""
 
 Entry = tuple[int, int]
 """A frame, and the column of a track's measurement in it, -1 for none."""
@@ -370,6 +379,7 @@ def _agreed_links_from(paths: list[list[list[Entry]]]) -> int:
 
 
 _SLACK_LOG_RATIO = 6.0
+"""What the common shift of a frame may change of the order of hypotheses."""
 
 
 @dataclass(frozen=True)

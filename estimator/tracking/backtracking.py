@@ -229,6 +229,8 @@ _LEAST_POINTS = 4
 """Points in space that a track needs to be followed."""
 
 _PASSES = 12
+"""Largest number of times that tracks are smoothed and get detections."""
+
 _REACH_FRAMES = 4
 """Frames beyond a track's ends that one pass looks at."""
 

@@ -52,7 +52,6 @@ class TrackerSettings:
     shake_sd_mm, shake_time_s : sd and correlation time of the offset that all bubbles of a frame
         share.
     stage_acceleration_mm_s2 : RMS acceleration of the stage in frames without an encoder position.
-    detection_probability : probability that a bubble is detected in a frame.
     missed_again_probability : probability that a bubble which was missed in the frame before is
         missed again.
     end_probability : probability that a bubble leaves for good in a frame. Because of it, a track
@@ -86,7 +85,6 @@ class TrackerSettings:
     shake_sd_mm: float = 0.3
     shake_time_s: float = 0.01
     stage_acceleration_mm_s2: float = 3000.0
-    detection_probability: float = 0.95
     missed_again_probability: float = 0.5
     end_probability: float = 0.002
     new_per_mm3: float = 1e-5

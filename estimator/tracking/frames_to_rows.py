@@ -49,7 +49,10 @@ from telerig.rig.camera import Camera
 from telerig.rig.triangulation import on_rays, stacked_jacobian
 
 _BUBBLES_AT_ONCE = 512
+"""Bubbles whose bodies are fitted and whose rows are written together."""
+
 _LEAST_FOR_OFFSET = 3
+"""Bubbles that tell the shift of all pixels of a frame by a median."""
 
 WANDER = (21 / 8) ** 0.5
 """Shift of an outline's centre, as a share of the radius, by a body's third harmonics of unit

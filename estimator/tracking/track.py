@@ -68,7 +68,10 @@ LARGEST_ID = 10**15
 """Tracks are numbered below it; a larger number is the name of a bubble."""
 
 _RELIABLE = 0.99
+"""Probability of a group from which shapes are learned."""
+
 _FRAMES_AT_ONCE = 64
+"""Frames whose tables are turned into arrays together."""
 
 
 @dataclass(frozen=True)

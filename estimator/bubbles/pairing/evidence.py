@@ -17,6 +17,9 @@ from telerig.arrays import Array, Bools, Ints, Rows
 GATE_PROBABILITY = 0.9999
 """Probability that the measurement of a predicted bubble lies inside the gate."""
 
+DETECTION_PROBABILITY = 0.95
+"""Probability that a bubble that is there is detected."""
+
 SIZE_SD = 0.05
 """Relative standard deviation of the diameter of one body from frame to frame."""
 
@@ -26,7 +29,7 @@ _SIZE_CAP = 4.5
 _SIZE_SPAN_MM = 5.0
 """Range of diameters of bubbles that nothing predicts."""
 
-LOG_2PI = float(np.log(2 * np.pi))
+_LOG_2PI = float(np.log(2 * np.pi))
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ def evidence(
     near = (distance2 <= _GATE2) | np.broadcast_to(certain, least.shape)[row, column]
     row, column, innovation = row[near], column[near], innovation[near]
     covariance = predicted.covariance_mm2[row] + covariance_mm2[column]
-    constant = -1.5 * LOG_2PI - np.log(np.linalg.det(covariance)) / 2
+    constant = -1.5 * _LOG_2PI - np.log(np.linalg.det(covariance)) / 2
     constant += _size_ratio(predicted.d_eq_mm[row], d_eq_mm[column], size_sd)
     information = np.linalg.inv(covariance)
     return Evidence(row, column, innovation, covariance, information, constant)
@@ -124,5 +127,5 @@ def _size_ratio(expected_mm: Array, measured_mm: Array, relative_sd: float) -> A
     """Return the log-likelihood ratio of sizes against a uniform density; 0 if unknown."""
     sd = relative_sd * expected_mm
     off = np.minimum(((measured_mm - expected_mm) / sd) ** 2 / 2, _SIZE_CAP)
-    score = np.log(_SIZE_SPAN_MM / sd) - LOG_2PI / 2 - off
+    score = np.log(_SIZE_SPAN_MM / sd) - _LOG_2PI / 2 - off
     return np.where(np.isfinite(score), score, 0.0)

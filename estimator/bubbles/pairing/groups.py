@@ -25,7 +25,11 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     centre_covariances,
     columns,
 )
-from telerig.estimator.bubbles.pairing.evidence import Prediction, evidence
+from telerig.estimator.bubbles.pairing.evidence import (
+    DETECTION_PROBABILITY,
+    Prediction,
+    evidence,
+)
 from telerig.estimator.bubbles.pairing.matching import (
     NEGLIGIBLE,
     Cameras,
@@ -45,9 +49,6 @@ from telerig.rig.triangulation import UNKNOWN_MM, on_rays, stacked_jacobian, tri
 
 SAFE_LOG_ODDS = 3.0
 """Posterior log odds (20 to 1) below which a group is ambiguous."""
-
-_SEEN = 0.95
-"""Probability that a camera that shows the place of a bubble detects it."""
 
 _NEW_SHARE = 0.1
 """Share of the bubbles of a frame that no track expects."""
@@ -318,7 +319,7 @@ def _edges(
     def near(every: PairGeometry) -> Bools:
         gap, variance = unbiased(every, own)
         wide = variance + own.frame_px**2 + kernels.MOST_TAIL_PX2
-        return np.asarray(gap**2 < (2 * kernels.GATE_SIGMA) ** 2 * wide)
+        return np.asarray(gap**2 < 4 * kernels.GAP_GATE2 * wide)
 
     pairs, rows, frame = near_pairs(cameras, views, counts, near)
     return _Edges(
@@ -471,7 +472,9 @@ def _prior(rows: Ints, of_pairs: Array, at: Places, counts: Ints, model: RigMode
     limit = np.array([c.image_size_px for c in model.cameras]) - 1.0
     inside = ((at.expected_px >= 0) & (at.expected_px <= limit)).all(-1)
     missed = (inside & ~seen).sum(1)
-    found = np.where(seen.sum(1) > 2, larger, of_pairs) + missed * np.log(1 / _SEEN - 1)
+    found = np.where(seen.sum(1) > 2, larger, of_pairs) + missed * np.log(
+        1 / DETECTION_PROBABILITY - 1
+    )
     return np.asarray(found)
 
 
@@ -505,8 +508,8 @@ def deviation(
     chi2 = (pull * pixels).sum(1)
     free = 2 * count - 3
     typical = (np.trace(noise, axis1=-2, axis2=-1) * seen).sum(1) / (2 * count)
-    wide = 1 + np.clip(3 * typical, 0.25, kernels.MOST_TAIL_PX2) / typical
-    possible = chi2 < wide * chdtri(free, chdtrc(1, kernels.GATE_SIGMA**2))
+    wide = 1 + np.clip(3 * typical, kernels.LEAST_TAIL_PX2, kernels.MOST_TAIL_PX2) / typical
+    possible = chi2 < wide * chdtri(free, chdtrc(1, kernels.GAP_GATE2))
     core = (1 - kernels.TAIL) * np.exp(-chi2 / 2)
     tail = kernels.TAIL * wide ** (-free / 2) * np.exp(-chi2 / wide / 2)
     determinants = np.where(seen, np.log(np.linalg.det(noise)), 0.0).sum(1)
@@ -636,14 +639,14 @@ def track_log_odds(found: Candidates, model: RigModel, predicted: Prediction) ->
     density = _densities(predicted, at.points_mm, blurred, 2 * np.exp(groups.log_radius))
     volumes = np.array([model.volume_mm3(*pair) for pair in model.pairs])
     volume = np.where(groups.pair >= 0, volumes[groups.pair], volumes.mean())
-    expected = (1 - _NEW_SHARE) * _SEEN**2 * volume * density.mean(1)
+    expected = (1 - _NEW_SHARE) * DETECTION_PROBABILITY**2 * volume * density.mean(1)
     total = np.log(expected + _NEW_SHARE)
     depths = model.areas_px2 / scales**2 * np.sqrt(2 * np.pi) * UNKNOWN_MM
     alone = []
     for c, (points, covariances) in enumerate(found.rays):
         usual = max(len(points) * model.unmatched_share(c), 1e-3)
         density = _densities(predicted, points, covariances, np.full(len(points), np.nan))
-        density *= _SEEN * (1 - _SEEN) * depths[c] / usual
+        density *= DETECTION_PROBABILITY * (1 - DETECTION_PROBABILITY) * depths[c] / usual
         none = np.zeros((1, density.shape[1]))
         alone.append(np.concatenate([density, none])[groups.rows[:, c]])
     every = [1 + one.sum(1) for one in alone]

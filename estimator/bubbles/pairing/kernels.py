@@ -8,14 +8,24 @@ import numpy as np
 from telerig.arrays import Array, Bools, Ints
 from telerig.compiled import compiled
 
-GATE_SIGMA, NEVER = 5.0, -1e6
-"""Limit of a true pair's gap in standard deviations of its wide part, and the log odds beyond."""
+GAP_GATE2 = 25.0
+"""Largest square of a true pair's gap, in variances of its wide part: wider than the gate of
+predictions, because what disturbs an outline is no Gaussian noise."""
 
-TAIL, _LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
+NEVER = -1e6
+"""Log odds of what is impossible."""
+
+TAIL, LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
+"""Share of outlines that are disturbed, and limits of the variance that this adds to a gap."""
+
 _EXACT_SIDE = 11
+"""Columns of a component with exact probabilities: 2**11 subsets."""
+
 _LARGEST_EXPONENT = 600.0
 """Of the product of all rows' odds to have no partner: exp(-745) is 0."""
+
 SHIFT_PASSES = 4
+"""Turns of probabilities and the shift that all gaps of a frame share."""
 
 
 def gap_log_odds(
@@ -29,12 +39,12 @@ def gap_log_odds(
     """
     own = variance + uncertainty
     square = (gap - shift) ** 2
-    wide = own + np.clip(3.0 * own, _LEAST_TAIL_PX2, MOST_TAIL_PX2)
+    wide = own + np.clip(3.0 * own, LEAST_TAIL_PX2, MOST_TAIL_PX2)
     core = np.exp(-0.5 * square / own)
     tail = np.exp(-0.5 * square / wide) * np.sqrt(own / wide)
     density = ((1.0 - TAIL) * core + TAIL * tail) / np.sqrt(2.0 * np.pi * own)
     odds = np.log(np.maximum(density * span_px, 1e-300))
-    out[:] = np.where(square < GATE_SIGMA**2 * wide, odds, NEVER)
+    out[:] = np.where(square < GAP_GATE2 * wide, odds, NEVER)
 
 
 @compiled

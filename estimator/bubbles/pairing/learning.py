@@ -46,7 +46,11 @@ from telerig.rig.triangulation import nearly_parallel, stacked_jacobian
 from telerig.statistics import robust_sd
 
 MOST_FRAMES = 60
+"""Frames that are learned from."""
+
 MOST_BIAS_PX = 20.0
+"""Largest offset of a calibration that is looked for."""
+
 _VOTE_REACH_PX = 5.0
 """Beyond the largest bias: what a vote spreads to, and what gaps scatter."""
 
@@ -54,23 +58,44 @@ _LIKELY = 0.01
 """Probability of a pair above which it takes part in the fits."""
 
 _START_SCATTER_PX = 1.5
+"""Scatter of gaps and of frames' shifts before anything is learned."""
+
 _PASSES = 6
+"""Passes of expectation-maximisation."""
+
 _LEAST_UNMATCHED, _MOST_UNMATCHED = 0.05, 0.9
+"""Limits of the share of detections without a partner."""
+
 _PRIOR_PAIRS = 3.0
-_PRIOR_SCATTER_PX = 0.3
+"""Weight of what is usual, in pairs."""
+
+_PRIOR_SCATTER_PX, _SMALLEST_SCATTER_PX = 0.3, 0.02
+"""Usual and smallest scatter of the gaps."""
+
 _SMALLEST = {"size": np.diag([0.005, 0.005]) ** 2, "contrast": np.diag([0.02]) ** 2}
 _PRIOR = {"size": np.diag([0.03, 0.06]) ** 2, "contrast": np.diag([0.2]) ** 2}
 _USUAL = {"size": np.array([[0.17, 0.15], [0.15, 0.17]]), "contrast": np.array([[0.1]])}
-_USUAL_WEIGHT = 4.0
+"""Covariances of logarithms: smallest and usual ones of a pair's differences, and those of all
+bubbles."""
 
 _BIAS_TERMS = (1, 4, 10)
+"""Numbers of terms of a bias: constant, linear, quadratic in space."""
+
 _PAIRS_PER_TERM = 3.0
-_BETTER, _AS_MANY = 0.95, 0.95
+"""Pairs that a bias needs for each term."""
+
+_BETTER = 0.95
+"""With more terms the RMS of pairs left out has to be below this share of that with fewer, and the
+number of pairs above."""
+
 _PRIOR_BIAS_SD_PX = np.array([10.0] + [2.0] * 3 + [1.0] * 6)
-_PRIOR_SCATTER_PAIRS, _SMALLEST_SCATTER_PX = 2.0, 0.02
+"""Of the coefficients of a bias."""
 
 _LEAST_PROBLEM_PX, _SIGNIFICANT = 0.5, 4.0
+"""Offset that is a problem of the calibration: its size, and over its standard error."""
+
 _FEW_PAIRS, _CLEAR_VOTE = 5.0, 3.0
+"""Pairs below which no calibration is accused, and height of the vote's peak over its median."""
 
 
 def default_model(cameras: Cameras) -> PairModel:
@@ -254,7 +279,7 @@ def estimate_pair_model(
             trial = model
             for _ in range(_PASSES):
                 trial = _improved(trial, sample, terms)
-            as_many = trial.pairs >= _AS_MANY * best.pairs
+            as_many = trial.pairs >= _BETTER * best.pairs
             best = trial if as_many and trial.rms_px[3] < _BETTER * best.rms_px[3] else best
     return replace(best, findings=_findings(best, votes))
 
@@ -385,8 +410,8 @@ def _bias_fit(
         residual = gap_px - basis @ bias
         lost = np.einsum("ni,ij,nj->n", basis, covariance, basis)
         excess = (tempered * (residual**2 + lost - variance_px2) / factor**2).sum()
-        prior_squares = _PRIOR_SCATTER_PAIRS * _PRIOR_SCATTER_PX**2
-        free = weight.sum() + _PRIOR_SCATTER_PAIRS
+        prior_squares = _PRIOR_PAIRS * _PRIOR_SCATTER_PX**2
+        free = weight.sum() + _PRIOR_PAIRS
         scatter = float(np.sqrt(max((excess + prior_squares) / free, _SMALLEST_SCATTER_PX**2)))
     left_out = residual / (1 - np.minimum(influence * lost, 0.95))
     raw, after, predicted = (
@@ -426,7 +451,7 @@ def _populations(model: PairModel, views: tuple[View, View]) -> PairModel:
     """Return means and spreads of all detections; outliers count as 3 sd."""
     learnt: dict[str, LogRatioModel] = {}
     for name, usual in _USUAL.items():
-        means, squares, count = [], _USUAL_WEIGHT * usual, _USUAL_WEIGHT
+        means, squares, count = [], _PRIOR_PAIRS * usual, _PRIOR_PAIRS
         for view in views:
             values: Array = getattr(view, f"log_{name}")
             values = values[np.isfinite(values).all(-1)]

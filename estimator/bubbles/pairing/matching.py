@@ -42,10 +42,13 @@ from telerig.rig.triangulation import cross, midpoint, nearly_parallel
 
 NO_SIZE_FLAGS = ("border", "merged")
 _SCATTER_FACTOR = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
+"""By flag, the factor on the scatter of a gap."""
+
 _UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
 """By flag, the standard deviation that a partly hidden outline adds to the centre, as a share of
 the major semi-axis."""
 _OUTLINE_SAMPLES = 96
+"""Points of an outline with harmonics, of which the highest is refined by a parabola."""
 
 Cameras = tuple[Camera, Camera]
 
@@ -193,6 +196,7 @@ def compared(cameras: Cameras, first: View, second: View) -> PairGeometry:
 
 
 _COMBINATIONS_AT_ONCE = 50_000
+"""Combinations of detections that are compared together; it limits the memory."""
 
 
 def near_pairs(
@@ -465,10 +469,16 @@ class PairModel:
 
 
 _WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-6, 0.02, 0.05
+"""Probabilities that a size or contrast is unrelated to the bubble."""
+
 _IMPOSSIBLE, _IMPOSSIBLE_SIGMA = 0.15, 10.0
+"""Difference of the logarithms of two heights that no outline shows, itself and in sd."""
+
 _UNKNOWN_SIZE = 2.0
 """Log odds against a pair with a bubble that is cut or merged: its partner is often unseen."""
+
 _RARE, _FREEDOM = 2.5, 6.0
+"""Limit of the rareness of a size (sd), and degrees of freedom of the differences' tails."""
 
 
 def unbiased(geometry: PairGeometry, model: PairModel) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints, Rows
 from telerig.estimator.bubbles.pairing.evidence import Prediction, gate2
-from telerig.estimator.bubbles.pairing.groups import Candidates, Pixels
+from telerig.estimator.bubbles.pairing.groups import Candidates
 from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.tracking.association import clear_assignment, gated_pairs
 from telerig.estimator.tracking.filter import (
@@ -104,8 +104,8 @@ class Bubbles(Rows):
 class Sight:
     """Hold the detections of one frame as arrays; tuples have an entry for each camera.
 
-    pixels : centres and covariances with the share of the unknown shape. rays : these in space, as
-        `triangulation.on_rays` returns them.
+    rays : the centres in space, as `triangulation.on_rays` returns them; the share of the unknown
+        shape is in their covariances.
     centre_px : (N, 5) the columns CENTRE_PX.
     a_px, d_eq_px : (N,) major semi-axes and equivalent diameters.
     given : (N,) ids given by the user, -1 for none.
@@ -114,7 +114,6 @@ class Sight:
     left_px : (E, C, 2) pixels less those of the points; NaN where a camera does not see it.
     """
 
-    pixels: tuple[Pixels, ...]
     rays: tuple[tuple[Array, Array, Array], ...]
     centre_px: tuple[Array, ...]
     a_px: tuple[Array, ...]
@@ -124,6 +123,12 @@ class Sight:
     candidates: Candidates
     possible: Bubbles
     left_px: Array
+
+    @property
+    def starts(self) -> Ints:
+        """Where the rays of each camera begin among those of all (C,)."""
+        many = [len(ids) for ids in self.given]
+        return np.asarray(np.cumsum(many) - many)
 
 
 @dataclass
@@ -155,15 +160,10 @@ class Frame:
     def owners(self) -> Ints:
         """Return the id (N,) of the track of each detection in ``rays``, -1 for none."""
         out = self.rays.given.copy()
-        rows = self.bubbles.rows + self._starts
+        rows = self.bubbles.rows + self.sight.starts
         taken = (self.bubbles.rows >= 0) & (self.particle != NO_PARTICLE)[:, None]
         out[rows[taken]] = np.repeat(self.particle, taken.sum(1))
         return out
-
-    @property
-    def _starts(self) -> Ints:
-        many = [len(ids) for ids in self.sight.given]
-        return np.asarray(np.cumsum(many) - many)
 
     def claim(self, one: Bubbles) -> None:
         """Add one bubble with its track. Earlier ones with one of its detections are removed."""

@@ -36,6 +36,7 @@ from telerig.estimator.tracking.backtracking import (
     SmoothedTracks,
     Tables,
     follow_back,
+    fused,
     shared_rows,
 )
 from telerig.estimator.tracking.filter import (
@@ -96,20 +97,12 @@ class RowMaker:
             a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
             joined.append(table)
             flags = ["|".join(words) for words in flag_words(table)]
-            centre, (uv, covariance) = table[CENTRE_PX].to_numpy(float), pixels[c]
-            rays = on_rays(self.cameras[c], uv, covariance)
+            centre = table[CENTRE_PX].to_numpy(float)
+            rays = on_rays(self.cameras[c], *pixels[c])
             ends = np.cumsum([0, *counts[:, c]]).tolist()
             of_cameras.append(
                 [
-                    (
-                        (uv[p], covariance[p]),
-                        tuple(r[p] for r in rays),
-                        centre[p],
-                        a[p],
-                        d_eq[p],
-                        ids[c][p],
-                        flags[p],
-                    )
+                    (tuple(r[p] for r in rays), centre[p], a[p], d_eq[p], ids[c][p], flags[p])
                     for p in (slice(low, high) for low, high in pairwise(ends))
                 ]
             )
@@ -181,11 +174,9 @@ class RowMaker:
         """
         predicted = self.tracker.predict(t_s, position_mm)
         sight = self.sights([tables])[0] if sight is None else sight
-        bubbles, offset_px = grouped_frame(sight, self.model, predicted)
-        late = np.flatnonzero(bubbles.bodies.used == "none")
+        bubbles, rays, offset_px = grouped_frame(sight, self.model, predicted)
+        late = np.flatnonzero((bubbles.bodies.used == "none") & ~bubbles.alone)
         self._fit(bubbles, late, tables, np.zeros_like(bubbles.rows))
-        rays = Bubbles.on_rays(sight, offset_px)
-        bubbles = Bubbles.concat([bubbles, rays.take(_others(rays, bubbles))])
         measured = FrameMeasurements.create(
             bubbles.points_mm, bubbles.covariance_mm2, d_eq_mm=bubbles.d_eq_mm,
             confidence=bubbles.confidence, particle=bubbles.given, alone=bubbles.alone,
@@ -347,10 +338,12 @@ def _shape_share_px2(cameras: tuple[Camera, ...], bodies: Bodies) -> Array:
 
 def grouped_frame(
     sight: Sight, model: RigModel, predicted: Prediction | None
-) -> tuple[Bubbles, Array]:
-    """Return the bubbles of a frame, and the median shift of each camera's pixels.
+) -> tuple[Bubbles, Bubbles, Array]:
+    """Return the bubbles of a frame, each detection by itself, and the shift of each camera's
+    pixels.
 
-    Detections with given ids are joined by their ids; all others are matched.
+    Detections with given ids are joined by their ids; all others are matched, and what has no
+    partner is a bubble that one camera alone sees.
 
     sight : detections of all cameras.
     model : the model for matching.
@@ -367,22 +360,17 @@ def grouped_frame(
     bubbles.confidence[len(given) :] = found.confidence
     bubbles.ambiguous[len(given) :] = found.ambiguous
     part = (bubbles.rows < 0).any(1)
-    if np.sum(~part) < _LEAST_FOR_OFFSET:
-        return bubbles, np.zeros((len(model.cameras), 2))
-    offset = np.median(sight.left_px[chosen][~part], axis=0)
-    if part.any():
-        pixels = [(uv - off, noise) for (uv, noise), off in zip(sight.pixels, offset)]
-        bubbles.points_mm[part] = places_of(model.cameras, pixels, bubbles.rows[part]).points_mm
-    return bubbles, offset
-
-
-def _others(rays: Bubbles, bubbles: Bubbles) -> Ints:
-    """Return which detections without a given id are in none of the bubbles."""
-    camera, row = rays.rows.argmax(1), rays.rows.max(1)
-    taken = np.zeros((int(row.max(initial=-1)) + 1, rays.rows.shape[1]), bool)
-    for c, rows in enumerate(bubbles.rows.T):
-        taken[rows[rows >= 0], c] = True
-    return np.flatnonzero((rays.given == NO_PARTICLE) & ~taken[row, camera])
+    offset = np.zeros((len(model.cameras), 2))
+    if np.sum(~part) >= _LEAST_FOR_OFFSET:
+        offset = np.median(sight.left_px[chosen][~part], axis=0)
+    rays = Bubbles.on_rays(sight, offset)
+    at = np.where(bubbles.rows >= 0, bubbles.rows + sight.starts, -1)
+    for k in np.flatnonzero(part) if offset.any() else ():
+        own = rays.take(at[k, at[k] >= 0])
+        bubbles.points_mm[k] = fused(own.points_mm, own.covariance_mm2)[0]
+    single = rays.given == NO_PARTICLE
+    single[at[at >= 0]] = False
+    return Bubbles.concat([bubbles, rays.take(single)]), rays, offset
 
 
 def _pixels(table: pd.DataFrame, wander: float) -> Pixels:

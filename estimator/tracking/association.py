@@ -396,7 +396,8 @@ class Association:
     """The possible pairings of tracks and measurements in one frame.
 
     It also holds the shift of all bubbles that follows from the best pairings. A track that has no
-    measurement of several cameras in these may have one of a camera alone.
+    measurement of several cameras in these may have one of a camera alone, if no other pairing of
+    them is nearly as likely.
     """
 
     def __init__(self, clusters: Sequence[Cluster], scan: Scan, common: Common) -> None:
@@ -422,7 +423,9 @@ class Association:
         missed = own & measured.alone & (closed & (chosen < 0))[:, None]
         if missed.any():
             alone = gated_pairs(where, measured, missed, self.common, scan.settings, misses)
-            pairs = Evidence.concat([pairs, alone])
+            best, clear = clear_assignment(alone, len(rows), self.common.shift_mm, scan.settings)
+            given = clear[alone.row] & (best[alone.row] == alone.column)
+            pairs = Evidence.concat([pairs, alone.take(given)])
         self.pairs = pairs
         self.owner = self.cluster_of[self.pairs.row]
         self.edges = self._allowed()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tracker_runs import STILL, UP, Array, cameras, frame_of, kinds, run
+from tracker_runs import SIGMA_MM, STILL, UP, Array, cameras, frame_of, kinds, run
 
 from telerig.errors import InputError
 from telerig.estimator.tracking.filter import FrameMeasurements, TrackerSettings
@@ -173,6 +173,28 @@ def test_one_camera_alone_keeps_a_track_alive(seeing: int) -> None:
             there = tracker.predict(i / 500 + 1e-6, 0.0).points_mm
             assert camera.project(there) == pytest.approx(uv, abs=1.0)
     assert [ids.particle.tolist() for ids in final] == [[0]] * 150 and tracker.next_id == 1
+
+
+@pytest.mark.parametrize(("share", "given"), [(0.0, 0), (1.0, 1), (0.5, -1)])
+def test_what_one_camera_sees_between_two_tracks_is_given_to_neither(
+    share: float, given: int
+) -> None:
+    """Two bubbles pass 0.2 mm apart, and for three frames one camera sees one outline there; a
+    third bubble far away tells that nothing else has moved."""
+    camera, tracker, final = cameras()[0], Tracker(settings=STILL), []
+    noise = SIGMA_MM**2 * np.eye(3)
+    for i in range(40):
+        three = np.array([[0.0, 0, 0], [0.2, 0.09 * (i - 21), 0], [0, 9, 0]])
+        measured = frame_of(three)
+        if 20 <= i < 23:
+            uv = camera.project(share * three[1:2])
+            point, covariance, _ = on_rays(camera, uv, 0.04 * np.eye(2)[None])
+            points, covariances = np.array([three[2], *point]), np.array([noise, *covariance])
+            measured = FrameMeasurements.create(points, covariances, alone=[False, True])
+        final += tracker.update(i, i / 500, measured, 0.0).final
+    ids = [one.particle.tolist() for one in final]
+    assert sorted(ids[5]) == [0, 1, 2] and ids[-1] == ids[5]
+    assert ids[20:23] == [[ids[5][2], [*ids[5], -1][given]]] * 3
 
 
 # --- streaming

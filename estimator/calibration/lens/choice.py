@@ -154,17 +154,24 @@ def _tilted_or_flat(
 ) -> tuple[Lenses, State]:
     """Return the better one of a model with a tilt and the best model without, both fitted.
 
-    The quadratic form contains a tilt to first order only.
+    The quadratic form contains a tilt to first order only. The form about the fit with the tilt
+    says which of the other groups are needed beside it.
     """
     flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
     fits = []
     for lenses in (tilted_lenses, _determined(quadratic, flat)):
         model = problem.with_model([name_of(lens) for lens in lenses])
-        begin = model_start(model, rich.state)
-        fit = solve(model, begin, max_iterations=40, relative=1e-7)
-        fits.append((quadratic.cost_of_fit(lenses, fit.cost), lenses, fit.state))
-    _, lenses, state = min(fits, key=lambda fit: fit[0])
-    return lenses, state
+        fit = solve(model, model_start(model, rich.state), max_iterations=40, relative=1e-7)
+        fits.append((quadratic.cost_of_fit(lenses, fit.cost), lenses, model, fit))
+    _, lenses, model, fit = min(fits, key=lambda fit: fit[0])
+    if lenses == tilted_lenses:
+        parts = [
+            [part for part in options if lens & {"tilt"} <= part <= lens]
+            for lens, options in zip(lenses, allowed)
+        ]
+        about_fit = QuadraticCost.of(model, fit)
+        lenses = search(replace(about_fit, group_penalty=quadratic.group_penalty), parts)
+    return lenses, fit.state
 
 
 def model_start(problem: Problem, state: State) -> State:

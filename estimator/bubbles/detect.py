@@ -393,9 +393,12 @@ def _flags(
         within = cv2.erode(field.astype(np.uint8), np.ones((5, 5), np.uint8))
         beyond |= within[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)] == 0
     border = np.any(beyond, axis=1)
-    gap = rough_distance(ellipse[:, None, None], rim[None, ..., 0], rim[None, ..., 1])
-    gap[np.arange(len(gap)), np.arange(len(gap))] = np.inf
-    hidden = np.any(gap < 0.0, axis=(0, 2))
+    apart = np.linalg.norm(ellipse[:, None, :2] - ellipse[:, :2], axis=2)
+    near = np.argwhere(apart < 1.1 * (ellipse[:, None, 2] + ellipse[:, 2]))
+    one, other = near[near[:, 0] != near[:, 1]].T
+    gap = rough_distance(ellipse[one, None], rim[other, :, 0], rim[other, :, 1])
+    hidden = np.zeros(len(ellipse), np.bool_)
+    hidden[other[np.any(gap < 0.0, axis=1)]] = True
     words = {
         "border": border,
         "defocus": judged["defocus"],

@@ -508,6 +508,9 @@ def _spline(shift: float) -> Float32:
 
 Shift = tuple[float, float]
 
+_FEW_FRAMES_CELL_PX = 8
+"""The level from fewer frames is that of square cells: the mean of 64 pixels has little noise."""
+
 LEAST_FRAMES = 4
 """With fewer frames the motion of the bubbles does not separate them from the background."""
 
@@ -589,10 +592,14 @@ def estimate_background(
     if len(frames) < LEAST_FRAMES:
         brightest = stack.max(0).astype(np.float32)
         level = screen_level(brightest)
-        dark = cv2.dilate(
-            (brightest < (1 - DARK) * level).view(np.uint8), np.ones((9, 9), np.uint8)
-        )
-        return Background(level, dark > 0, frames=frames, shift_px=shift_px)
+        seen = brightest < (1 - DARK) * level
+        dark = np.asarray(cv2.dilate(seen.view(np.uint8), np.ones((9, 9), np.uint8)) > 0)
+        cells = log_cells(brightest, _FEW_FRAMES_CELL_PX)
+        size = cells.shape[::-1]
+        hidden = cv2.resize(dark.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+        smooth = cv2.GaussianBlur(fill_masked(cells, hidden, ~hidden), (0, 0), 1.0)
+        level = np.exp(cv2.resize(smooth, level.shape[::-1], interpolation=cv2.INTER_LINEAR))
+        return Background(level, dark, frames=frames, shift_px=shift_px)
     travel = shifts[frames]
     moving = bool(np.ptp(travel, axis=0).max() >= LEAST_TRAVEL_PX)
     layers, covered, noise = fit_layers(stack, travel if moving else None)

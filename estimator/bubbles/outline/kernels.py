@@ -173,10 +173,10 @@ def _basis(foot: Array, square: float, out: Array) -> None:
         damping = np.exp((1.0 - order * order) * square / 2.0)
         for k in range(foot.shape[1]):
             cos, sin = foot[0, k], foot[1, k]
-            real, imaginary = damping, 0.0
-            for _ in range(order):
+            real, imaginary = cos * cos - sin * sin, 2.0 * cos * sin
+            for _ in range(2, order):
                 real, imaginary = real * cos - imaginary * sin, real * sin + imaginary * cos
-            out[i, k], out[i + 1, k] = real, imaginary
+            out[i, k], out[i + 1, k] = damping * real, damping * imaginary
 
 
 @compiled

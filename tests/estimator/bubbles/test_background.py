@@ -224,6 +224,17 @@ def test_too_few_frames_give_a_smooth_surface() -> None:
     assert len(background.frames) == 2 and background.lab_factor is None
 
 
+def test_a_single_frame_tells_the_level_behind_its_bubbles() -> None:
+    """The broad mean of the screen alone is off by 1.5 % here."""
+    v, u = np.mgrid[:400, :600].astype(float)
+    screen = 180.0 * (1.0 + 0.3 * (u - 300.0) / 600.0)
+    behind = (u - 200.0) ** 2 + (v - 150.0) ** 2 < 30.0**2
+    image = np.where(behind, 0.2, 1.0) * screen + np.random.default_rng(0).normal(0, 1.5, v.shape)
+    found = estimate_background(lambda _: image.round().astype(np.uint8), 1)
+    assert np.abs(found.rig_level / screen - 1.0)[behind].max() < 0.002
+    assert found.covered[behind].all() and found.covered.mean() < 0.05
+
+
 def test_refusals() -> None:
     with pytest.raises(DetectionError, match="no frame can be used"):
         estimate_background(lambda k: None, 5)

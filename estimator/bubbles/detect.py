@@ -178,7 +178,10 @@ def find_bubbles(
         outside = np.minimum(background, image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
     found = _found(image, background, field, min_diameter_px, min_contrast, shadows)
-    area = float(found.accepted["area_px2"].sum())
+    merged = (
+        found.accepted["flags"].astype(str).str.contains("merged")
+    )  # of which clusters are part
+    area = float(found.accepted["area_px2"][~merged].sum())
     area += sum(cv2.contourArea(line.astype(np.float32)) for line in found.clusters)
     looked_at = max(image.size if field is None else np.count_nonzero(field), 1)
     return replace(found, field=field, covered=min(area / looked_at, 1.0))

@@ -115,7 +115,9 @@ def test_a_heap_is_no_large_ellipse() -> None:
             Drawn((*rng.uniform(38, 82, 2), *(2 * (rng.uniform(4.0, 6.0),)), 0.0))
             for _ in range(40)
         ]
-        found = find_bubbles(crowd(heap, 120))
+        image = crowd(heap, 120)
+        found = find_bubbles(image)
+        assert found.covered < 1.1 * np.mean(image < 0.5 * WHITE)
         merged = found.accepted["flags"].str.contains("merged")
         large += int((found.accepted["a_px"][~merged] > 13.0).sum())
         area = sum(cv2.contourArea(line.astype(np.float32)) for line in found.clusters)

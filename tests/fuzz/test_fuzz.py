@@ -8,7 +8,7 @@ import pytest
 from fuzz_corpus import write_corpus
 from fuzz_driver import run_cases
 
-CASES = 300
+CASES = 200
 SHARDS = 20
 LONG_CASES = 200_000
 

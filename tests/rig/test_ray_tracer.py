@@ -96,34 +96,6 @@ def test_points_on_a_ray_traced_from_the_camera_give_its_pixel(kappa: float) -> 
             np.testing.assert_allclose(found, wanted, rtol=0, atol=EXACT_PX)
 
 
-# ---- closed forms
-
-
-@pytest.mark.parametrize("tilt_deg, shear_um", [(0.1, 13), (1.0, 131), (10.0, 1318)])
-def test_a_tilted_wall_shears_depth(tilt_deg: float, shear_um: int) -> None:
-    """In water the rays lean by psi less psi in water; the glass has no part in it.
-
-    In the image the shear is smaller by what the wall takes off lengths along its slope.
-    """
-    psi = np.radians(tilt_deg)
-    lean = psi - np.arcsin(np.sin(psi) / 1.333)
-    shear_mm = 30 * np.tan(lean)
-    kept = np.cos(psi) * np.cos(lean) / np.cos(psi - lean)
-    for towards_deg in (0.0, 90.0, 200.0):
-        slope = tilted(90.0, towards_deg)
-        points = [4.0, -7.0, -15.0] + np.array(
-            [0 * slope, [0, 0, 30.0], slope, np.cross(slope, [0, 0, 1])]
-        )
-        for glass in ({}, {"thickness_mm": 3.0}, {"indices": (1.0, 1.8, 1.333)}):
-            behind = wall(tilted(tilt_deg, towards_deg), **glass)
-            seen = trace_pixels(PLAIN, behind, points) / 40
-            deeper, along, aside = seen[1:] - seen[0]
-            np.testing.assert_allclose(deeper, -kept * shear_mm * slope[:2], rtol=0, atol=1e-12)
-            np.testing.assert_allclose(along, kept * slope[:2], rtol=0, atol=1e-12)
-            np.testing.assert_allclose(aside, np.cross(slope, [0, 0, 1])[:2], rtol=0, atol=1e-12)
-    assert round(1e3 * shear_mm) == shear_um
-
-
 # ---- what the arguments mean
 
 

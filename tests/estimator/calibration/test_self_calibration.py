@@ -215,7 +215,7 @@ def test_no_nominal_rotation_is_an_error(scene: Any) -> None:
 
 
 def test_the_plate_of_a_two_sided_target_decides(scene: Any) -> None:
-    made = scene("two_sided", 1, outlier_share=0.03, views=8)
+    made = scene("two_sided", 1, outlier_share=0.03, views=6)
     alone = made.calibrate("radial", nominal_rotvec_deg=None)
     assert alone.twin["decided_by"] == "refraction in the plate"
     assert made.space_rms_um(alone) < 1.5
@@ -225,7 +225,7 @@ def test_the_plate_of_a_two_sided_target_decides(scene: Any) -> None:
 
 def test_strong_perspective_decides_and_contradicts(scene: Any) -> None:
     """Lenses of 400 mm working distance: farther is smaller, in one of the twins only."""
-    made = scene("paper", 2)
+    made = scene("paper", 2, views=7)
     cameras = []
     for c in made.true_cameras.values():
         cameras.append(c.with_parameters(kappa_per_mm=1 / 400, k1=0.0))

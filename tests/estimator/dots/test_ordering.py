@@ -247,15 +247,6 @@ def test_a_part_of_a_grid_without_marks_is_refused(target: Target) -> None:
         number_dots(part, target)
 
 
-def test_unequal_pitches_tell_rows_from_columns() -> None:
-    target = replace(LARGE, rows=8, columns=8, pitch_mm=(7.0, 7.7), marks=())
-    for seed in range(8):
-        dots, truth = photograph(target, View(), np.random.default_rng([13, seed]))
-        numbering = number_dots(dots, target)
-        assert len(numbering.equivalents) == 2
-        assert sum(is_right(numbering, truth, ids) for ids in numbering.equivalents) == 1
-
-
 @pytest.mark.parametrize("lost", [(1, 2), (1, 3), (0, 2)])
 def test_one_mark_seen_as_a_plain_dot_is_settled_or_left_open(lost: tuple[int, int]) -> None:
     ring = replace(DESIGN, mark_style="ring")

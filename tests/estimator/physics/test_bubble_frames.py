@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import telerig
 from telerig.errors import InputError
 from telerig.estimator.physics.bodies import bodies_table
 from telerig.estimator.physics.frames import frames_table
@@ -263,8 +262,3 @@ def test_a_bubble_is_summarised() -> None:
     once = summary_table(frames_table(still, body(1), UP, G, WATER), UP, liquid[0]).iloc[0]
     assert once["d_eq_mm"] == pytest.approx(3.0) and np.isnan(once["reynolds"])
     assert not len(summary_table(frames.iloc[:0], UP))
-
-
-def test_a_table_of_bubbles_needs_a_smoothing() -> None:
-    with pytest.raises(InputError, match="from a Smoothing, not from int"):
-        telerig.bubble_table(3)  # type: ignore[arg-type]

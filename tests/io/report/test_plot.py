@@ -144,9 +144,6 @@ def test_pictures_of_the_rig(tmp_path: Path) -> None:
         (tmp_path / "cut.npz").write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             telerig.plot.uncertainty(tmp_path / "cut.npz")
-    np.save(tmp_path / "one.npy", grid)
-    with pytest.raises(InputError, match="cannot be read"):
-        telerig.plot.uncertainty(tmp_path / "one.npy")
     far = telerig.plot.residuals(dots.assign(du_px=300.0), "left")
     assert far.get_title() == "left, arrows 0.01 times as long"
 

@@ -44,11 +44,6 @@ def test_a_share_that_means_nothing_is_not_said() -> None:
     assert "assumptions" in number_words(axes(flags=(Flag.SHAKE_UNMEASURED,)), "y")
 
 
-def test_what_the_encoder_adds_is_said_where_it_counts() -> None:
-    assert "encoder" not in number_words(axes(sigma_encoder_mm=0.01), "y")
-    assert "add 64 µm along y" in number_words(axes(sigma_encoder_mm=0.0641), "y")
-
-
 def test_the_conclusion_says_why_a_run_is_not_resolved() -> None:
     assert conclusion("RESOLVED").startswith("RESOLVED: the data separate")
     left = conclusion("PARTIAL", q=3.1, eta=0.88)

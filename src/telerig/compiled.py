@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from multiprocessing import parent_process
 from typing import Any, TypeVar
 
 from numba import njit
@@ -19,7 +20,9 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]
     told = False
 
     def on_start(self, started: event.Event) -> None:
-        if not self.told and started.data["dispatcher"].py_func.__module__.startswith("telerig."):
+        """Say it once, in the process that the user has started."""
+        ours = started.data["dispatcher"].py_func.__module__.startswith("telerig.")
+        if ours and not self.told and parent_process() is None:
             self.told = True
             tell("compiling loops, once for this installation")
 
@@ -41,12 +44,11 @@ def compiled(function: _Function) -> _Function:
     Sums may be reordered. NaN and infinity keep their meaning in comparisons, so write
     ``abs(x) < np.inf``: ``np.isfinite`` of a sum may be simplified to True.
 
-    The function cannot be passed to other compiled ones, and expressions of arrays are not merged:
-    that makes compiling faster.
+    The function cannot be passed to other compiled ones, which makes compiling faster.
     """
     options = {
         "fastmath": {"reassoc", "contract", "nsz", "arcp"}, "error_model": "numpy",
-        "no_cfunc_wrapper": True, "no_rewrites": True,
+        "no_cfunc_wrapper": True,
     }  # fmt: skip
     try:
         kept: _Function = njit(cache=True, **options)(function)

@@ -27,6 +27,7 @@ TABLE = ("scale_px_per_mm", "centre_u_px", "centre_v_px")
 """The parametrisation of the design's table: a centre per camera, no baseline between them."""
 OURS = ("scale_px_per_mm",)
 """The product's: centres held, a full pose of the second camera."""
+SHAPE, TILT = ("aspect", "skew"), ("tilt_x", "tilt_y")
 TILTED = {"tilt_x": 0.1, "tilt_y": 0.05}
 
 
@@ -54,6 +55,14 @@ def make(views: int = 12, *, cameras: int = 2, relief_mm: float = 0.0, **lens: f
     return State(
         intrinsics[:cameras], np.array([np.eye(4), second])[:cameras], np.array(poses), dots
     )
+
+
+def parallel(state: State, rotvec: Any, roll_rad: float = 0.0) -> State:
+    """All views turned alike but for a roll in the plate's own plane."""
+    views = state.rig_from_target.copy()
+    for view, roll in zip(views, np.linspace(-roll_rad, roll_rad, len(views))):
+        view[:3, :3] = rotation_from_rotvec(rotvec) @ rotation_from_rotvec([0.0, 0.0, roll])
+    return replace(state, rig_from_target=views)
 
 
 def every_dot(state: State) -> Observations:
@@ -122,6 +131,81 @@ def test_the_products_gauge_removes_exactly_what_is_unseen() -> None:
     assert unseen(np.r_[rows, gauge]) == 7
     assert unseen(np.r_[rows, gauge, scale]) == 6
     assert unseen(np.r_[rows, gauge, scale, prior]) == 0
+
+
+@pytest.mark.parametrize(
+    ("views", "lens", "expected"),
+    [
+        (12, TABLE + SHAPE, 10),
+        (3, TABLE + SHAPE, 10),
+        (2, TABLE + SHAPE, 12),
+        (2, TABLE, 10),
+        (1, TABLE, 12),
+    ],
+)
+def test_few_views_of_a_flat_target(views: int, lens: tuple[str, ...], expected: int) -> None:
+    assert unseen(jacobian(make(views), lens, baseline=False)) == expected
+
+
+@pytest.mark.parametrize(("views", "lens"), [(2, TABLE + SHAPE), (1, TABLE)])
+def test_relief_of_the_target_shows_one_direction_more(views: int, lens: tuple[str, ...]) -> None:
+    """The table's counts are of a flat plate; any relief at all gives the epipolar directions."""
+    state = make(views, relief_mm=0.02)
+    assert unseen(jacobian(state, lens, baseline=False)) == 11
+
+
+def test_aspect_and_skew_or_tilt_but_not_both() -> None:
+    both = jacobian(make(**TILTED), TABLE + SHAPE + TILT, baseline=False)
+    assert unseen(both) == 14
+    assert unseen(jacobian(make(**TILTED), TABLE + TILT, baseline=False)) == 10
+    assert unseen(jacobian(make(**TILTED), TABLE + SHAPE, baseline=False)) == 10
+
+
+def test_a_small_tilt_is_unseen() -> None:
+    """A bilateral tilt acts in the second order: at zero its two components vanish per camera."""
+    assert unseen(jacobian(make(), TABLE + TILT, baseline=False)) == 14
+
+
+def test_distortion_and_its_centre() -> None:
+    """One centre for distortion and image: k1 sees the rig's shift (10 - 3), until it is zero.
+
+    With a centre of its own (to first order p1 and p2) the distortion leaves the table's 10.
+    """
+    state = make(k1=0.02)
+    assert unseen(jacobian(state, (*TABLE, "k1"), baseline=False)) == 7
+    assert unseen(jacobian(make(), (*TABLE, "k1"), baseline=False)) == 10
+    assert unseen(jacobian(state, (*TABLE, "k1", "p1", "p2"), baseline=False)) == 10
+    assert unseen(jacobian(state, (*OURS, "k1", "p1", "p2"), baseline=True)) == 9
+
+
+def test_kappa_keeps_the_depth_origin_unseen() -> None:
+    """A shift of the depth origin re-scales scale and kappa together: still 9 in our variables."""
+    state = make(kappa_per_mm=1e-3)
+    assert unseen(jacobian(state, (*OURS, "kappa_per_mm"), baseline=True)) == 9
+    free_centre = jacobian(state, (*TABLE, "kappa_per_mm"), baseline=True)
+    assert unseen(free_centre) == 9
+
+
+@pytest.mark.parametrize(("roll_rad", "count"), [(0.0, 11), (0.3, 10)])
+def test_parallel_views_leave_a_bas_relief_unless_they_roll(roll_rad: float, count: int) -> None:
+    state = parallel(make(), [0.2, 0.75, 0.0], roll_rad=roll_rad)
+    assert unseen(jacobian(state, TABLE, baseline=False)) == count
+
+
+def test_stereo_with_known_dots() -> None:
+    """3; for parallel views too, unless frontal to a camera, where a tilt is stationary."""
+    assert unseen(jacobian(make(), TABLE, baseline=False, dots=False)) == 3
+    tilted = parallel(make(), [0.2, 0.75, 0.0])
+    assert unseen(jacobian(tilted, TABLE, baseline=False, dots=False)) == 3
+    frontal = parallel(make(), [0.0, 0.0, 0.0])
+    assert unseen(jacobian(frontal, TABLE, baseline=False, dots=False)) == 4
+
+
+def test_mono_with_known_dots() -> None:
+    state = make(cameras=1)
+    assert unseen(jacobian(state, TABLE, baseline=False, dots=False, depth=False)) == 2
+    with_depth = jacobian(state, TABLE, baseline=False, dots=False)
+    assert unseen(with_depth) == 2 + len(state.rig_from_target)
 
 
 @pytest.mark.parametrize("kappa", [0.0, 1e-4, 3e-3])

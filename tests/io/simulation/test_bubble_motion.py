@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.signal import welch
 
 from telerig.errors import InputError
 from telerig.io.simulation.run.motion import (
@@ -11,10 +12,12 @@ from telerig.io.simulation.run.motion import (
     accelerometer_readings,
     constant_speed_path,
     constant_speed_rise_mm_s,
+    mode_acceleration,
     ornstein_uhlenbeck,
     oscillator,
     rig_mode,
     rig_shake,
+    square_root,
     stage_trajectory,
     stochastic_paths,
 )
@@ -51,12 +54,76 @@ def test_one_step_has_the_exact_transition_and_noise(process, step):
     assert np.allclose(got, expected / sigma[:, None] / sigma, atol=1e-9)
 
 
+@pytest.mark.parametrize("step", [5e-4, 1e-2, 0.3])
+def test_the_stationary_state_stays(step):
+    process = rig_mode(0.2, 12.0, 0.03, 60.0)
+    start = process.stationary_covariance()
+    transition, root = process.discretised(step)
+    after = transition @ start @ transition.T + root @ root.T
+    sigma = np.sqrt(np.diag(start))
+    assert np.allclose((after - start) / sigma[:, None] / sigma, 0, atol=1e-9)
+
+
+def test_oscillator_in_closed_form():
+    """Stationary: x and v independent, RMS of v = w times that of x; correlation at a lag."""
+    w, damping = 2 * np.pi * 12.0, 0.1
+    process = oscillator(0.5, 12.0, damping)
+    assert np.allclose(process.stationary_covariance(), np.diag([0.25, (0.5 * w) ** 2]), atol=1e-9)
+    x = process.paths(1 / 200, 2000, rng(), paths=200)[..., 0]
+    assert x.std() == pytest.approx(0.5, rel=0.02)
+    lag = np.arange(0, 30) / 200
+    free = w * np.sqrt(1 - damping**2)
+    fall = np.exp(-damping * w * lag)
+    expected = fall * (np.cos(free * lag) + damping * w / free * np.sin(free * lag))
+    got = [np.mean(x[:, : 2000 - k] * x[:, k:]) / 0.25 for k in range(30)]
+    assert np.allclose(got, expected, atol=0.06)
+
+
+def test_ornstein_uhlenbeck_displacement_variance():
+    """Var of the displacement: 2 s^2 tau (t - tau (1 - e^(-t/tau)))."""
+    process = ornstein_uhlenbeck(10.0, 0.3)
+    paths = process.paths(0.01, 101, rng(), paths=20_000, start_covariance=np.diag([0.0, 100.0]))
+    for k in (5, 30, 100):
+        t = 0.01 * k
+        expected = 2 * 100 * 0.3 * (t - 0.3 * (1 - np.exp(-t / 0.3)))
+        assert paths[:, k, 0].var() == pytest.approx(expected, rel=0.05)
+        assert paths[:, k, 1].std() == pytest.approx(10.0, rel=0.03)
+
+
+def test_rig_mode_spectrum_and_acceleration():
+    """Displacement density = |force filter|^2 |resonator|^2, and its second derivative."""
+    f0, damping, force = 20.0, 0.1, 60.0
+    process = rig_mode(0.2, f0, damping, force)
+    rate = 1000.0
+    states = process.paths(1 / rate, 4096, rng(), paths=60)
+    assert states[..., 0].std() == pytest.approx(0.2, rel=0.05)
+    frequency, density = welch(states[..., 0], rate, nperseg=1024)
+    w = 2 * np.pi * frequency
+    low_pass = process.noise_input[3] / ((2 * np.pi * force) ** 2 - w**2 + 4j * np.pi * force * w)
+    resonator = 1 / ((2 * np.pi * f0) ** 2 - w**2 + 2j * damping * 2 * np.pi * f0 * w)
+    expected = 2 * np.abs(low_pass * resonator) ** 2
+    band = (frequency > 8) & (frequency < 80)
+    ratio = density.mean(0)[band] / expected[band]
+    assert np.abs(np.log(ratio)).max() < 0.5 and abs(np.log(ratio).mean()) < 0.05
+    acceleration = mode_acceleration(states, process)
+    velocity = states[..., 1]
+    mean = np.cumsum((acceleration[:, 1:] + acceleration[:, :-1]) / 2, 1) / rate
+    drift = np.diff(velocity[:, 1:] - velocity[:, :1] - mean, axis=1)
+    assert drift.std() < 0.03 * np.diff(velocity, axis=1).std()
+
+
 def test_processes_that_do_not_settle_are_refused():
     with pytest.raises(InputError, match="no stationary state"):
         ornstein_uhlenbeck(1.0, 1.0).stationary_covariance()
     undamped = LinearProcess(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([0.0, 1.0]))
     with pytest.raises(InputError):
         undamped.paths(0.1, 3, rng())
+
+
+def test_square_root_of_singular_covariances():
+    covariance = np.array([[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    root = square_root(covariance)
+    assert np.allclose(root @ root.T, covariance, atol=1e-12)
 
 
 @pytest.mark.parametrize("amplitudes", [(3.0, 0.0), (3.0, 3.0), (4.0, 2.0)])

@@ -259,14 +259,17 @@ class Tracker:
 
         Raises InputError when t_s is not later than the last frame's time.
         """
-        tracks = [t.copy() for t in self._confirmed()]
-        common = self.common
-        if tracks and self.last is not None:
-            step, control, found = self._motion(replace(self.stage), t_s, position_mm)
-            _move(tracks, step, control, found)
-            common = common.predicted(step)
-        now = expected(tracks)
-        return replace(now, covariance_mm2=now.covariance_mm2 + common.covariance_mm2)
+        tracks = self._confirmed()
+        if not tracks or self.last is None:
+            return expected(tracks)
+        step, control, found = self._motion(replace(self.stage), t_s, position_mm)
+        x = np.array([t.x for t in tracks])
+        x[:, VELOCITY] += found
+        x = x @ step.matrix.T + control
+        p = np.array([t.p for t in tracks]) + self.common.covariance
+        p = step.matrix @ p @ step.matrix.T + step.noise + step.common_noise
+        points, covariances = x[:, POSITION], p[:, POSITION, POSITION]
+        return replace(expected(tracks), points_mm=points, covariance_mm2=covariances)
 
     def update(
         self,
@@ -363,7 +366,10 @@ class Tracker:
         step, control, found = self._motion(self.stage, t_s, position_mm)
         every = self._every()
         self.common = self.common.predicted(step) if every else Common()
-        _move(every, step, control, found)
+        if found.any():
+            for track in every:
+                track.x = track.x + np.pad(found, (3, STATES - 6))
+        predict_tracks(every, step, control)
         return Motion(step.matrix, step.noise, step.matrix[:, VELOCITY] @ found + control)
 
     def _new(self, scan: Scan, column: int) -> Track:
@@ -461,11 +467,3 @@ class Tracker:
         self.events += found
         if dead:
             self.clusters = [c for c in self.clusters if c.tracks[0].particle not in dead]
-
-
-def _move(tracks: Sequence[Track], step: Transition, control: Array, found_mm_s: Array) -> None:
-    """Move tracks to the next frame; see `Tracker._motion` for the arguments."""
-    if found_mm_s.any():
-        for track in tracks:
-            track.x = track.x + np.pad(found_mm_s, (3, STATES - 6))
-    predict_tracks(tracks, step, control)

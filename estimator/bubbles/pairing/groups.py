@@ -636,35 +636,34 @@ def track_log_odds(found: Candidates, model: RigModel, predicted: Prediction) ->
     scales = np.array([camera["scale_px_per_mm"] for camera in model.cameras])
     blur_px2 = model.mean("scatter_px") ** 2 + model.mean("frame_px") ** 2
     blurred = at.covariance_mm2 + blur_px2 / np.mean(scales) ** 2 * np.eye(3)
-    density = _densities(predicted, at.points_mm, blurred, 2 * np.exp(groups.log_radius))
+    ends = np.cumsum([len(groups), *(len(points) for points, _ in found.rays)])
+    sizes = np.full(ends[-1], np.nan)
+    sizes[: len(groups)] = 2 * np.exp(groups.log_radius)
+    near = evidence(
+        predicted,
+        np.concatenate([at.points_mm, *(points for points, _ in found.rays)]),
+        np.concatenate([blurred, *(covariances for _, covariances in found.rays)]),
+        sizes,
+        size_sd=_SILHOUETTE_SIZE_SD,
+    )
+    every = np.zeros((ends[-1], len(predicted.ids)))
+    every[near.column, near.row] = np.exp(near.scores(np.zeros(3)))
+    density, *of_rays, _ = np.split(every, ends)
     volumes = np.array([model.volume_mm3(*pair) for pair in model.pairs])
     volume = np.where(groups.pair >= 0, volumes[groups.pair], volumes.mean())
     expected = (1 - _NEW_SHARE) * DETECTION_PROBABILITY**2 * volume * density.mean(1)
     total = np.log(expected + _NEW_SHARE)
     depths = model.areas_px2 / scales**2 * np.sqrt(2 * np.pi) * UNKNOWN_MM
     alone = []
-    for c, (points, covariances) in enumerate(found.rays):
-        usual = max(len(points) * model.unmatched_share(c), 1e-3)
-        density = _densities(predicted, points, covariances, np.full(len(points), np.nan))
-        density *= DETECTION_PROBABILITY * (1 - DETECTION_PROBABILITY) * depths[c] / usual
-        none = np.zeros((1, density.shape[1]))
-        alone.append(np.concatenate([density, none])[groups.rows[:, c]])
-    every = [1 + one.sum(1) for one in alone]
+    for c, own in enumerate(of_rays):
+        usual = max(len(own) * model.unmatched_share(c), 1e-3)
+        relative = DETECTION_PROBABILITY * (1 - DETECTION_PROBABILITY) * depths[c] / usual
+        none = np.zeros((1, own.shape[1]))
+        alone.append(np.concatenate([relative * own, none])[groups.rows[:, c]])
+    sums = [1 + one.sum(1) for one in alone]
     for c, one in enumerate(alone):
-        total -= np.log(every[c])
+        total -= np.log(sums[c])
         for d in range(c):
-            both = (one * alone[d]).sum(1) / (every[c] * every[d])
+            both = (one * alone[d]).sum(1) / (sums[c] * sums[d])
             total -= np.log1p(-both)
     return np.asarray(total)
-
-
-def _densities(
-    predicted: Prediction, points_mm: Array, covariances_mm2: Array, d_eq_mm: Array
-) -> Array:
-    """Return the density (N, K) of N measured points and sizes at K tracks (1/mm^3)."""
-    near = evidence(
-        predicted, points_mm, covariances_mm2, d_eq_mm, size_sd=_SILHOUETTE_SIZE_SD
-    )  # fmt: skip
-    out = np.zeros((len(points_mm), len(predicted.ids)))
-    out[near.column, near.row] = np.exp(near.scores(np.zeros(3)))
-    return out

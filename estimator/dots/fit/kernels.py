@@ -29,7 +29,7 @@ def coverages(first: Array, theta: Array, value: Array, gradient: Array) -> None
     farther to the left have its full value: it is added to the last of them, and carried on at the
     end.
     """
-    height, width = value.shape[1:]
+    height, width = value.shape[1], value.shape[2]
     across, along = np.empty((3, width)), np.empty((2, height))
     full = np.empty((2, height, width))
     for n in range(len(theta)):

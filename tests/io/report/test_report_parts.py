@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.report.calibration.dot_fit import edge_distance_px
+from telerig.io.report.calibration.dot_fit import dot_pictures, edge_distance_px
 from telerig.io.report.calibration.figures import tilt_angles_rad, trust_pictures
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
@@ -156,6 +156,14 @@ def test_distance_from_a_circle_is_exact() -> None:
     distance = edge_distance_px(_circle_example())
     expected = np.hypot(u - 120, v - 65) - 8
     np.testing.assert_allclose(distance[off_centre], expected[off_centre], atol=1e-9)
+
+
+def test_profile_keeps_clear_of_a_neighbour_and_states_the_misfit() -> None:
+    example = _circle_example()
+    patch = example["patch"].copy()
+    patch[:, :6] = 250
+    *_, profile = dot_pictures(example | {"patch": patch})
+    assert "RMS 1.00 grey values, noise 0.500" in profile.caption
 
 
 def _overlay_tables() -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -217,6 +217,13 @@ def test_lines_that_could_be_the_others_are_listed(folder: Path) -> None:
     assert "31.0 y 200 14.0 rig identified from the data" in text
 
 
+def test_tables_of_another_tracking_are_named(folder: Path) -> None:
+    tracks = pd.read_csv(folder / "tracks.csv")
+    tracks.assign(particle=7).to_csv(folder / "tracks.csv", index=False)
+    told = _judged(folder)
+    assert "Bubbles 0 of trajectories.csv" in told.warnings[-1] and told.colour == "usable"
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_no_bubbles_leaves_the_shake(folder: Path) -> None:
     (folder / "trajectories.csv").write_text("frame,particle,t_s\n")

@@ -137,10 +137,14 @@ def test_one_folder_for_two_runs_is_refused(tank: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_cluster_is_named_where_runs_are_tracked(data: Path) -> None:
+def test_a_cluster_is_named_where_runs_are_tracked(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from telerig.estimator.batch import batch
     from telerig.estimator.batch.batch import do_job
     from telerig.estimator.batch.jobs import fingerprint
 
+    monkeypatch.setattr(batch, "_CONNECT_S", 0.5)
     address = "tcp://127.0.0.1:1"
     here, there = (jobs_of([data], only=["track"], cluster=c) for c in (None, address))
     assert all(job.command.endswith(f"--cluster {address}") for job in there)

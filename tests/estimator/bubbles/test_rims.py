@@ -63,6 +63,7 @@ def test_images_are_searched_by_rims_where_bubbles_crowd() -> None:
     assert not found["flags"].str.contains("merged").any()
 
 
+@pytest.mark.slow
 def test_errors_beside_neighbours_are_those_stated() -> None:
     """Without what the residuals show of misled fits the figure is 9."""
     square = []

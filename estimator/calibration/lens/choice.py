@@ -121,7 +121,8 @@ def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
     for camera, group, lenses in steps_to(quadratic, chosen, simplest):
         steps.append(_step(quadratic, steps[-1].lenses, camera, group, lenses))
     steps += _not_taken(quadratic, chosen, allowed)
-    words = _words(problem, quadratic, steps, chosen, rich.state)
+    auto = [model == AUTO for model in models]
+    words = _words(problem, quadratic, steps, auto, rich.state)
     return Choice(tuple(steps), chosen, start, words)
 
 
@@ -243,11 +244,12 @@ def _not_taken(quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens
 
 
 def _words(
-    problem: Problem, quadratic: QuadraticCost, steps: list[Step], chosen: Lenses, rich: State
+    problem: Problem, quadratic: QuadraticCost, steps: list[Step], auto: list[bool], rich: State
 ) -> str:
     """Return the choice in sentences for the user."""
     cameras = [c.name for c in problem.cameras]
     added = [step for step in steps[1:] if step.taken]
+    chosen = [step for step in steps if step.taken][-1].lenses
     words = f"{joint_name([name_of(lens) for lens in chosen], cameras)}: "
     if added:
         last = f"{', '.join(added[-1].added)} of camera {cameras[added[-1].camera]!r}"
@@ -259,8 +261,9 @@ def _words(
             words += f", {added[-1].gain:.3g} of it by the parameters added last ({last})"
     else:
         words += "no further parameter lowers chi-square by more than its penalty"
-    if any("kappa" in lens for lens in chosen):
-        without = tuple(lens - {"kappa", "centre"} for lens in map(_lens_of, problem.free))
+    if any("kappa" in lens and free for lens, free in zip(chosen, auto)):
+        whole = map(_lens_of, problem.free)
+        without = tuple(x - {"kappa", "centre"} if free else x for x, free in zip(whole, auto))
         words += (
             "; kappa = 0 is rejected: the scale changes with depth, and chi-square would be at "
             f"least {quadratic.rise(without):.3g} larger without it"

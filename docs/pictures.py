@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import av
 import grimp
 import networkx as nx
 import numpy as np
@@ -50,17 +51,17 @@ def pictures(work: Path) -> Iterator[tuple[str, Image.Image]]:
     yield "imports", imports_picture(folder_graph())
     telerig("demo", "--out", work / "demo", "--quiet")
     calibration, run = (work / "demo" / "results" / name for name in ("calibration", "rise"))
-    telerig("report", run, "--film", "--format", "gif", "--quiet")
+    telerig("report", run, "--film", "--quiet")
     with patch.object(Figure, "savefig", _as_png):
         drawn = [*calibration_pictures(calibration), *run_pictures(run)]
     for name, picture in drawn:
         yield name, Image.open(BytesIO(base64.b64decode(picture.source.partition(",")[2])))
     for name, folder in (("view", calibration), ("bubble", run)):
         yield name, Image.open(min((folder / "overlays").glob("*/*")))
-    for name, film, share in (("film", "path.gif", 0.1), ("film-views", "views.gif", 0.5)):
-        with Image.open(run / "film" / film) as frames:
-            frames.seek(int(share * frames.n_frames))
-            yield name, frames.copy()
+    for name, film, share in (("film", "path.mp4", 0.1), ("film-views", "views.mp4", 0.5)):
+        with av.open(str(run / "film" / film)) as film:
+            frames = list(film.decode(video=0))
+        yield name, frames[int(share * len(frames))].to_image()
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         sys.stdout.write("no browser: report.png and batch.png stay as they are\n")

@@ -48,9 +48,6 @@ def export(
             "cameras see]."
         ),
     ] = None,
-    full_cubic: Annotated[
-        bool, typer.Option("--full-cubic", help="For soloff: add the term z^3, 20 terms in all.")
-    ] = False,
     accept: Annotated[
         list[str] | None,
         typer.Option(
@@ -58,13 +55,6 @@ def export(
             "have changed since. Can be given several times."
         ),
     ] = None,
-    first_pixel: Annotated[
-        float,
-        typer.Option(
-            help="For soloff: coordinates of the centre of the top-left pixel in the other "
-            "program: 0 if it counts pixels from 0, as telerig does; 1 for MATLAB."
-        ),
-    ] = 0.0,
 ) -> None:
     """Write a calibration or a run in a format of other programs.
 
@@ -82,8 +72,8 @@ def export(
         bounds = options.numbers_of("--volume", volume, 6, ",", todo)
         box = volume_of([bounds[0:2], bounds[2:4], bounds[4:6]])
     for line in export_results(
-        source, to, run=run, calibration=calibration, out=out, volume=box, full_cubic=full_cubic,
-        first_pixel=first_pixel, accept=accept or (),
+        source, to, run=run, calibration=calibration, out=out, volume=box,
+        accept=accept or (),
     ):  # fmt: skip
         say(line)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -11,14 +10,6 @@ import typer
 from telerig.errors import InputError
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, run_file, say
-
-
-class FilmFormat(StrEnum):
-    """Kinds of film files."""
-
-    both = "both"
-    mp4 = "mp4"
-    gif = "gif"
 
 
 @errors_in_words()
@@ -34,9 +25,6 @@ def report(
     film: Annotated[
         bool, typer.Option(help="Also make films of each run: its path in space, and both views.")
     ] = False,
-    film_format: Annotated[
-        FilmFormat, typer.Option("--format", help="Format of the films.")
-    ] = FilmFormat.both,
     run: Annotated[
         Path | None,
         typer.Option(help="The recording, for the film of both views [DATASET/runs/NAME]."),
@@ -47,12 +35,12 @@ def report(
 
     A folder of results (calibration.json, tracking.json or batch.json) gives its report.html, a
     dataset gives those of its calibration and all its runs. With --film each run also gets
-    film/path.mp4 and film/path.gif, its path in space turned once about the vertical, and
-    film/views.mp4 and film/views.gif, the images of all cameras with the detected bubbles.
+    film/path.mp4, its path in space turned once about the vertical, and film/views.mp4, the images
+    of all cameras with the detected bubbles.
 
     Exit code 0: written. 2: the input cannot be used. 130: interrupted.
     """
-    from telerig.io.report.film.files import need_av
+    from telerig.io.report.film.mp4 import need_av
     from telerig.io.report.film.run import write_films
     from telerig.io.report.remake import remake_report, results_folders
     from telerig.io.results.stale import stale
@@ -69,7 +57,7 @@ def report(
             "--run is given, but there are several runs", where=str(folder),
             todo=f"name the results folder of one run, e.g. {runs[0].folder}",
         )  # fmt: skip
-    if film and film_format is not FilmFormat.gif:
+    if film:
         need_av()
     for i, results in enumerate(found):
         alone = found[0].folder == folder
@@ -81,9 +69,8 @@ def report(
             for sentence in stale(results.folder):
                 say(f"warning: {sentence}")
             if film and results.kind == "run":
-                endings = ("mp4", "gif") if film_format is FilmFormat.both else (film_format.value,)
                 folder_of_films = (place or results.folder) / "film"
-                for line in write_films(results.folder, folder_of_films, endings, run, stage):
+                for line in write_films(results.folder, folder_of_films, run, stage):
                     say(line)
 
 

@@ -61,12 +61,6 @@ CAMERA_EXPORTS = {
     "opencv": Format(
         "OpenCV", "export.opencv:export_opencv", "3 x 4 matrices in YAML", ".yml", ("remarks",)
     ),
-    "soloff": Format(
-        "Soloff",
-        "export.soloff:export_soloff",
-        "polynomials for PIV programs",
-        options=("full_cubic", "first_pixel", "remarks"),
-    ),
 }
 RUN_EXPORTS = {
     "hdf5": Format("HDF5", "export.tables:write_hdf5", "h5py, MATLAB", ".h5", ("cameras",)),
@@ -130,7 +124,7 @@ def export_results(
     calibration: Path | None = None,
     out: Path | None = None,
     accept: Collection[str] = (),
-    **options: Any,
+    volume: Volume | None = None,
 ) -> list[str]:
     """Write cameras or a run in the format ``to``, a name in `CAMERA_EXPORTS` or `RUN_EXPORTS`.
 
@@ -138,8 +132,8 @@ def export_results(
     run : name of the run; None takes the only one with results.
     calibration : calibration.json to use in place of that of the dataset.
     out : file or folder to write; None writes into the folder results/export of the dataset.
-    accept : ("stale",) also exports results whose inputs have changed. options : options of the
-        format, see `Format.options`.
+    accept : ("stale",) also exports results whose inputs have changed.
+    volume : as for `export_cameras`.
 
     Returns lines of text that say what was written and where. Raises InputError for an unknown
     format, for an option of other formats, and for results that are missing, stale or cannot be
@@ -156,7 +150,7 @@ def export_results(
     known = CAMERA_EXPORTS | RUN_EXPORTS
     if to not in known:
         raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
-    _refuse_options_of_others(to, run=run, calibration=calibration, **options)
+    _refuse_options_of_others(to, run=run, calibration=calibration, volume=volume)
     rig, results = CalibratedCameras(), None
     if to in CAMERA_EXPORTS or "cameras" in known[to].options:
         rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
@@ -165,7 +159,7 @@ def export_results(
     name = to if results is None else results.name
     place = out or results_root(source) / "export" / f"{name}{known[to].suffix}"
     if results is None:
-        lines = export_cameras(rig.cameras, to, place, remarks=rig.accepted, **options)
+        lines = export_cameras(rig.cameras, to, place, volume=volume, remarks=rig.accepted)
     else:
         lines = export_run(results, to, place, rig.cameras)
     accepted = rig.accepted if results is None else results.accepted
@@ -175,7 +169,7 @@ def export_results(
 def _refuse_options_of_others(to: str, **given: Any) -> None:
     """Raise InputError for a given option that the format ``to`` does not know.
 
-    given : the options; those that are None, False or 0 were not given.
+    given : the options; those that are None were not given.
     """
     with_cameras = [name for name, known in RUN_EXPORTS.items() if "cameras" in known.options]
     shared = {
@@ -184,14 +178,10 @@ def _refuse_options_of_others(to: str, **given: Any) -> None:
         "volume": [*CAMERA_EXPORTS],
     }
     for option in (name for name, value in given.items() if value):
-        formats = shared.get(option) or [
-            name for name, known in CAMERA_EXPORTS.items() if option in known.options
-        ]
-        if to not in formats:
-            name = option.replace("_", "-")
+        if to not in shared[option]:
             raise InputError(
-                f"--to {to} has no option --{name}",
-                todo=f"leave it out; the formats that have it: {', '.join(formats) or 'none'}",
+                f"--to {to} has no option --{option}",
+                todo=f"leave it out; the formats that have it: {', '.join(shared[option])}",
             )
 
 
@@ -202,13 +192,11 @@ def export_cameras(
     *,
     volume: Volume | None = None,
     remarks: Sequence[str] = (),
-    **options: Any,
 ) -> list[str]:
     """Write the cameras in one of the formats `CAMERA_EXPORTS`.
 
-    volume : box in which errors are measured and polynomials are fitted; None takes
+    volume : box in which errors are measured; None takes
     `working_volume`. remarks : sentences that are written into the file as comments.
-    options : options of the format, see `Format.options`.
     Returns lines of text that say what was written. Raises InputError for a volume that the cameras
     do not see.
     """
@@ -219,7 +207,7 @@ def export_cameras(
     box = volume or working_volume(cameras)
     lines = [
         f"working volume: {box.words()}",
-        *CAMERA_EXPORTS[to](cameras, out, box, remarks=remarks, **options),
+        *CAMERA_EXPORTS[to](cameras, out, box, remarks=remarks),
     ]
     walled = ", ".join(camera.name for camera in cameras if camera.wall is not None)
     if walled and to != "halcon":

@@ -59,7 +59,6 @@ def test_cameras_of_a_stale_calibration_say_so(data: Path) -> None:
     for to, file in (
         ("halcon", "halcon/cameras.hdev.txt"),
         ("opencv", "opencv.yml"),
-        ("soloff", "soloff/soloff_left.csv"),
     ):
         assert telerig("export", data, "--to", to)[0] == 2
         assert telerig("export", data, "--to", to, "--accept", "stale")[0] == 0

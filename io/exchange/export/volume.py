@@ -74,8 +74,7 @@ def refuse_unknown_parameters(cameras: Sequence[Camera], program: str) -> None:
                 raise InputError(
                     f"camera {camera.name} has the lens parameter {name} = {value:.6g}, which the "
                     f"export to {program} does not know",
-                    todo="export to soloff, which is fitted to any lens, or calibrate with a "
-                    f"--model without {name}",
+                    todo=f"calibrate with a --model without {name}",
                 )
 
 

@@ -14,7 +14,7 @@ import pandas as pd
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.report.film.files import Picture, Progress, write_film
+from telerig.io.report.film.mp4 import Picture, Progress, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.results import TrackResults, read_track_results
 from telerig.io.report.run.tracking.scene import thinned, track_colour
@@ -45,21 +45,21 @@ _SHADES = ((1.0, 0.62), (0.72, 0.74), (0.42, 0.86))
 
 
 def write_path_film(
-    results_folder: Path, files: Sequence[Path], *, stage: Progress | None = None
+    results_folder: Path, file: Path, *, stage: Progress | None = None
 ) -> tuple[str, ...]:
     """Film the path that a run's results folder holds, from 180 sides; return remarks in words.
 
     Bubbles are ellipsoids where their shapes are known, else spheres; the band round a path is
     +-2 sd, widened where it would be thinner than a line, by a factor that stands in the film. A
     long run's path is thinned. Raises InputError for results that cannot be read or hold no path,
-    and files that cannot be written.
+    and a file that cannot be written.
     """
     folder = Path(results_folder)
     path = read_film_path(folder)
     angles = [float(angle) for angle in range(0, 360, STEP_DEG)]
     draw = partial(draw_path, path, film_layout(path))
     pictures = ordered_map(draw, angles, quick_workers(len(angles)))
-    write_film(pictures, len(angles), files, what="turning the path", stage=stage)
+    write_film(pictures, len(angles), file, what="turning the path", stage=stage)
     return path.notes
 
 

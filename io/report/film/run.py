@@ -8,7 +8,7 @@ from pathlib import Path
 
 from telerig.errors import InputError
 from telerig.io.dataset.run import load_run, recordings
-from telerig.io.report.film.files import Progress
+from telerig.io.report.film.mp4 import Progress
 from telerig.io.report.film.path import write_path_film
 from telerig.io.report.film.views import write_views_film
 from telerig.io.report.run.tracking.results import read_track_results
@@ -17,18 +17,16 @@ from telerig.io.report.run.tracking.results import read_track_results
 def write_films(
     results_folder: Path,
     place: Path,
-    endings: Sequence[str],
     recording: Path | None,
     stage: Progress,
 ) -> Iterator[str]:
-    """Write path.* and views.* into the folder ``place``; return a line for each file and note.
+    """Write path.mp4 and views.mp4 into the folder ``place``; yield a line for each file and note.
 
-    endings : "mp4", "gif" or both. recording : the run's folder; None looks in the dataset, and
-    leaves out the film of the views where it is not there. Raises InputError for what cannot be
-    used.
+    recording : the run's folder; None looks in the dataset, and leaves out the film of the views
+    where it is not there. Raises InputError for what cannot be used.
     """
-    files = [place / f"path.{ending}" for ending in endings]
-    yield from _lines(files, write_path_film(results_folder, files, stage=stage))
+    file = place / "path.mp4"
+    yield from _lines(file, write_path_film(results_folder, file, stage=stage))
     if recording is None:
         folder = results_folder.resolve()
         recording = folder.parent.parent / "runs" / folder.name
@@ -49,20 +47,19 @@ def write_films(
             todo="name the recording that these results are of (--run DATASET/runs/NAME)",
         )
     images = replace(data, stage=None, accelerometers=None, references=None, skip_unreadable=True)
-    files = [place / f"views.{ending}" for ending in endings]
+    file = place / "views.mp4"
     notes = write_views_film(
         results_folder,
-        files,
+        file,
         images=images.image,
         image_sizes_px=data.image_sizes_px,
         frame_count=frames,
         t_s=data.t_s,
         stage=stage,
     )
-    yield from _lines(files, notes)
+    yield from _lines(file, notes)
 
 
-def _lines(files: Sequence[Path], notes: Sequence[str]) -> Iterator[str]:
-    for file in files:
-        yield f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)"
+def _lines(file: Path, notes: Sequence[str]) -> Iterator[str]:
+    yield f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)"
     yield from (f"  {note}" for note in notes)

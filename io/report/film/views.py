@@ -16,7 +16,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.report.film.files import Progress, write_film
+from telerig.io.report.film.mp4 import Progress, write_film
 from telerig.io.report.film.path import font
 from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
 from telerig.io.results.manifest import reading
@@ -28,7 +28,6 @@ Colour = tuple[int, int, int]
 MOST_FRAMES = 1_000
 TAIL_FRAMES = 24
 WIDTH_PX = 640
-_GIF_WIDTH_PX = 800
 _RATE_HZ = 25.0
 _STRIP_PX, _GAP_PX, _NAME_PX = 30, 4, 13
 _ALONE: Colour = (250, 190, 20)
@@ -61,7 +60,7 @@ class ViewFrame:
 
 def write_views_film(
     results_folder: Path,
-    files: Sequence[Path],
+    file: Path,
     *,
     images: Images,
     image_sizes_px: Mapping[str, tuple[int, int]],
@@ -73,7 +72,7 @@ def write_views_film(
 
     images : gives the grey image (H, W) of a camera and frame, or None; it is called from several
     processes. t_s : (frame_count,). Of a run of more than 1,000 frames every k-th is shown. Raises
-    InputError for a folder without detections.csv, and files that cannot be written.
+    InputError for a folder without detections.csv, and a file that cannot be written.
     """
     cameras = tuple(image_sizes_px)
     folder = Path(results_folder)
@@ -84,10 +83,7 @@ def write_views_film(
     shades = {name: _shades(images, name, frame_count) for name in cameras}
     draw = partial(draw_views, images, dict(image_sizes_px), shades)
     pictures = ordered_map(draw, frames, quick_workers(len(frames)))
-    write_film(
-        pictures, len(frames), files, rate_hz=_RATE_HZ, what="both views", stage=stage,
-        gif_width_px=_GIF_WIDTH_PX, palette=_palette(),
-    )  # fmt: skip
+    write_film(pictures, len(frames), file, rate_hz=_RATE_HZ, what="both views", stage=stage)
     return (f"both views: every {step}. of {frame_count} frames is shown",) if step > 1 else ()
 
 
@@ -213,17 +209,6 @@ def _view(
     strip = Image.new("RGB", (width, _STRIP_PX), PAPER)
     ImageDraw.Draw(strip).text((8, _STRIP_PX / 2), camera, INK, font(_NAME_PX), "lm")
     return np.concatenate([np.array(strip), picture])
-
-
-def _palette() -> list[Colour]:
-    """Return colours for a GIF: greys, and the lines' colours mixed with grey, black and white."""
-    greys = [(g, g, g) for g in np.linspace(0, 255, 140).astype(int).tolist()]
-    mixed = [
-        tuple(round(share * part + (1 - share) * ground) for part in colour)
-        for colour in (*_COLOURS, _ALONE)
-        for share, ground in ((1.0, 0), (0.5, 0), (0.4, 230), (0.7, 230))
-    ]
-    return [*greys, *((c[0], c[1], c[2]) for c in mixed)]
 
 
 def _shades(images: Images, camera: str, frame_count: int) -> tuple[float, float]:

@@ -233,6 +233,6 @@ def test_the_command_for_three_cameras(tmp_path: Path) -> None:
         assert words in page
     with np.load(place / "uncertainty.npz") as found:
         assert np.isfinite(found["calibration_mm2"]).all()
-    for to in ("halcon", "opencv", "soloff"):
+    for to in ("halcon", "opencv"):
         exported = asked("export", str(folder), "--to", to, "--out", str(tmp_path / to))
         assert exported.exit_code == 0, exported.output

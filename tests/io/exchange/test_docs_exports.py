@@ -100,13 +100,13 @@ def blocks(kind: str) -> list[str]:
 
 def test_commands_of_the_page(place: Path) -> None:
     lines = [line for block in blocks("sh") for line in block.splitlines()]
-    assert len(lines) == 10
+    assert len(lines) == 9
     said = {line: command(line) for line in lines}
     exports = place / "data" / "results" / "export"
     assert sorted(p.name for p in exports.iterdir()) == (
-        ["halcon", "opencv.yml", "rise", "rise.nc", "soloff"]
+        ["halcon", "opencv.yml", "rise", "rise.nc"]
     )
-    assert "20 terms, RMS" in said[lines[2]] and "verdict: UNRESOLVED" in said[lines[3]]
+    assert "verdict: UNRESOLVED" in said[lines[2]]
     assert loadmat("rise.mat")["trajectories"]["x_mm"][0, 0].shape == (4, 1)
     for program in ("openlpt", "opencv", "openptv"):
         calibration = telerig.load_calibration(f"from-{program}")
@@ -126,10 +126,10 @@ def test_code_of_the_page(place: Path) -> None:
     pytest.importorskip("xarray")
     names: dict[str, object] = {}
     code = blocks("python")
-    assert len(code) == 5
+    assert len(code) == 4
     for block in code:
         exec(compile(block, str(PAGE), "exec"), names)
-    assert Path("soloff_right.csv").is_file() and Path("rise.nc").is_file()
+    assert Path("cameras-in-air.yml").is_file() and Path("rise.nc").is_file()
 
 
 @pytest.mark.parametrize("to", ["hdf5", "trackpy"])
@@ -153,12 +153,10 @@ def test_default_run_is_the_only_one(place: Path, to: str) -> None:
         ("telerig export data --to halcon --calibration nowhere.json", "no such calibration"),
         ("telerig export data --to halcon --volume 1,2", "six numbers"),
         ("telerig export data --to halcon --volume 90,95,0,1,0,1", "inside the images"),
-        ("telerig export data/runs/rise --to soloff", "neither a dataset nor a folder of results"),
-        ("telerig export data --to opencv --full-cubic", "the formats that have it: soloff"),
-        ("telerig export data --to mat --first-pixel 1", "the formats that have it: soloff"),
+        ("telerig export data/runs/rise --to opencv", "neither a dataset nor a folder of results"),
         ("telerig export data --to halcon --run rise", "have it: hdf5, netcdf, mat, vtk, trackpy"),
-        ("telerig export data --to vtk --volume 0,1,0,1,0,1", "have it: halcon, opencv, soloff"),
-        ("telerig export data --to netcdf --calibration x", "opencv, soloff, hdf5, mat"),
+        ("telerig export data --to vtk --volume 0,1,0,1,0,1", "have it: halcon, opencv"),
+        ("telerig export data --to netcdf --calibration x", "opencv, hdf5, mat"),
         ("telerig import opencv extrinsics.yml --out x", "no matrix with one of the names M1"),
         ("telerig import openptv cam1.tif.ori --out x", "sensor is not known"),
         ("telerig import openptv cam1.tif.ori --image-size 3 --pixel-mm 1,1 --out x", "two num"),

@@ -1,8 +1,7 @@
-"""Cameras as matrices and polynomials against OpenCV and independent evaluations."""
+"""Cameras as matrices against OpenCV."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,6 @@ from telerig.errors import InputError
 from telerig.io.exchange.export import volume
 from telerig.io.exchange.export.halcon import halcon_cameras
 from telerig.io.exchange.export.opencv import camera_matrices, write_opencv
-from telerig.io.exchange.export.soloff import POWERS, fit_soloff, write_soloff
 from telerig.io.exchange.export.volume import seen_points, volume_of, working_volume
 from telerig.rig.triangulation import triangulate
 
@@ -111,72 +109,6 @@ def test_opencv_undistorts_and_triangulates_what_telerig_projects(tmp_path: Path
     np.testing.assert_allclose((found[:3] / found[3]).T, points, rtol=0, atol=1e-6)
     ours = triangulate(cameras, [c.project(points) for c in cameras], 0.1, "ml").points_mm
     np.testing.assert_allclose((found[:3] / found[3]).T, ours, rtol=0, atol=1e-6)
-
-
-# ------------------------------------------------------------------------------------- Soloff
-
-
-def read_soloff(path: Path) -> Array:
-    """(19, 2) or (20, 2) coefficients, after a check of the exponents."""
-    table = np.loadtxt(path, delimiter=",", comments=("#", "i"), ndmin=2)
-    np.testing.assert_array_equal(table[:, :3], [*POWERS, (0, 0, 3)][: len(table)])
-    return np.asarray(table[:, 3:])
-
-
-def soloff_by_hand(a: Array, x: Array, y: Array, z: Array) -> Array:
-    """Equation 8 of the paper, term by term."""
-    return np.asarray(
-        a[0] + a[1] * x + a[2] * y + a[3] * z + a[4] * x**2 + a[5] * x * y + a[6] * y**2
-        + a[7] * x * z + a[8] * y * z + a[9] * z**2 + a[10] * x**3 + a[11] * x**2 * y
-        + a[12] * x * y**2 + a[13] * y**3 + a[14] * x**2 * z + a[15] * x * y * z
-        + a[16] * y**2 * z + a[17] * x * z**2 + a[18] * y * z**2
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("parameters", [{}, {"k1": 0.004}, {"kappa_per_mm": 1 / 400}])
-def test_soloff_error_in_the_header_is_that_of_an_independent_evaluation(
-    parameters: dict[str, float], tmp_path: Path
-) -> None:
-    cameras = pair(**parameters)
-    points = np.random.default_rng(5).uniform(-25, 25, (40000, 3))
-    for camera in cameras:
-        uv = camera.project(points)
-        points = points[np.all((uv > 0) & (uv < np.array(camera.image_size_px) - 1), axis=1)]
-    inside = working_volume(cameras)
-    points = points[np.all((points > inside.lower_mm) & (points < inside.upper_mm), axis=1)]
-    for camera, fit in zip(cameras, fit_soloff(cameras)):
-        path = tmp_path / f"{camera.name}.csv"
-        write_soloff(fit, path)
-        text = path.read_text()
-        rms, largest = (
-            float(v)
-            for v in re.search(r"rms_px = (\S+), max_px = (\S+) at", text).groups()  # type: ignore[union-attr]
-        )
-        a = np.array([[float(v) for v in row.split(",")[3:]] for row in text.splitlines()[-19:]])
-        pixels = np.stack([soloff_by_hand(a[:, i], *points.T) for i in (0, 1)], -1)
-        distance = np.linalg.norm(pixels - camera.project(points), axis=1)
-        if not parameters:
-            assert largest < 1e-9 and distance.max() < 1e-9
-        else:
-            assert np.sqrt(np.mean(distance**2)) == pytest.approx(rms, rel=0.25)
-            assert distance.max() < 1.1 * largest
-        np.testing.assert_array_equal(read_soloff(path), a)
-        write_soloff(fit, path, first_pixel=1.0)
-        np.testing.assert_allclose(read_soloff(path)[0] - a[0], 1, atol=1e-12)
-
-
-def test_the_missing_cubic_term_is_what_a_camera_along_x_lacks(tmp_path: Path) -> None:
-    """Distortion k1 is a cubic; the 19 terms have no z^3, and z lies in the second image."""
-    cameras = pair(SQUARE_ON, k1=0.004)
-    nineteen, twenty = fit_soloff(cameras), fit_soloff(cameras, full_cubic=True)
-    assert nineteen[0].misfit.max_px < 1e-9 and 0.05 < nineteen[1].misfit.max_px < 0.2
-    assert max(fit.misfit.max_px for fit in twenty) < 1e-9
-    write_soloff(twenty[1], tmp_path / "right.csv")
-    points = random_points(cameras)
-    coefficients = read_soloff(tmp_path / "right.csv")
-    pixels = np.stack([soloff_by_hand(a, *points.T) for a in coefficients.T], -1)
-    pixels += np.outer(points[:, 2] ** 3, coefficients[19])
-    np.testing.assert_allclose(pixels, cameras[1].project(points), rtol=0, atol=1e-9)
 
 
 # ------------------------------------------------------------------------------------- volume

@@ -15,11 +15,10 @@ from filmed_run import (
     decoded,
     write_run,
 )
-from PIL import Image
 
 from telerig.errors import InputError
 from telerig.io.report.film import views
-from telerig.io.report.film.files import write_film
+from telerig.io.report.film.mp4 import write_film
 from telerig.io.report.film.views import (
     draw_views,
     outlines_px,
@@ -40,17 +39,14 @@ def _few(count: int = 3) -> Iterator[np.ndarray]:
         yield np.full((40, 60, 3), 60 * k, np.uint8)
 
 
-def test_without_pyav_the_error_names_the_extra_and_gifs_go_on(
+def test_without_pyav_the_error_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError) as caught:
-        write_film(_few(), 3, [tmp_path / "a.mp4"])
+        write_film(_few(), 3, tmp_path / "a.mp4")
     assert "pip install 'telerig[video]'" in str(caught.value)
-    greys = [(0, 0, 0), (60, 60, 60), (120, 120, 120)]
-    write_film(_few(), 3, [tmp_path / "a.gif"], palette=greys)
-    with Image.open(tmp_path / "a.gif") as gif:
-        assert gif.n_frames == 3
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_broken_off_film_leaves_the_old_one(tmp_path: Path) -> None:
@@ -58,15 +54,11 @@ def test_a_broken_off_film_leaves_the_old_one(tmp_path: Path) -> None:
         yield from _few(2)
         raise KeyboardInterrupt
 
-    files = [tmp_path / "a.mp4", tmp_path / "a.gif"]
-    for file in files:
-        file.write_text("old")
+    file = tmp_path / "a.mp4"
+    file.write_text("old")
     with pytest.raises(KeyboardInterrupt):
-        write_film(fails(), 9, files)
-    assert sorted(tmp_path.iterdir()) == sorted(files)
-    assert {f.read_text() for f in files} == {"old"}
-    with pytest.raises(InputError, match=r"\.mp4 or \.gif"):
-        write_film(_few(), 3, [tmp_path / "a.mkv"])
+        write_film(fails(), 9, file)
+    assert list(tmp_path.iterdir()) == [file] and file.read_text() == "old"
 
 
 def _image(camera: str, frame: int) -> np.ndarray | None:
@@ -79,19 +71,15 @@ SIZES = {"left": SIZE_PX, "right": SIZE_PX}
 
 
 def test_both_views_film(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = [tmp_path / "v.mp4", tmp_path / "v.gif"]
-    write_views_film(run, files, images=_image, image_sizes_px=SIZES, frame_count=FRAMES)
-    frames = decoded(files[0])
+    file = tmp_path / "v.mp4"
+    write_views_film(run, file, images=_image, image_sizes_px=SIZES, frame_count=FRAMES)
+    frames = decoded(file)
     assert len(frames) == FRAMES
     assert frames[0].shape[1] >= 2 * SIZE_PX[0] and frames[0].shape[0] >= SIZE_PX[1]
-    with Image.open(files[1]) as gif:
-        assert gif.n_frames == FRAMES and gif.info["loop"] == 0
     monkeypatch.setattr(views, "MOST_FRAMES", 10)
-    notes = write_views_film(run, files[1:], images=_image, image_sizes_px=SIZES,
-                             frame_count=FRAMES)  # fmt: skip
+    notes = write_views_film(run, file, images=_image, image_sizes_px=SIZES, frame_count=FRAMES)
     assert notes == (f"both views: every 3. of {FRAMES} frames is shown",)
-    with Image.open(files[1]) as gif:
-        assert gif.n_frames == 8
+    assert len(decoded(file)) == 8
 
 
 def test_outlines_and_tails_are_drawn_where_they_were_found(run: Path) -> None:

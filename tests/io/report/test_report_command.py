@@ -15,8 +15,7 @@ import pytest
 import tifffile
 from browser_check import BROWSER, look, print_pdf
 from calibration_folder import write_calibration_folder as write_calibration
-from filmed_run import FRAMES, SIZE_PX, write_run
-from PIL import Image
+from filmed_run import FRAMES, SIZE_PX, decoded, write_run
 from places import ROOT
 from typer.testing import CliRunner
 
@@ -159,17 +158,16 @@ def filmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_films_of_a_run_as_gif(filmed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    said = command(filmed, "--film", code=2)
-    assert "pip install 'telerig[video]'" in said and "--format gif" in said
+def test_films_of_a_run(filmed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "av", None)
+        assert "pip install 'telerig[video]'" in command(filmed, "--film", code=2)
     monkeypatch.setattr("telerig.io.report.film.path.STEP_DEG", 30)
-    said = command(filmed, "--film", "--format", "gif")
+    said = command(filmed, "--film")
     for name, count in (("path", 12), ("views", FRAMES)):
-        assert f"written: {filmed / 'film' / name}.gif (" in said
-        with Image.open(filmed / "film" / f"{name}.gif") as gif:
-            assert gif.n_frames == count and gif.info["loop"] == 0
-    assert sorted(p.name for p in (filmed / "film").iterdir()) == ["path.gif", "views.gif"]
+        assert f"written: {filmed / 'film' / name}.mp4 (" in said
+        assert len(decoded(filmed / "film" / f"{name}.mp4")) == count
+    assert sorted(p.name for p in (filmed / "film").iterdir()) == ["path.mp4", "views.mp4"]
 
 
 def test_without_the_recording_only_the_path_is_filmed(
@@ -177,13 +175,13 @@ def test_without_the_recording_only_the_path_is_filmed(
 ) -> None:
     monkeypatch.setattr("telerig.io.report.film.path.STEP_DEG", 60)
     shutil.move(tmp_path / "runs" / "rise", tmp_path / "elsewhere")
-    said = command(filmed, "--film", "--format", "gif")
+    said = command(filmed, "--film")
     assert "both views is left out" in said and "--run" in said
-    said = command(filmed, "--film", "--format", "gif", "--run", tmp_path / "elsewhere")
-    assert "views.gif (" in said
+    said = command(filmed, "--film", "--run", tmp_path / "elsewhere")
+    assert "views.mp4 (" in said
     for camera in ("left", "right"):
         (tmp_path / "elsewhere" / camera / f"{FRAMES - 1:03d}.tif").unlink()
-    said = command(filmed, "--film", "--format", "gif", "--run", tmp_path / "elsewhere", code=2)
+    said = command(filmed, "--film", "--run", tmp_path / "elsewhere", code=2)
     assert f"has {FRAMES - 1} frames, but {FRAMES} were tracked" in said
 
 

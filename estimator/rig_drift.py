@@ -340,10 +340,10 @@ _SINGULAR = 1e-10
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """Prior standard deviations of how far the second camera has moved since the calibration.
+    """Prior standard deviations of how far a camera has moved since the calibration.
 
-    The movement is that against the first camera, along and about each axis of the rig frame. The
-    defaults are wide. Raises InputError for values that are not positive.
+    The movement is that against the others, along and about each axis of the camera. The defaults
+    are wide. Raises InputError for values that are not positive.
     """
 
     rotation_rad: float = 5e-3
@@ -360,9 +360,9 @@ class DriftPrior:
 
 @dataclass(frozen=True)
 class RigChange:
-    """The movement of the second of two cameras relative to the first since the calibration.
+    """The movement of a camera relative to another, the first of a pair, since the calibration.
 
-    camera : name of the second camera.
+    camera : name of the camera.
     tangent, covariance : (6,), (6, 6) movement as a tangent of the pose rig_from_<camera>, with the
         components `POSE_COMPONENTS`; 0 in directions that ray misses do not identify.
     place_mm : (3,) mean position of the bubbles in the rig frame, to which the offset refers.
@@ -371,7 +371,7 @@ class RigChange:
     chance : p-value of the hypothesis that nothing has moved.
     pairs : number of pairs used.
     refined : pose rig_from_<camera> that calibration and run give together, or None.
-    against : name of the first camera.
+    against : name of the other camera.
     culprit : of more than two cameras the one that has moved, if all others agree; else "".
     """
 
@@ -501,19 +501,63 @@ def ray_misses(
     return RayMisses(miss, variance, by_rig)
 
 
-def drift_covariance(cameras: Pair, prior: DriftPrior) -> Array:
-    """Return the prior covariance (6, 6) of a movement of the second camera.
+@dataclass(frozen=True)
+class Movement:
+    """A movement of one of C cameras since the calibration, before it is known.
 
-    Directions of movement that cause hardly any ray misses in the volume that both cameras see have
-    the variance 0. The components are `POSE_COMPONENTS` (rad, mm).
+    moved, against : indices of the camera, and of another with which it makes ray misses.
+    by_movement : (6 (C - 1), 6) derivative of the poses of all cameras but the first, which the rig
+        frame moves with, by the movement.
+    covariance : (6, 6) prior covariance of the movement: rotation (rad), translation (mm).
     """
-    _, middle = common_perpendicular(cameras)
+
+    moved: int
+    against: int
+    by_movement: Array
+    covariance: Array
+
+    @staticmethod
+    def of(cameras: Sequence[Camera], moved: int, against: int, prior: DriftPrior) -> Movement:
+        """Return the movement of a camera with the prior of `drift_covariance`."""
+        by = np.zeros((len(cameras) - 1, POSE, POSE))
+        if moved:
+            by[moved - 1] = np.eye(POSE)
+        else:  # the others move in the frame of the first
+            for j, camera in enumerate(cameras[1:]):
+                by[j] = -camera.camera_from_rig.adjoint()
+        covariance = drift_covariance(cameras, prior, moved)
+        return Movement(moved, against, by.reshape(-1, POSE), covariance)
+
+    def pair(self, cameras: Sequence[Camera]) -> Pair:
+        """Return the camera that it is against, and the camera that moves."""
+        return cameras[self.against], cameras[self.moved]
+
+    def applied(self, cameras: Sequence[Camera], tangent: Array) -> tuple[Camera, ...]:
+        """Return the cameras after a movement (6,)."""
+        steps = (self.by_movement @ tangent).reshape(-1, POSE)
+        poses = (moved_pose(c.camera_from_rig.inverse(), t) for c, t in zip(cameras[1:], steps))
+        others = (replace(c, camera_from_rig=p.inverse()) for c, p in zip(cameras[1:], poses))
+        return (cameras[0], *others)
+
+
+def drift_covariance(cameras: Sequence[Camera], prior: DriftPrior, moved: int = 1) -> Array:
+    """Return the prior covariance (6, 6) of a movement of one camera.
+
+    Directions of movement that hardly move any pixels from those of one point, in the volume that
+    the cameras see, have the variance 0. The components are `POSE_COMPONENTS` (rad, mm).
+    """
+    others = [c for k, c in enumerate(cameras) if k != moved]
+    every = (*others, cameras[moved])
+    beside = next((c for c in others if not nearly_parallel((c, every[-1]))), others[0])
+    _, middle = common_perpendicular((beside, every[-1]))
     reach = min(min(c.image_size_px) / c["scale_px_per_mm"] / 2 for c in cameras)
     steps = _GRID * reach * np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), -1).reshape(-1, 3)
-    rows = ray_misses(cameras, ((), ()), middle + steps).by_rig
+    _, by_point = stacked_jacobian(every, middle + steps)
+    by_pose = rig_jacobian(every, ((),) * len(every), middle + steps)[..., -POSE:]
+    rows = by_pose - by_point @ (np.linalg.pinv(by_point) @ by_pose)
     sigma = np.repeat([prior.rotation_rad, prior.translation_mm], 3)
-    _, strength, directions = np.linalg.svd(rows * sigma)
-    seen = directions[: len(strength)][strength > _LEAST_EFFECT * strength[0]]
+    _, strength, directions = np.linalg.svd(rows.reshape(-1, POSE) * sigma, full_matrices=False)
+    seen = directions[strength > _LEAST_EFFECT * strength[0]]
     return np.asarray(sigma[:, None] * (seen.T @ seen) * sigma)
 
 
@@ -602,36 +646,33 @@ def rig_block(calibration: Calibration) -> tuple[Array, Free]:
     """
     if calibration.covariance.size:
         return calibration.covariance, calibration.free
-    return np.zeros((POSE, POSE)), ((), ())
+    count = len(calibration.cameras)
+    return np.zeros((POSE * (count - 1), POSE * (count - 1))), ((),) * count
 
 
-def with_drift(covariance: Array, drift: Array) -> Array:
-    """Return the covariance (P, P) of the cameras' parameters with that of a movement added.
-
-    drift : (6, 6) covariance of a movement of the second camera: rotation (rad), translation (mm).
-    """
-    total = covariance.copy()
-    total[-POSE:, -POSE:] += drift
+def with_drift(covariance: Array, movement: Movement) -> Array:
+    """Return the covariance (P, P) of the cameras' parameters with that of a movement added."""
+    by, total = movement.by_movement, covariance.copy()
+    total[-len(by) :, -len(by) :] += by @ movement.covariance @ by.T
     return total
 
 
 def drift_posterior(
-    rig: Array, rig_covariance: Array, prior_rig: Array, drift: Array
+    rig: Array, rig_covariance: Array, prior_rig: Array, movement: Movement
 ) -> tuple[Array, Array]:
-    """Return the movement (6,) of the second camera, and its covariance (6, 6).
+    """Return the movement (6,) of a camera, and its covariance (6, 6).
 
     A run determines only the sum of the calibration's error and the movement. By Gaussian
     conditioning, the movement is a gain times this sum.
 
     rig, rig_covariance : (P,), (P, P) posterior of the sum, for the cameras' P parameters.
     prior_rig : (P, P) covariance of the calibration.
-    drift : (6, 6) prior covariance of the movement.
     """
-    total = with_drift(prior_rig, drift)
+    total, drift = with_drift(prior_rig, movement), movement.covariance
     unit = _scale(total)
     inverse = np.linalg.pinv(total / unit[:, None] / unit, rcond=1e-13, hermitian=True)
     gain = np.zeros((POSE, len(total)))
-    gain[:, -POSE:] = drift
+    gain[:, -len(movement.by_movement) :] = drift @ movement.by_movement.T
     gain = (gain / unit) @ inverse / unit
     left = drift - gain @ total @ gain.T
     return gain @ rig, left + gain @ rig_covariance @ gain.T
@@ -700,26 +741,38 @@ class PairCollector:
         import pandas as pd
 
         filled = [p for p in self.parts if len(p)]
-        if not filled:
-            return None
-        table = pd.concat(filled, ignore_index=True)
-        changes: dict[tuple[int, int], RigChange] = {}
-        for pair in combinations(range(len(self.calibration.cameras)), 2):
-            two = self.calibration.subset(*pair)
-            if not nearly_parallel((two.cameras[0], two.cameras[1])):
-                found = rig_change(_seen_by(table, two), two)
-                if found is not None:
-                    changes[pair] = found[0]
+        table = pd.concat(filled, ignore_index=True) if filled else None
+        changes = {} if table is None else rig_changes(table, self.calibration)
         if not changes:
             return None
-        moved = {pair for pair, change in changes.items() if change.moved}
-        least = min(changes.values(), key=lambda change: change.chance)
-        culprits = [
-            camera.name
-            for c, camera in enumerate(self.calibration.cameras)
-            if len(moved) > 1 and moved == {pair for pair in changes if c in pair}
-        ]
-        return replace(least, culprit=culprits[0] if len(culprits) == 1 else "")
+        least = min((change for change, _ in changes.values()), key=lambda change: change.chance)
+        alone = culprit(changes, len(self.calibration.cameras))
+        name = "" if alone is None else self.calibration.cameras[alone].name
+        return replace(least, culprit=name)
+
+
+Changes = dict[tuple[int, int], "tuple[RigChange, Noise]"]
+
+
+def rig_changes(
+    tracks: pd.DataFrame, calibration: Calibration, prior: DriftPrior | None = None
+) -> Changes:
+    """Return `rig_change` of each pair of cameras whose lines of sight are not parallel."""
+    changes: Changes = {}
+    for pair in combinations(range(len(calibration.cameras)), 2):
+        two = calibration.subset(*pair)
+        if not nearly_parallel((two.cameras[0], two.cameras[1])):
+            found = rig_change(_seen_by(tracks, two), two, prior)
+            if found is not None:
+                changes[pair] = found
+    return changes
+
+
+def culprit(changes: Changes, cameras: int) -> int | None:
+    """Return which of more than two cameras has moved, if all pairs of it say so and no others."""
+    moved = {pair for pair, (change, _) in changes.items() if change.moved}
+    alone = [c for c in range(cameras) if moved == {pair for pair in changes if c in pair}]
+    return alone[0] if len(moved) > 1 and len(alone) == 1 else None
 
 
 def _seen_by(table: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
@@ -754,9 +807,10 @@ def rig_change(
     table = _without_outliers(tracks.loc[_reliable(tracks)])
     if len(table) < LEAST_PAIRS or table["frame"].nunique() < _LEAST:
         return None
-    drift = drift_covariance(cameras, prior or DriftPrior())
+    movement = Movement.of(cameras, 1, 0, prior or DriftPrior())
+    drift = movement.covariance
     covariance, free = rig_block(calibration)
-    root = covariance_root(with_drift(covariance, drift), singular=1e-12)
+    root = covariance_root(with_drift(covariance, movement), singular=1e-12)
 
     def series_of(part: pd.DataFrame) -> Series:
         misses = ray_misses(cameras, free, _points(part), *_pixels(part, [c.name for c in cameras]))
@@ -776,7 +830,7 @@ def rig_change(
     unit, spreads, noise, used = found
     rig = root @ unit
     (tangent, own), (_, with_shapes) = (
-        drift_posterior(rig, root @ spread @ root.T, covariance, drift) for spread in spreads
+        drift_posterior(rig, root @ spread @ root.T, covariance, movement) for spread in spreads
     )
     change = rig_change_from(cameras, tangent, own, drift, _points(table).mean(0), used)
     t = np.unique(table["t_s"].to_numpy(float))
@@ -855,7 +909,7 @@ def with_change(
         words.append(
             f"Camera {change.camera!r} has moved against {change.against!r} since the "
             f"calibration{unsure}, {change.size_words()}. All positions are wrong because of this "
-            f"movement. Calibrate again{'' if len(names) > 2 else REFINE}."
+            f"movement. Calibrate again{REFINE if len(names) == 2 or change.culprit else ''}."
         )
     if change is not None and change.culprit:
         words.append(f"The other cameras agree, so it is {change.culprit!r} that has moved.")

@@ -75,7 +75,7 @@ RefineRig = Annotated[
     bool,
     typer.Option(
         "--refine-rig",
-        help="Estimate how the cameras have moved against each other since the calibration.",
+        help="Estimate how a camera has moved against the others since the calibration.",
     ),
 ]
 AcceptedFaults = Annotated[

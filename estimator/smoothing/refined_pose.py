@@ -17,13 +17,16 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.rig_drift import (
     LEAST_PAIRS,
+    POSE,
     DriftPrior,
+    Movement,
     RigChange,
-    drift_covariance,
+    culprit,
     drift_posterior,
     moved_pose,
-    rig_change,
     rig_change_from,
+    rig_changes,
+    with_drift,
 )
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
@@ -37,14 +40,14 @@ _LEAST_WANDER_PX = 5e-3
 
 @dataclass(frozen=True)
 class Refinement:
-    """What is needed to estimate a movement of the second camera together with the smoothing.
+    """What is needed to estimate a movement of a camera together with the smoothing.
 
-    drift : (6, 6) prior covariance of the movement.
+    movement : which camera moves, with the prior of its movement.
     tangent : (6,) the movement that the ray misses alone give.
     wander_px, wander_s : RMS and correlation time of the wander of outlines' centres in an image.
     """
 
-    drift: Array
+    movement: Movement
     tangent: Array
     wander_px: float
     wander_s: float
@@ -55,30 +58,43 @@ def refinement_of(
 ) -> Refinement | None:
     """Return what `Refinement` holds for a run; None if it is not wanted.
 
-    Raises InputError for runs of more or fewer than two cameras, or with too few pairs.
+    Of more than two cameras it is the one that the ray misses of all its pairs accuse, or that of
+    the pair which contradicts the calibration most. Raises InputError if several have moved, or
+    with too few pairs.
     """
     if not wanted:
         return None
-    if len(calibration.cameras) > 2:
-        raise InputError(
-            f"the run has {len(calibration.cameras)} cameras, and a rig of two can be refined",
-            where="refine_rig",
-            todo="calibrate again; or track and smooth it with two cameras, [tracking] cameras in "
-            "rig.toml, of which one has moved",
-        )
+    cameras = calibration.cameras
     prior = wanted if isinstance(wanted, DriftPrior) else DriftPrior()
-    found = None if tracks is None else rig_change(tracks, calibration, prior)
-    if found is None:
+    changes = {} if tracks is None else rig_changes(tracks, calibration, prior)
+    if not changes:
         raise InputError(
             f"the rig cannot be refined from fewer than {LEAST_PAIRS} pairs of two cameras",
             where="refine_rig",
             todo="smooth without --refine-rig",
         )
-    change, noise = found
-    scale = float(np.mean([c["scale_px_per_mm"] for c in calibration.cameras]))
-    drift = drift_covariance((calibration.cameras[0], calibration.cameras[1]), prior)
+    alone = culprit(changes, len(cameras))
+    accused = [pair for pair, (change, _) in changes.items() if change.moved]
+    if alone is None and len(accused) > 1:
+        raise InputError(
+            f"{len(accused)} of {len(changes)} pairs of cameras have moved against each other, "
+            "which the movement of one camera does not explain",
+            where="refine_rig",
+            todo="calibrate again, and track the run with that calibration",
+        )
+    pair = min(
+        (p for p in changes if alone is None or alone in p), key=lambda p: changes[p][0].chance
+    )
+    moved = pair[1] if alone is None else alone
+    movement = Movement.of(cameras, moved, sum(pair) - moved, prior)
+    change, noise = changes[pair]
+    tangent = change.tangent
+    if moved != pair[1]:  # the other camera's movement, seen from this one
+        other, own = (c.camera_from_rig for c in movement.pair(cameras))
+        tangent = -(own @ other.inverse()).adjoint() @ tangent
+    scale = float(np.mean([c["scale_px_per_mm"] for c in cameras]))
     wander = noise.wander_mm * scale / np.sqrt(2)
-    return Refinement(drift, change.tangent, wander, noise.wander_s)
+    return Refinement(movement, tangent, wander, noise.wander_s)
 
 
 def for_learning(problem: SmoothingProblem, refinement: Refinement) -> SmoothingProblem:
@@ -86,9 +102,8 @@ def for_learning(problem: SmoothingProblem, refinement: Refinement) -> Smoothing
 
     It is used for learning, which holds the cameras fixed.
     """
-    first, second = problem.cameras
-    pose = moved_pose(second.camera_from_rig.inverse(), refinement.tangent).inverse()
-    return replace(problem, cameras=(first, replace(second, camera_from_rig=pose)))
+    moved = refinement.movement.applied(problem.cameras, refinement.tangent)
+    return replace(problem, cameras=moved)
 
 
 def with_wander(model: ShakeModel, refinement: Refinement) -> ShakeModel:
@@ -100,7 +115,7 @@ def with_wander(model: ShakeModel, refinement: Refinement) -> ShakeModel:
 
 
 def refined_change(solution: Solution, calibration: Calibration) -> RigChange | None:
-    """Return the posterior of the second camera's movement; None if it was not estimated."""
+    """Return the posterior of a camera's movement; None if it was not estimated."""
     problem, found = solution.graph.problem, solution.covariances
     share = problem.calibration
     if share is None or share.drift is None or found is None:
@@ -109,30 +124,30 @@ def refined_change(solution: Solution, calibration: Calibration) -> RigChange | 
     rig = root @ solution.state.calibration
     unaffected = share.covariance - root @ root.T
     covariance = unaffected + root @ found.calibration @ root.T
-    before = share.covariance.copy()
-    before[-6:, -6:] -= share.drift
-    tangent, own = drift_posterior(rig, covariance, before, share.drift)
-    pair = (problem.cameras[0], problem.cameras[1])
+    movement = share.drift
+    before = with_drift(share.covariance, replace(movement, covariance=-movement.covariance))
+    tangent, own = drift_posterior(rig, covariance, before, movement)
     place = np.concatenate([b.guess_mm for b in problem.bubbles]).mean(0)
     positions = np.concatenate([problem.encoder_mm[b.first : b.last + 1] for b in problem.bubbles])
     place = place - positions.mean() * problem.axis
-    pose = moved_pose(calibration.cameras[1].camera_from_rig.inverse(), rig[-6:])
+    at = len(rig) + POSE * (movement.moved - len(problem.cameras))
+    step = rig[at : at + POSE] if movement.moved else tangent
+    moved = calibration.cameras[movement.moved]
     return rig_change_from(
-        pair, tangent, own, share.drift, place, len(problem.observations) // 2, pose
-    )
+        movement.pair(problem.cameras), tangent, own, movement.covariance, place,
+        len(problem.observations) // len(problem.cameras),
+        moved_pose(moved.camera_from_rig.inverse(), step),
+    )  # fmt: skip
 
 
-def change_words(change: RigChange, first: str) -> str:
-    """Return a sentence on the movement, for smoothing.json and the terminal.
-
-    first : name of the first camera.
-    """
+def change_words(change: RigChange) -> str:
+    """Return a sentence on the movement, for smoothing.json and the terminal."""
     if not change.moved:
         return (
-            f"no movement of camera {change.camera!r} against {first!r} since the calibration "
-            f"beyond chance ({change.size_words()})"
+            f"no movement of camera {change.camera!r} against {change.against!r} since the "
+            f"calibration beyond chance ({change.size_words()})"
         )
     return (
-        f"camera {change.camera!r} has moved against {first!r} since the calibration, "
+        f"camera {change.camera!r} has moved against {change.against!r} since the calibration, "
         f"{change.size_words()}; the trajectories are corrected for it"
     )

@@ -133,7 +133,7 @@ def _moved(tracks: Tracks | StoredTracks | Any) -> list[str]:
         f"camera {change['camera']!r} had moved since the calibration with which the run was "
         f"tracked (by {1e3 * change['offset_mm']:+.0f} µm perpendicular to both optical axes), so "
         "all positions are wrong by this movement. Calibrate again and track again"
-        + ("" if len(cameras) > 2 else ", or smooth with --refine-rig")
+        + (", or smooth with --refine-rig" if len(cameras) == 2 or change.get("culprit") else "")
     ]
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
@@ -88,7 +87,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from telerig.estimator.calibration.result.calibration import Calibration
-    from telerig.estimator.rig_drift import DriftPrior
+    from telerig.estimator.rig_drift import DriftPrior, Movement
     from telerig.factors.bubble_motion import LowPasses
     from telerig.io.dataset.run import RunData
     from telerig.io.rig_file.description import RigDescription
@@ -162,9 +161,8 @@ def smooth(
     options : settings of the solver; None for the defaults.
     progress : True to show a progress bar; or a function that is called with the name of the step,
         the share that is done (0 to 1), and 1.
-    refine_rig : whether to estimate also how the cameras have moved relative to each other since
-        the calibration (``summary["rig_change"]``); a `DriftPrior` states how far they may have
-        moved.
+    refine_rig : whether to estimate also how a camera has moved against the others since the
+        calibration (``summary["rig_change"]``); a `DriftPrior` states how far it may have moved.
     accept : codes of faults, like ["SENSOR_AXES"], that are used as they are, where they would be
         refused (the error names its code): SENSOR_UNIT, SENSOR_GRAVITY, SENSOR_AXES, SENSOR_MOUNT,
         SENSOR_SCALE, SENSOR_CLOCK, ENCODER_SIGN, ENCODER_UNIT, ENCODER_STUCK, ENCODER_SCALE,
@@ -197,7 +195,7 @@ def smooth(
         problem, tracked, encoder_sigma, findings = problem_of(
             tracks, calibration, stage=stage, accelerometers=accelerometers,
             references=references, rig=rig, t_s=t_s,
-            drift=None if refinement is None else refinement.drift,
+            drift=None if refinement is None else refinement.movement,
         )  # fmt: skip
         problem, findings = with_sensors_aligned(problem, findings)
         warnings = settled(findings, accepted)
@@ -229,7 +227,7 @@ def smooth(
     ]  # fmt: skip
     change = refined_change(solution, calibration)
     if change is not None:
-        words = change_words(change, problem.cameras[0].name)
+        words = change_words(change)
         summary["rig_change"] = {**change.as_dict(), "words": words}
     described = rig or getattr(stage, "rig", None)
     summary["bodies"] = _shapes_of(tracks)
@@ -518,7 +516,7 @@ def problem_of(
     references: Any = None,
     rig: Any = None,
     t_s: ArrayLike | None = None,
-    drift: Array | None = None,
+    drift: Movement | None = None,
 ) -> tuple[SmoothingProblem, Tracked | None, float, list[Finding]]:
     """Return the smoothing problem of these tables, the tracks that were read, the standard
     deviation of the encoder in mm, and what the checks found.
@@ -527,8 +525,7 @@ def problem_of(
 
     The arguments are those of `smooth`. The tracks are None if none were given.
 
-    drift : (6, 6) prior covariance of a movement of the second camera since the calibration
-        (rotation in rad, translation in mm); None if it has not moved.
+    drift : a movement of a camera since the calibration; None if none has moved.
     """
     files = ("stage", "")
     if hasattr(stage, "frame_count"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from telerig.errors import InputError
 from telerig.factors.bubble_motion import BubbleModel, Triple
 from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
+
+if TYPE_CHECKING:
+    from telerig.estimator.rig_drift import Movement
 
 CARRIAGE = -1
 """This value in place of a camera's index stands for a sensor on the carriage of the stage, or for
@@ -287,14 +290,14 @@ class CalibrationShare:
         that affect no pixel.
     free : names of the free intrinsics of each camera.
     covariance : (P, P) prior covariance.
-    drift : (6, 6) prior covariance, included in it, of a movement of the second camera since the
-        calibration (rad, mm); None if it is assumed not to have moved.
+    drift : a movement of a camera since the calibration, whose prior is included in it; None if
+        none is assumed to have moved.
     """
 
     root: Array
     free: tuple[tuple[str, ...], ...]
     covariance: Array
-    drift: Array | None = None
+    drift: Movement | None = None
 
 
 ConstantFamily = Literal["sensors", "constants", "marks", "clocks"]

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from telerig.estimator.calibration.result.calibration import Calibration
+    from telerig.estimator.rig_drift import Movement
     from telerig.rig.camera import Camera
 
 
@@ -192,7 +193,7 @@ def _marks(
 
 
 def calibration_share(
-    calibration: Calibration, points_mm: Array, sigma_px: float, drift: Array | None = None
+    calibration: Calibration, points_mm: Array, sigma_px: float, drift: Movement | None = None
 ) -> CalibrationShare | None:
     """Return the uncertainty of a calibration that affects the pixels of some points.
 
@@ -201,7 +202,7 @@ def calibration_share(
 
     points_mm : (n, 3) in the rig frame.
     sigma_px : noise of a pixel.
-    drift : (6, 6) prior covariance of a movement of the second camera since the calibration.
+    drift : a movement of a camera since the calibration; None if none has moved.
     """
     from telerig.estimator.rig_drift import rig_block, with_drift
     from telerig.rig.triangulation import rig_jacobian

@@ -18,6 +18,7 @@ from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift import (
     DriftPrior,
+    Movement,
     Noise,
     PairCollector,
     Series,
@@ -274,17 +275,17 @@ def test_noise_covariance_of_two_bubbles() -> None:
 def test_the_share_of_a_movement_is_gaussian_conditioning() -> None:
     """Against the joint posterior of calibration error and movement, worked out at once."""
     rng = np.random.default_rng(10)
-    drift = drift_covariance(rig(), DriftPrior())
+    movement = Movement.of(rig(), 1, 0, DriftPrior())
     root = 1e-3 * rng.standard_normal((8, 8))
     before = root @ root.T
     rows, sigma, seen = rng.standard_normal((5, 8)), 0.02, rng.standard_normal(5) * 0.05
     both = np.zeros((14, 14))
-    both[:8, :8], both[8:, 8:] = before, drift
+    both[:8, :8], both[8:, 8:] = before, movement.covariance
     by_both = np.concatenate([rows, rows[:, 2:]], 1)
     gain = both @ by_both.T @ np.linalg.inv(by_both @ both @ by_both.T + sigma**2 * np.eye(5))
     mean, left = gain @ seen, both - gain @ by_both @ both
     total = np.concatenate([np.eye(8), np.eye(8)[:, 2:]], 1)
-    tangent, covariance = drift_posterior(total @ mean, total @ left @ total.T, before, drift)
+    tangent, covariance = drift_posterior(total @ mean, total @ left @ total.T, before, movement)
     assert np.allclose(tangent, mean[8:], atol=1e-9)
     assert np.allclose(covariance, left[8:, 8:], atol=1e-11)
 
@@ -310,38 +311,61 @@ def test_words_say_it_once() -> None:
     assert off["calibration_problem"] and "+7.00 px" in off["words"][-1]
 
 
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_of_three_cameras_the_one_that_moved_is_named(which: int) -> None:
-    config = run_preset("three").calibration
-    cameras = tuple(true_cameras(config).values())
+def run_of_three(which: int, frames: int) -> tuple[Calibration, Array, pd.DataFrame]:
+    """Return a calibration, the true points and the tracks of a run in which one camera is 0.08 mm
+    higher along y than calibrated."""
+    cameras = tuple(true_cameras(run_preset("three").calibration).values())
     names = tuple(f"{c.name}.{n.split('.')[1]}" for c in cameras[1:] for n in NAMES)
     covariance = np.diag(np.tile(np.repeat(np.square((2e-5, 5e-4)), 3), 2))
     known = Calibration(
         cameras, np.zeros(0, np.int64), np.zeros((0, 3)), {}, covariance, names, ((), (), ())
     )
     true = list(cameras)
-    up = np.array([0.0, 0.0, 0.0, 0.0, 0.08, 0.0])  # 0.08 mm along y
+    up = np.array([0.0, 0.0, 0.0, 0.0, 0.08, 0.0])
     pose = moved_pose(cameras[which].camera_from_rig.inverse(), up)
     true[which] = replace(cameras[which], camera_from_rig=pose.inverse())
-    rng, t = np.random.default_rng(which), np.arange(300) / 100.0
+    rng, t = np.random.default_rng(which), np.arange(frames) / 100.0
     points = np.stack([8 * np.cos(11 * t), 5 * (t - t.mean()), 8 * np.sin(11 * t)], -1)
-    uv = [c.project(points) + 0.1 * rng.standard_normal((300, 2)) for c in true]
+    uv = [c.project(points) + 0.1 * rng.standard_normal((frames, 2)) for c in true]
     uv[0][::3] = np.nan  # the first camera misses every third frame
     found = triangulate_views(cameras, uv, 0.1)
-    table = pd.DataFrame({"frame": np.arange(300), "particle": 0, "t_s": t})
+    table = pd.DataFrame({"frame": np.arange(frames), "particle": 0, "t_s": t})
     table[["x_mm", "y_mm", "z_mm"]] = found.points_mm
     table["ray_miss_mm"] = np.sqrt(np.nanmean(found.ray_miss_mm**2, axis=1))
     for camera, pixels in zip(cameras, uv):
         table[[f"{camera.name}_u_px", f"{camera.name}_v_px"]] = pixels
         table[[f"{camera.name}_d{x}_px" for x in "uv"]] = 0.0
-        table[[f"{camera.name}_s{x}_px2" for x in ("uu", "uv", "vv")]] = [0.01, 0.0, 0.01]
+        spread = np.array([0.01, 0.0, 0.01]) + 0.0 * pixels[:, :1]
+        table[[f"{camera.name}_s{x}_px2" for x in ("uu", "uv", "vv")]] = spread
+    return known, points, table
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_of_three_cameras_the_one_that_moved_is_named(which: int) -> None:
+    known, _, table = run_of_three(which, 300)
     pairs = PairCollector(known)
     pairs.add(table)
     change = pairs.found()
     assert change is not None and change.moved
-    assert change.culprit == cameras[which].name
+    assert change.culprit == known.cameras[which].name
     assert abs(change.values[0]) == pytest.approx(0.08, abs=4 * change.sigmas[0])
-    assert cameras[which].name in {change.camera, change.against}
+    assert known.cameras[which].name in {change.camera, change.against}
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_of_three_cameras_the_one_that_moved_is_refined(which: int) -> None:
+    known, points, table = run_of_three(which, 120)
+    model = ShakeModel(modes=(RigMode(SHAKE_HZ, 0.03, (1e-3, 1e-3, 1e-3)),))
+    refined = telerig.smooth(table, known, model=model, refine_rig=True)
+    change = refined.summary["rig_change"]
+    assert change["moved"] and change["camera"] == known.cameras[which].name
+    assert change["tangent"][4] == pytest.approx(0.08, abs=0.006)
+    found = refined.trajectories[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    if which == 0:  # the rig frame is that of the first camera, where it is now
+        points = points - known.cameras[0].camera_from_rig.rotation.T @ [0.0, 0.08, 0.0]
+    assert np.abs((found - points).mean(0)).max() < 0.006
+    before = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    assert np.abs((before - points).mean(0)).max() > 0.015
 
 
 def test_a_long_run_is_collected_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:

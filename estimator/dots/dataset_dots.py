@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,14 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     shape_from_axes,
 )
 from telerig.estimator.dots.fit.candidates import Polarity
-from telerig.estimator.dots.grid.numbering import Numbering, check_handedness, number_dots
+from telerig.estimator.dots.grid.agreement import PossibleNumbers, decided_by_pair
+from telerig.estimator.dots.grid.numbering import (
+    OUTSIDE,
+    Numbering,
+    check_handedness,
+    is_likely,
+    number_dots,
+)
 from telerig.estimator.dots.grid.seen_target import SeenTarget, contradiction, seen_target
 from telerig.estimator.dots.locate import REJECTED, DotMeasurement, measure_dots
 from telerig.io.dataset.dataset import Dataset, View
@@ -58,30 +66,34 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     ``image`` is no grey image.
     """
     measured = measure_dots(image, polarity=target.polarity)
-    return _clearly_numbered(image, measured, target).table
+    found = _numbered(image, measured, target)
+    if found.numbering.ambiguous:
+        raise _ambiguous(found, measured, target)
+    return found.table
 
 
-def _clearly_numbered(
+def _numbered(
     image: NDArray[Any], measured: DotMeasurement, target: Target, min_diameter_px: float = 5.0
 ) -> TargetDetection:
-    """Number the target's dots that were measured in an image.
+    """Number the target's dots that were measured in an image, see `numbered`.
 
     Raises DetectionError, which says what of the target in rig.toml does not fit the image, if they
-    cannot be numbered or not in one way only.
+    cannot be numbered.
 
     min_diameter_px : as for `measure_dots`.
     """
     try:
-        found = numbered(measured, target)
+        return numbered(measured, target)
     except DetectionError as error:
         words = _other_polarity(image, measured, target, min_diameter_px)
-        words = words or _described_otherwise(measured, target, image.shape)
+        words = words or _described_otherwise(measured, target)
         raise DetectionError(error.what, todo=words or error.todo) from error
-    if found.numbering.ambiguous:
-        ambiguous = ambiguous_numbering(found.numbering, target)
-        words = _described_otherwise(measured, target, image.shape)
-        raise DetectionError(ambiguous.what, todo=words or ambiguous.todo)
-    return found
+
+
+def _ambiguous(found: TargetDetection, measured: DotMeasurement, target: Target) -> DetectionError:
+    """Return the error for a numbering that is not unique."""
+    error = ambiguous_numbering(found.numbering, target)
+    return DetectionError(error.what, todo=_described_otherwise(measured, target) or error.todo)
 
 
 def _other_polarity(
@@ -93,7 +105,7 @@ def _other_polarity(
     try:
         numbered(inverse, target)
     except DetectionError:
-        if _grid(measured, image.shape) or not _grid(inverse, image.shape):
+        if _grid(measured) or not _grid(inverse):
             return ""
     stated, seen = (name.replace("_", " ") for name in (target.polarity, other))
     return (
@@ -102,18 +114,16 @@ def _other_polarity(
     )
 
 
-def _grid(measured: DotMeasurement, image_shape: tuple[int, ...]) -> SeenTarget | None:
+def _grid(measured: DotMeasurement) -> SeenTarget | None:
     """Return the grid that an image shows, None if it shows none."""
     try:
-        return seen_target(measured.dots, image_shape)
+        return seen_target(measured.dots, measured.image_shape)
     except DetectionError:
         return None
 
 
-def _described_otherwise(
-    measured: DotMeasurement, target: Target, image_shape: tuple[int, ...]
-) -> str:
-    seen = _grid(measured, image_shape) if target.layout == "grid" else None
+def _described_otherwise(measured: DotMeasurement, target: Target) -> str:
+    seen = _grid(measured) if target.layout == "grid" else None
     return "" if seen is None else contradiction(seen, target)
 
 
@@ -132,7 +142,7 @@ def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
             "scale_px_per_mm of the camera in rig.toml; a dot needs a diameter of 5 px, and of a "
             "third of the one that rig.toml states",
         )
-    numbering = number_dots(measured.dots, target)
+    numbering = number_dots(measured.dots, target, measured.image_shape)
     rows = measured.dots.iloc[numbering.table["index"].to_numpy()][MEASURED]
     unplaced = numbering.unplaced
     return TargetDetection(
@@ -145,9 +155,10 @@ def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
 def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
     """Return the error that the caller may raise for a numbering that is not unique."""
     found, wanted = len(numbering.marks_found), len(target.marks)
-    hands = set(numbering.equivalent_handedness.tolist())
+    likely = is_likely(numbering.score)
+    hands = set(numbering.equivalent_handedness[likely].tolist())
     mirrored = "; some of these need the image to be mirrored" if len(hands) > 1 else ""
-    count = len(numbering.equivalents)
+    count = np.count_nonzero(likely)
     return DetectionError(
         f"the {len(numbering.table)} dots can be numbered in {count} ways that fit the image about "
         f"equally well{mirrored}; {found} of the target's {wanted} marks were found",
@@ -229,6 +240,7 @@ class ImageDots:
     handedness : -1 if the image shows the target mirrored, +1 if not, 0 if no target was found.
     failure : why the image was left out, or "".
     overlay : JPEG data of the image with the dots and rejected candidates drawn, or empty.
+    found : the dots and all their possible numberings; None if they cannot be numbered.
     """
 
     view: str
@@ -238,6 +250,7 @@ class ImageDots:
     handedness: int
     failure: str = ""
     overlay: bytes = b""
+    found: TargetDetection | None = None
 
 
 @dataclass(frozen=True)
@@ -305,8 +318,10 @@ def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = F
     """
     image = dataset.image(view, camera)
     found = _numbered_image(dataset, image, view, camera)
-    if not overlay:
-        return found
+    return _with_overlay(found, image) if overlay else found
+
+
+def _with_overlay(found: ImageDots, image: NDArray[Any]) -> ImageDots:
     from telerig.io.report.overlays import overlay_jpeg
 
     drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=OVERLAY_WIDTH_PX)
@@ -320,8 +335,10 @@ def _detect_task(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> Ima
 def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
     """Return the results of all images of a dataset as one.
 
+    What one image leaves open of its numbering is decided by the other camera's, if it can be.
     Raises DetectionError if no image shows the target, or if only some of them are mirrored.
     """
+    found = _decided_by_pairs(dataset, found)
     failures = [i for i in found if i.failure]
     if len(failures) == len(found):
         raise DetectionError(
@@ -336,6 +353,53 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
         Code.LEFT_OUT.found(cameras=i.camera, views=i.view, text=i.failure) for i in failures
     )
     return DatasetDots(_joined(found, "dots"), _joined(found, "rejected"), tuple(found), left_out)
+
+
+def _decided_by_pairs(dataset: Dataset, found: list[ImageDots]) -> list[ImageDots]:
+    """Return the images, those that `decided_by_pair` decides with their numbers."""
+    by_image = {(i.view, i.camera): i for i in found}
+    if dataset.target.symmetry_order() > 1:
+        return found
+    for cameras in combinations(dict.fromkeys(i.camera for i in found), 2):
+        views: dict[str, tuple[PossibleNumbers, PossibleNumbers]] = {}
+        for view in dict.fromkeys(i.view for i in found):
+            first, second = (by_image.get((view, camera)) for camera in cameras)
+            if first and second and first.found and second.found:
+                views[view] = _possible_numbers(first.found), _possible_numbers(second.found)
+        for view, choices in decided_by_pair(views).items():
+            for camera, choice in zip(cameras, choices):
+                image = by_image[view, camera]
+                by_image[view, camera] = _numbered_as(dataset, image, choice)
+    return [by_image[i.view, i.camera] for i in found]
+
+
+def _possible_numbers(found: TargetDetection) -> PossibleNumbers:
+    numbering = found.numbering
+    uv_px = found.table[["u_px", "v_px"]].to_numpy(float)
+    return PossibleNumbers(uv_px, numbering.equivalents, numbering.score)
+
+
+def _numbered_as(dataset: Dataset, image: ImageDots, choice: int) -> ImageDots:
+    """Return an image with one of its possible numberings."""
+    found = image.found
+    assert found is not None
+    before = found.numbering
+    ids, hand = before.equivalents[choice], int(before.equivalent_handedness[choice])
+    row, column = dataset.target.row_column_from_id(ids)
+    table = found.table.assign(dot=ids, row=row, column=column)
+    off = table[ids < 0].assign(reason=OUTSIDE)[REJECTED]
+    only = replace(
+        before, equivalents=ids[None], score=np.zeros(1), ambiguous=False, handedness=hand,
+        equivalent_handedness=np.array([hand]),
+    )  # fmt: skip
+    numbered_so = replace(image, dots=table[ids >= 0].sort_values("dot", ignore_index=True),
+        rejected=pd.concat([found.rejected, off], ignore_index=True), handedness=hand, failure="",
+        found=replace(found, table=table, numbering=only),
+    )  # fmt: skip
+    if not image.overlay:
+        return numbered_so
+    view = next(v for v in dataset.views if v.name == image.view)
+    return _with_overlay(numbered_so, dataset.image(view, image.camera))
 
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
@@ -381,12 +445,22 @@ def _numbered_image(dataset: Dataset, image: NDArray[Any], view: View, camera: s
         where = str(view.image_paths[camera])
         raise InputError(error.what, where=where, todo=error.todo) from error
     try:
-        found = _clearly_numbered(image, measured, target, smallest_px)
+        found = _numbered(image, measured, target, smallest_px)
     except DetectionError as error:
-        words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
-        rejected = rejected_table(measured, slice(None), error.what)
-        return ImageDots(view.name, camera, NO_DOTS, rejected, 0, words)
-    return ImageDots(view.name, camera, found.table, found.rejected, found.numbering.handedness)
+        return _left_out(view, camera, measured, error)
+    if found.numbering.ambiguous:
+        unsure = _ambiguous(found, measured, target)
+        return replace(_left_out(view, camera, measured, unsure), found=found)
+    hand = found.numbering.handedness
+    return ImageDots(view.name, camera, found.table, found.rejected, hand, found=found)
+
+
+def _left_out(
+    view: View, camera: str, measured: DotMeasurement, error: DetectionError
+) -> ImageDots:
+    words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
+    rejected = rejected_table(measured, slice(None), error.what)
+    return ImageDots(view.name, camera, NO_DOTS, rejected, 0, words)
 
 
 def _smallest_px(dataset: Dataset, camera: str) -> float:

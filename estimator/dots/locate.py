@@ -73,12 +73,14 @@ class DotMeasurement:
     rejected : the candidates that are no dots: u_px, v_px, a_px, b_px, angle_rad, reason.
     noise : noise of the grey levels.
     polarity : of the dots.
+    image_shape : (rows, columns).
     """
 
     dots: pd.DataFrame
     rejected: pd.DataFrame
     noise: NoiseModel
     polarity: Polarity
+    image_shape: tuple[int, ...]
 
 
 def locate_dots(
@@ -181,6 +183,7 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
         pd.DataFrame(rejected, columns=REJECTED),
         noise,
         found.polarity,
+        grey.shape,
     )
 
 

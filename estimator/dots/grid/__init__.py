@@ -1,5 +1,5 @@
 """The numbering of dots: which dot of the target is which dot of the image.
 
 In: unordered dots. Out: row and column of each. Read ``numbering`` first; ``lattice`` finds the
-grid, ``point_layout`` serves targets without a grid.
+grid, ``arrangement`` serves targets without one, and ``agreement`` compares two cameras.
 """

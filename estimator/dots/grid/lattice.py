@@ -416,3 +416,24 @@ def _lattice(growth: _Growth, image_from_flat: Array, shapes_px2: Array) -> Latt
     return Lattice(
         index, places - places.min(0), basis_px, shape, unplaced, tuple(reasons.tolist())
     )
+
+
+def next_places(
+    lattice: Lattice, points_px: Array, image_shape: tuple[int, ...], radius_px: float
+) -> tuple[Ints, Ints]:
+    """Return the places (K, 2) without a dot next to dots: those in view, and the others.
+
+    A place is in view if the image would show a whole dot there.
+
+    points_px : (N, 2) centres of all dots of the image. radius_px : of a dot.
+    """
+    steps = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+    at = (lattice.places[:, None] + steps).reshape(-1, 2)
+    px = (points_px[lattice.index, None] + steps @ lattice.basis_px).reshape(-1, 2)
+    margin, size = radius_px + 2.0, np.array(image_shape[::-1])
+    inside = np.all((px > margin) & (px < size - 1 - margin), axis=1)
+    taken = {*map(tuple, lattice.places.tolist())}
+    out = {*map(tuple, at[~inside].tolist())} - taken
+    seen = {*map(tuple, at[inside].tolist())} - taken - out
+    in_view, out_of_view = (np.array(sorted(s), np.int64).reshape(-1, 2) for s in (seen, out))
+    return in_view, out_of_view

@@ -30,22 +30,27 @@ from telerig.estimator.dots.grid.lattice import (
     Lattice,
     frequent_cell,
     grow_lattice,
+    next_places,
     shape_matrix,
 )
 from telerig.rig.target import Target
 from telerig.statistics import robust_sd
 
-LOG_MISSED_MARK = -4.0
-"""Log-probability that a mark is seen as a plain dot."""
-LOG_FALSE_MARK = -7.5
-"""Log-probability that a plain dot is seen as a mark."""
-LOG_UNSEEN_MARK = -2.0
-"""Log-likelihood ratio of a mark at a place where the image shows no dot."""
-LOG_FILLED_GAP = -5.0
-"""Log-likelihood ratio of a mark of the style "missing" at a place where there is a dot (dirt)."""
-LOG_UNSURE_GAP = -0.7
-"""Log-likelihood ratio of a mark of the style "missing" at an empty place that has too few dots
-round it for a clear decision."""
+MARK_MISSED = 0.02
+"""Probability that a mark is seen as a plain dot: its ring is blurred, or dirt fills it."""
+MARK_FALSE = 0.0025
+"""Probability that a plain dot is seen as a mark: one in four plates of a hundred dots has one."""
+DOT_LOST = 0.1
+"""Probability that a dot in view is not found: dirt, glare, a scratch."""
+DOT_FALSE = 0.0025
+"""Probability that something is seen as a dot at a place of the grid where the target has none."""
+PART_HIDDEN = 0.001
+"""Probability that something hides a part of the target that is in view: a shadow, a vignette. It
+bounds what dots that are missing side by side can prove."""
+WRONG_ODDS = 0.005
+"""A numbering is unique if each other one has less than this probability, relative to it."""
+POSSIBLE_ODDS = 1e-6
+"""Numberings with less than this probability, relative to the best one, are not listed."""
 
 
 @dataclass(frozen=True)
@@ -53,22 +58,24 @@ class MarkEvidence:
     """What an image shows about where the marks are on the lattice of its dots.
 
     gain : (H, W) log-likelihood ratio of a mark to a plain dot at each place; that of the place (i,
-        j) is gain[i + 1, j + 1].
+        j) is gain[i + 1, j + 1]. It is 0 where the image shows nothing.
     seen : (k, 2) places that look like marks.
+    empty : (E, 2) places next to dots that are in view and have no dot.
     """
 
     gain: Array
     seen: Ints
+    empty: Ints
 
     def at(self, places: Ints) -> Array:
         """Return the log-likelihood ratios (...) of a mark to a plain dot at places (..., 2).
 
-        Outside the lattice it is `LOG_UNSEEN_MARK`.
+        Outside the lattice it is 0: a mark that is not in view is neither for nor against a place.
         """
         shifted = places + 1
         inside = np.all((shifted >= 0) & (shifted < self.gain.shape), axis=-1)
         clipped = np.clip(shifted, 0, np.array(self.gain.shape) - 1)
-        return np.where(inside, self.gain[clipped[..., 0], clipped[..., 1]], LOG_UNSEEN_MARK)
+        return np.where(inside, self.gain[clipped[..., 0], clipped[..., 1]], 0.0)
 
     def is_seen(self, places: Ints) -> Bools:
         """Return whether each of the places (..., 2) looks like a mark, as booleans (...)."""
@@ -100,25 +107,24 @@ def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
     return np.asarray(1 / (1 + np.exp(-np.clip(odds, -30, 30))))
 
 
-def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidence:
+def mark_evidence(lattice: Lattice, rings: Bools, empty: Ints, target: Target) -> MarkEvidence:
     """Return the evidence for marks at all places of the lattice and of a border one place wide.
 
-    rings : (n,) whether each of the lattice's n dots has a hole.
+    rings : (n,) whether each of the lattice's n dots has a hole. empty : see `MarkEvidence`.
     """
     shape = lattice.places.max(0) + 3
     occupied = np.zeros(shape, bool)
     occupied[tuple((lattice.places + 1).T)] = True
-    gain = np.full(shape, LOG_UNSEEN_MARK)
+    gain = np.zeros(shape)
     if target.mark_style == "missing":
-        empty = gaps(occupied, target.bounded)
-        lost = max(0.5, empty.sum() - len(target.marks)) / occupied.sum()
-        gain[_count_around(occupied) >= 4] = LOG_UNSURE_GAP
-        gain[occupied] = LOG_FILLED_GAP
-        gain[empty] = -np.clip(np.log(lost), -5.0, -1.5)
-        return MarkEvidence(gain, np.argwhere(empty) - 1)
+        gap = gaps(occupied, target.bounded)
+        lost = max(0.5, gap.sum() - len(target.marks)) / occupied.sum()
+        gain[occupied] = np.log(DOT_FALSE)
+        gain[gap] = -np.log(np.clip(lost, DOT_FALSE, 2 * DOT_LOST))
+        return MarkEvidence(gain, np.argwhere(gap) - 1, empty)
     like = mark_likeness(lattice, rings, target)
     gain[tuple((lattice.places + 1).T)] = mark_gain(like)
-    return MarkEvidence(gain, lattice.places[like > 0.4])
+    return MarkEvidence(gain, lattice.places[like > 0.4], empty)
 
 
 def mark_gain(likeness: Array) -> Array:
@@ -126,10 +132,9 @@ def mark_gain(likeness: Array) -> Array:
 
     likeness : (n,) probabilities that the dots look like marks, see `mark_likeness`.
     """
-    missed, false = np.exp(LOG_MISSED_MARK), np.exp(LOG_FALSE_MARK)
-    as_mark = np.log(likeness * (1 - missed) + (1 - likeness) * missed)
-    as_plain = np.log(likeness * false + (1 - likeness) * (1 - false))
-    return np.asarray(as_mark - as_plain)
+    as_mark = likeness * (1 - MARK_MISSED) + (1 - likeness) * MARK_MISSED
+    as_plain = likeness * MARK_FALSE + (1 - likeness) * (1 - MARK_FALSE)
+    return np.asarray(np.log(as_mark / as_plain))
 
 
 def gaps(occupied: Bools, bounded: bool) -> Bools:
@@ -155,10 +160,6 @@ def _count_around(places: Bools) -> Ints:
     return np.asarray(convolve(places.astype(np.int64), ring, mode="constant"))
 
 
-LOG_DOT_OUTSIDE = -6.0
-"""Log-likelihood of a dot on the lattice where the target has none."""
-MARGIN = 4.0
-"""Placements whose log-likelihood is less than this below the best one count as equally good."""
 MAX_TIED = 64
 
 _MIN_ASPECT_SIGMA = 0.03
@@ -265,8 +266,17 @@ class Placements:
         shifted = columns_rows + self.shift[:, None]
         return np.asarray(np.einsum("kab,knb->kna", inverse_of(self.turn), shifted))
 
+    def likely(self) -> Placements:
+        """Return the placements that are not clearly less likely than the best one."""
+        return self.take(np.flatnonzero(is_likely(self.score)))
+
     def take(self, which: Ints) -> Placements:
         return Placements(self.turn[which], self.shift[which], self.score[which])
+
+
+def is_likely(score: Array) -> Bools:
+    """Return which of K log-likelihoods, best first, are not clearly below the best one."""
+    return np.asarray(score >= score[0] + np.log(WRONG_ODDS))
 
 
 def inverse_of(turn: Ints) -> Ints:
@@ -275,7 +285,7 @@ def inverse_of(turn: Ints) -> Ints:
 
 
 def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: TargetLattice) -> Placements:
-    """Return all placements whose log-likelihood is within `MARGIN` of the best one, best first.
+    """Return all possible placements (`POSSIBLE_ODDS`), best first.
 
     Among equals, those without mirroring come first. Mirrored placements are tried only for a
     target that differs from its mirror image.
@@ -296,7 +306,7 @@ def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: TargetLatt
             "[target] marks, mark_style and mark_diameter_mm in rig.toml",
         )
     order = np.argsort(-np.round(every.score, 6), kind="stable")
-    return every.take(order[every.score[order] >= every.score[order[0]] - MARGIN])
+    return every.take(order[every.score[order] >= every.score[order[0]] + np.log(POSSIBLE_ODDS)])
 
 
 _UNIMODULAR: Ints = np.array(
@@ -345,7 +355,9 @@ def _shifts(
     lattice: Lattice, evidence: MarkEvidence, target: TargetLattice, turn: Ints
 ) -> tuple[Ints, Array]:
     if target.places is not None:
-        shifts, score = _bounded_shifts(lattice.places @ turn.T, target.places)
+        shifts, score = _bounded_shifts(
+            lattice.places @ turn.T, evidence.empty @ turn.T, target.places
+        )
     elif len(target.marks):
         seen = evidence.seen @ turn.T
         shifts = np.unique((seen[:, None] - target.marks).reshape(-1, 2), axis=0)
@@ -362,18 +374,28 @@ def _shifts(
     return shifts, score
 
 
-def _bounded_shifts(turned: Ints, places: Ints) -> tuple[Ints, Array]:
-    """Return the shifts (S, 2) that keep most dots on the target, and log-likelihoods (S,)."""
+def _bounded_shifts(turned: Ints, empty: Ints, places: Ints) -> tuple[Ints, Array]:
+    """Return the shifts (S, 2) that keep most dots on the target, and log-likelihoods (S,).
+
+    turned, empty : (n, 2), (E, 2) places with a dot and of `MarkEvidence`. places : (N, 2) of the
+    target.
+    """
     from scipy.signal import correlate
 
-    low = turned.min(0), places.min(0)
-    dots, target = (np.zeros(np.ptp(one, axis=0) + 1) for one in (turned, places))
-    dots[tuple((turned - low[0]).T)] = 1
-    target[tuple((places - low[1]).T)] = 1
-    inside = np.rint(correlate(dots, target)).astype(np.int64)
-    outside = len(turned) - inside
+    every = np.concatenate([turned, empty])
+    low, size = every.min(0), np.ptp(every, axis=0) + 1
+    target = np.zeros(np.ptp(places, axis=0) + 1)
+    target[tuple((places - places.min(0)).T)] = 1
+    on_target = []
+    for seen in (turned, empty):
+        there = np.zeros(size)
+        there[tuple((seen - low).T)] = 1
+        on_target.append(np.rint(correlate(there, target)).astype(np.int64))
+    outside, lost = len(turned) - on_target[0], on_target[1]
     near = np.argwhere(outside <= outside.min() + 8)
-    return near - target.shape + 1 + low[0] - low[1], LOG_DOT_OUTSIDE * outside[tuple(near.T)]
+    few = np.maximum(lost[tuple(near.T)] * np.log(DOT_LOST), np.log(PART_HIDDEN))
+    score = np.log(DOT_FALSE) * outside[tuple(near.T)] + few
+    return near - target.shape + 1 + low - places.min(0), score
 
 
 def related_by_symmetry(placements: Placements, target: TargetLattice) -> bool:
@@ -406,11 +428,11 @@ class Numbering:
     unplaced : the other dots: index, and reason why they have no number.
     handedness : +1, -1 if the image shows the target mirrored, 0 if the image does not reveal it;
         for a target that equals its mirror image, +1 is assumed.
-    equivalents : (K, n) ids of the n dots under each of the K numberings that fit equally well; row
-        0 is that of the table, -1 means that the target has no dot there.
-    equivalent_handedness : (K,) handedness under each of these numberings.
-    ambiguous : whether these numberings differ by more than rotations that leave the target
-        unchanged.
+    equivalents : (K, n) ids of the n dots under each of the K numberings that are possible, best
+        first; row 0 is that of the table, -1 means that the target has no dot there.
+    equivalent_handedness, score : (K,) handedness and log-likelihood of each of these numberings.
+    ambiguous : whether those that are likely (`is_likely`) differ by more than rotations that leave
+        the target unchanged.
     marks_found : ids of the marks that the image shows.
     """
 
@@ -419,15 +441,20 @@ class Numbering:
     handedness: int
     equivalents: Ints
     equivalent_handedness: Ints
+    score: Array
     ambiguous: bool
     marks_found: Ints
 
 
-def number_dots(dots: pd.DataFrame, target: Target) -> Numbering:
+def number_dots(
+    dots: pd.DataFrame, target: Target, image_shape: tuple[int, ...] | None = None
+) -> Numbering:
     """Find out which dot of the target each located dot of an image is.
 
     dots : table with the columns u_px, v_px, a_px, b_px, angle_rad and, for ring marks, ring, as
     `locate_dots` returns it; the order of its rows does not matter.
+    image_shape : (rows, columns) of the image: it tells on which sides the target ends in view.
+    None takes the box round the dots.
 
     Raises DetectionError if there are too few dots, no grid, no marks, or too many numberings that
     fit equally well, and InputError if a column is missing or a value is not finite.
@@ -446,9 +473,16 @@ def number_dots(dots: pd.DataFrame, target: Target) -> Numbering:
         return _number_points(points, shapes, target)
     lattice = grow_lattice(points, shapes, cell=Cell.of(on.cell_mm))
     ring = dots["ring"].to_numpy(bool) if "ring" in dots else np.zeros(len(dots), bool)
-    evidence = mark_evidence(lattice, ring[lattice.index], target)
-    ranked, ambiguous = _kept(rank_placements(lattice, evidence, on), evidence, target, on)
-    return _numbering(lattice, evidence, ranked, ambiguous, target, on)
+    if image_shape is None:
+        points = points - points.min(0)
+        image_shape = tuple(np.ceil(points.max(0)[::-1]).astype(int) + 1)
+    radius_px = float(dots["a_px"].median())
+    empty = next_places(lattice, points, image_shape, radius_px)[0]
+    evidence = mark_evidence(lattice, ring[lattice.index], empty, target)
+    ranked = rank_placements(lattice, evidence, on)
+    ambiguous = _is_ambiguous(ranked, evidence, target, on)
+    few = ranked.take(np.arange(min(len(ranked.score), MAX_TIED)))
+    return _numbering(lattice, evidence, few, ambiguous, target, on)
 
 
 def _check_columns(dots: pd.DataFrame) -> None:
@@ -508,18 +542,22 @@ def _mirrored_camera(
     return None
 
 
-def _kept(
+def _is_ambiguous(
     ranked: Placements, evidence: MarkEvidence, target: Target, on: TargetLattice
-) -> tuple[Placements, bool]:
-    """Return the placements to keep, and whether they differ by more than a symmetry."""
+) -> bool:
+    """Whether the likely placements differ by more than a symmetry.
+
+    Raises DetectionError if they are many, or if no other image can decide between them.
+    """
+    likely = ranked.likely()
     best = ranked.take(np.flatnonzero(ranked.score >= ranked.score[0] - 1e-6))
-    if len(ranked.score) == len(best.score) and related_by_symmetry(best, on):
-        return best, False
-    if len(ranked.score) <= MAX_TIED and (target.marks or not target.bounded):
-        return ranked, True
+    if len(likely.score) == len(best.score) and related_by_symmetry(best, on):
+        return False
+    if len(likely.score) <= MAX_TIED and (target.marks or not target.bounded):
+        return True
     seen = f"{len(evidence.seen)} of its {len(target.marks)} marks" if target.marks else "no marks"
     raise DetectionError(
-        f"{len(ranked.score)} numberings fit equally well: the grid is seen in part and has {seen}",
+        f"{len(likely.score)} numberings fit equally well: the grid is seen in part and has {seen}",
         todo="keep the whole grid in view, or put marks on it and keep those in view",
     )
 
@@ -546,9 +584,10 @@ def _numbering(
         unplaced=_unplaced(
             np.concatenate([lattice.unplaced, off]), [*lattice.reasons, *[reason] * len(off)]
         ),
-        handedness=int(signs[0]) if np.all(signs == signs[0]) else 0,
+        handedness=int(signs[0]) if np.all((signs == signs[0])[is_likely(ranked.score)]) else 0,
         equivalents=ids[:, order],
         equivalent_handedness=signs,
+        score=ranked.score,
         ambiguous=ambiguous,
         marks_found=mark_ids[evidence.is_seen(ranked.places(on.marks)[0])],
     )
@@ -599,6 +638,7 @@ def _number_points(points_px: Array, shapes_px2: Array, target: Target) -> Numbe
         handedness=best.handedness,
         equivalents=best.point[order][None],
         equivalent_handedness=np.array([best.handedness]),
+        score=np.zeros(1),
         ambiguous=False,
         marks_found=np.zeros(0, np.int64),
     )

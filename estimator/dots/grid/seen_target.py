@@ -12,10 +12,10 @@ import pandas as pd
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import DetectionError
 from telerig.estimator.dots.grid.lattice import (
-    NEIGHBOURS,
     Cell,
     Lattice,
     grow_lattice,
+    next_places,
     shape_matrix,
 )
 from telerig.estimator.dots.grid.numbering import gaps, relative_diameter
@@ -140,7 +140,7 @@ def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
     occupied = np.zeros(places.max(axis=0) + 3, bool)
     occupied[tuple((places + 1).T)] = True
     radius_px = float(np.median(dots["a_px"]))
-    whole = _is_whole(points[lattice.index], lattice, image_shape, radius_px)
+    whole = not len(next_places(lattice, points, image_shape, radius_px)[1])
     rings, large, size = _unusual(dots, lattice)
     style, which = _marks(places, rings, large, np.argwhere(gaps(occupied, whole)) - 1)
     diagonal = np.median(np.diagonal(lattice.shape, axis1=1, axis2=2), axis=0)
@@ -179,26 +179,13 @@ def seen_hexagon(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenHexago
     pitch = float(1.0 / np.mean(diameter))
     return SeenHexagon(
         (places - places.min(axis=0))[order],
-        _is_surrounded(points[lattice.index], lattice, steps, image_shape, dots["a_px"].median()),
+        not len(next_places(lattice, points, image_shape, float(dots["a_px"].median()))[1]),
         tuple(np.flatnonzero(marked).tolist()),
         style,
         float(np.median(size[large])) if style == "large" else float("nan"),
         (pitch, pitch),
         2.0 * float(np.median(dots["a_px"].to_numpy()[lattice.index[order[~marked]]])),
     )
-
-
-def _is_surrounded(
-    points_px: Array, lattice: Lattice, steps: Array, image_shape: tuple[int, ...], radius_px: float
-) -> bool:
-    """Whether all places next to dots would be inside the image. steps : (2, 2) pitch vectors."""
-    near = NEIGHBOURS[np.linalg.norm(NEIGHBOURS @ steps, axis=1) < 1.1]
-    beyond = points_px[:, None] + near @ lattice.basis_px
-    margin, size = radius_px + 2.0, np.array(image_shape[::-1])
-    inside = np.all((beyond > margin) & (beyond < size - 1 - margin), axis=-1)
-    taken = {*map(tuple, lattice.places.tolist())}
-    steps_out = (lattice.places[:, None] + near)[~inside]
-    return all(place in taken for place in map(tuple, steps_out.tolist()))
 
 
 def _unusual(dots: pd.DataFrame, lattice: Lattice) -> tuple[Bools, Bools, Array]:
@@ -240,21 +227,6 @@ def _refuse_oblique(lattice: Lattice) -> None:
             f"the rows of dots cross at {np.rad2deg(np.arccos(cosine)):.0f} degrees, not at 90; "
             'describe such a plate by the places of its dots: layout = "points", points_mm = ...'
         )
-
-
-def _is_whole(
-    points_px: Array, lattice: Lattice, image_shape: tuple[int, ...], radius_px: float
-) -> bool:
-    """Whether the image would show a whole dot at the place next to every outermost one."""
-    margin = radius_px + 2.0
-    last = lattice.places.max(axis=0)
-    for axis in (0, 1):
-        for end, sign in ((0, -1.0), (last[axis], 1.0)):
-            outer = lattice.places[:, axis] == end
-            beyond = points_px[outer] + sign * lattice.basis_px[outer, axis]
-            if not np.all((beyond > margin) & (beyond < np.array(image_shape[::-1]) - 1 - margin)):
-                return False
-    return True
 
 
 def _marks(places: Ints, rings: Bools, large: Bools, empty: Ints) -> tuple[MarkStyle | None, Ints]:

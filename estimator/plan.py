@@ -44,12 +44,13 @@ from telerig.estimator.smoothing.result import trajectories
 from telerig.estimator.smoothing.verdict.identifiability import expected_shake, verdicts
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.io.results.calibration_words import NO_COVARIANCE
-from telerig.io.results.smoothing import AXES, AxisVerdict, Verdict, vertical_axis, worst_of
+from telerig.io.results.smoothing import AxisVerdict, Verdict, vertical_axis, worst_of
 from telerig.io.results.verdict_words import number_words
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.simulation.calibration.scene import hand_held_views, true_cameras, true_target
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
+from telerig.io.tables.smoothing import AXES
 from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 from telerig.short_text import counted, share

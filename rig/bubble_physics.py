@@ -183,6 +183,18 @@ def tomiyama_velocity(d: ArrayLike, liquid: Liquid, contamination: str = "pure")
     return _terminal(excess, d)
 
 
+def schiller_naumann_drag(reynolds: ArrayLike) -> Array:
+    """Return the drag coefficient of a rigid sphere, and of a small contaminated bubble.
+
+    The law is 24 / Re (1 + 0.15 Re^0.687) (Schiller and Naumann, Z. Ver. Dtsch. Ing. 77:318, 1933),
+    for Reynolds numbers below 1,000; NaN beyond.
+
+    reynolds : Reynolds number Re.
+    """
+    re = np.asarray(reynolds, float)
+    return np.where(re < 1000, 24 / re * (1 + 0.15 * re**0.687), np.nan)
+
+
 def moore_aspect_weber(aspect: ArrayLike) -> Array:
     """Return the Weber number at which a clean bubble has a given aspect ratio.
 

@@ -238,3 +238,11 @@ def checked_model(model: str) -> str:
 def _by_camera(model: str) -> dict[str, str]:
     pairs = [part.partition("=") for part in model.split(",")]
     return {camera.strip(): name.strip() for camera, _, name in pairs}
+
+
+def unit_of_parameter(name: str) -> str:
+    """Return the unit of a parameter of cameras, as UDUNITS has it, from its name; "1" for none."""
+    ends = {
+        "_px_per_mm": "px mm-1", "_per_mm": "mm-1", "_px": "px", "_mm": "mm", "_rad": "rad"
+    }  # fmt: skip
+    return next((unit for end, unit in ends.items() if name.endswith(end)), "1")

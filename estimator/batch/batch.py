@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
@@ -28,13 +29,16 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from telerig.errors import InputError
-from telerig.estimator.batch.jobs import Job, check_run_name, fingerprint
+from telerig.errors import InputError, TelerigWarning
+from telerig.estimator.batch.jobs import Job, check_run_name
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
 from telerig.io.results.batch import BatchFile, verdict_and_flags, verdict_counts
-from telerig.io.results.manifest import is_whole, replaced_results
+from telerig.io.results.manifest import is_whole, read_manifest, replaced_results
+from telerig.io.results.smoothing import SmoothingFile
+from telerig.io.tables.smoothing import BATCH_BUBBLES, SUMMARY
+from telerig.version import VERSION
 
 Stage = Callable[[str, float, int], None]
 
@@ -289,7 +293,11 @@ class Journal:
         record = self.read(job)
         if record is None or record.get("status") != DONE or not is_whole(job.result):
             return None
-        return record if record.get("fingerprint") == fingerprint(job) else None
+        same = (record.get("options"), record.get("telerig")) == (job.options, VERSION)
+        manifest = read_manifest(job.results)
+        section = None if manifest is None else manifest.sections.get(job.kind)
+        fresh = section is not None and not section.changes(job.results, alone=False)
+        return record if same and fresh else None
 
     def read(self, job: Job) -> dict[str, Any] | None:
         """Return the last record of the job, or None if there is none that can be read."""
@@ -299,15 +307,12 @@ class Journal:
             return None
         return dict(content) if isinstance(content, dict) else None
 
-    def write(self, job: Job, result: Mapping[str, Any], inputs: str) -> dict[str, Any]:
-        """Write the result of a job to the journal and return the record.
-
-        inputs : `fingerprint` of the job before it began. If an input has changed while the job was
-        running, the job is therefore done again next time.
-        """
+    def write(self, job: Job, result: Mapping[str, Any]) -> dict[str, Any]:
+        """Write the result of a job to the journal and return the record."""
         record = {
             "kind": job.kind, "dataset": job.dataset, "run": job.run, **result,
-            "fingerprint": inputs,
+            "options": job.options,
+            "telerig": VERSION,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         }  # fmt: skip
         write_json_atomic(self.folder / f"{job.name}.json", record)
@@ -331,6 +336,31 @@ def table_of(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*COLUMNS, *FIGURES, "words"])
 
 
+def bubbles_of(records: Sequence[Mapping[str, Any]]) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the bubbles of all smoothed runs in one table, and the liquid if it is one.
+
+    records : the journal's record of each job. A run whose table cannot be read is left out, with a
+    warning.
+    """
+    parts, fluids = [pd.DataFrame(columns=BATCH_BUBBLES.names())], []
+    for record in records:
+        place = Path(record["dataset"]) / "results" / record["run"]
+        if record["kind"] != "smooth" or record["status"] != DONE:
+            continue
+        try:
+            table = SUMMARY.read(place / SUMMARY.file)
+            fluids.append(SmoothingFile.read(place / "smoothing.json").fluid)
+        except InputError as error:
+            warnings.warn(f"{error}; its bubbles are left out", TelerigWarning, stacklevel=2)
+            continue
+        table.insert(0, "dataset", record["dataset"])
+        table.insert(1, "run", record["run"])
+        parts.append(table)
+    known = [fluid for fluid in fluids if fluid]
+    fluid = known[0] if known and all(one == known[0] for one in known) else {}
+    return pd.concat(parts[1:] or parts, ignore_index=True), fluid
+
+
 def _first_line(words: object) -> str:
     return next(iter(str(words or "").strip().splitlines()), "")
 
@@ -338,17 +368,20 @@ def _first_line(words: object) -> str:
 def write_batch(
     records: Sequence[Mapping[str, Any]], folder: Path, *, report: bool = True, again: str = ""
 ) -> pd.DataFrame:
-    """Write batch.csv, batch.json and report.html to ``folder``, and return the table in batch.csv.
+    """Write batch.csv, bubbles.csv, batch.json and report.html to ``folder``; return the first.
 
     records : the journal's record of each job.
     report : whether report.html is written.
     again : the command line that makes the files again; "" for `telerig batch`.
     """
-    table = table_of(records)
+    table, (bubbles, fluid) = table_of(records), bubbles_of(records)
     name = Path(folder).resolve().name
-    content = {"schema": 1, "kind": "telerig batch", "name": name, "jobs": list(records)}
+    content = {
+        "schema": 1, "kind": "telerig batch", "name": name, "jobs": list(records), "fluid": fluid
+    }  # fmt: skip
     with replaced_results(folder, "batch", again=again or "telerig batch", inputs={}) as staged:
         write_table(table, staged / "batch.csv")
+        write_table(bubbles, staged / "bubbles.csv")
         BatchFile.of(content, staged / "batch.json").write(staged / "batch.json")
         if report:
             from telerig.io.report.batch.report import write_batch_report
@@ -402,7 +435,7 @@ def run_batch(
     """
     by_name = {job.name: job for job in jobs}
     records: dict[str, dict[str, Any]] = {}
-    running: dict[Future[dict[str, Any]], tuple[Job, str]] = {}
+    running: dict[Future[dict[str, Any]], Job] = {}
     drawn: dict[str, dict[str, Any]] = {}
     order = TopologicalSorter({job.name: job.needs for job in jobs})
     order.prepare()
@@ -418,22 +451,21 @@ def run_batch(
         for job in ready:
             known = _known_record(job, records, journal)
             if known is None:
-                inputs = fingerprint(job)
-                running[executor.submit(perform, job)] = job, inputs
+                running[executor.submit(perform, job)] = job
             elif known["status"] == DONE and job.lacks_report:
                 drawn[job.name] = known
                 future = executor.submit(perform, replace(job, only_report=True))
-                running[future] = job, str(known["fingerprint"])
+                running[future] = job
             else:
                 keep(job, known)
         if not ready:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job, inputs = running.pop(future)
+                job = running.pop(future)
                 result = _result(future)
                 if job.name in drawn and result["status"] == DONE:
                     keep(job, drawn[job.name])
                 else:
-                    keep(job, journal.write(job, result, inputs))
+                    keep(job, journal.write(job, result))
     return [records[job.name] for job in jobs]
 
 
@@ -444,7 +476,7 @@ def _known_record(
     for needed in job.needs:
         if records[needed]["status"] != DONE:
             words = f"needs {needed}, which was {records[needed]['status']}"
-            return journal.write(job, failure(LEFT_OUT, words), fingerprint(job))
+            return journal.write(job, failure(LEFT_OUT, words))
     before = journal.done(job)
     return None if before is None else {**before, "resumed": True}
 

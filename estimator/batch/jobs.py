@@ -1,5 +1,4 @@
-"""Lists the jobs for a list of datasets, in an order in which they can be done, and their input
-files."""
+"""Lists the jobs for a list of datasets, in an order in which they can be done."""
 
 from __future__ import annotations
 
@@ -14,7 +13,6 @@ from typing import Any, Literal
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.files.names import absent
-from telerig.version import VERSION
 
 Kind = Literal["calibrate", "track", "smooth"]
 KINDS: tuple[Kind, ...] = ("calibrate", "track", "smooth")
@@ -24,7 +22,6 @@ SHAKE_MODELS = ("auto", "default")
 MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
 RESERVED = "calibration"
 """No run can have this name, because results/calibration holds the results of the calibration."""
-_INPUTS = {"calibrate": ("calibration", "stage_axis")}
 
 
 @dataclass(frozen=True)
@@ -103,6 +100,11 @@ class Job:
         words += [f"--model={self.shake}"] if self.shake != "auto" else []
         words += ["--refine-rig"] if self.refine_rig else []
         return [*words, *(word for code in self.accept for word in ("--accept", code))]
+
+    @property
+    def options(self) -> str:
+        """Return as text what the result depends on besides the inputs and the version."""
+        return replace(self, report=True, only_report=False, cluster="").as_json()
 
     def as_json(self) -> str:
         """Return the job as one line of JSON."""
@@ -302,37 +304,3 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
     except CalibrationError as error:
         raise InputError(f"--model {model}", todo=error.todo) from error
     checked_medium(medium)
-
-
-def fingerprint(job: Job) -> str:
-    """Return a hash of all that the result of a job depends on: version, options and input files.
-
-    Recorded files enter by size and time of change, calibrations and tracks by their content. The
-    report does not change the hash.
-    """
-    stated = replace(job, report=True, only_report=False, cluster="")
-    hashed = hashlib.sha256(f"{VERSION} {stated.as_json()}".encode())
-    place = Path(job.dataset)
-    listed = [place / "rig.toml"]
-    for folder in _INPUTS.get(job.kind, (f"runs/{job.run}",)):
-        listed += sorted((place / folder).rglob("*"))
-    for file in listed:
-        if file.is_file():
-            stat = file.stat()
-            hashed.update(f"{file.relative_to(place)} {stat.st_size} {stat.st_mtime_ns}".encode())
-    for file in _used_results(job):
-        if file.is_file():
-            hashed.update(file.read_bytes())
-    return hashed.hexdigest()[:16]
-
-
-def _used_results(job: Job) -> list[Path]:
-    if job.kind == "calibrate":
-        return []
-    own = Path(job.dataset) / "results" / "calibration" / "calibration.json"
-    given = Path(job.calibration) if job.calibration else own
-    used = [given / own.name if given.is_dir() else given]
-    if job.kind == "track":
-        return used
-    tracks = Path(job.tracks) if job.tracks else job.results
-    return [*used, tracks / "tracks.csv" if tracks.is_dir() else tracks]

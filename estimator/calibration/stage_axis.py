@@ -21,9 +21,10 @@ from telerig.factors.linear_factors import add_linear_factors
 from telerig.factors.robust_loss import next_limit, travel_weights
 from telerig.io.dataset.dataset import Dataset, View, files_by_view
 from telerig.io.dataset.tables import read_dots_csv
-from telerig.io.files.csv_table import Column, read_table
+from telerig.io.files.csv_table import read_table
 from telerig.io.images.read import natural
 from telerig.io.results.findings import Code, Finding
+from telerig.io.tables.calibration import POSITIONS
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, across, hat, nearest_rotation, rotation_from_rotvec
 from telerig.rig.triangulation import rig_jacobian, triangulate_any
@@ -116,7 +117,7 @@ def _positions(folder: Path) -> pd.DataFrame:
         raise InputError(
             f"there is no {_POSITIONS}", where=str(folder), todo="write view,position_mm"
         )
-    return read_table(file, [Column("view", "name"), Column("position_mm")])
+    return read_table(file, POSITIONS.of())
 
 
 def _measured(dataset: Dataset, folder: Path, read: list[Finding]) -> pd.DataFrame:

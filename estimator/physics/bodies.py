@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from telerig.io.results.bubbles import BODY_COLUMNS
+from telerig.io.tables.smoothing import BODY_COLUMNS
 
 _KEYS = ["frame", "particle"]
 

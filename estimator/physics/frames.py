@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
-from telerig.io.results.bubbles import BODY_COLUMNS, FRAME_COLUMNS, NUMBERS
 from telerig.io.rig_file.fluid import liquid_of, liquid_velocity
+from telerig.io.tables.smoothing import BODY_COLUMNS, BUBBLES, NUMBERS
 from telerig.rig.bubble_physics import Liquid, added_mass, drag_coefficient
 
 AXES = ("x", "y", "z")
@@ -68,7 +68,7 @@ def frames_table(
     out |= {"slip_mm_s": speed, "s_slip_mm_s": speed_sd}
     out |= {"curvature_1_mm": curvature, "s_curvature_1_mm": curvature_sd}
     out["observed"] = _column(table, "observed")
-    return pd.DataFrame(out)[FRAME_COLUMNS]
+    return pd.DataFrame(out)[BUBBLES.names()]
 
 
 def _column(table: pd.DataFrame, name: str) -> Array:

@@ -12,7 +12,7 @@ from telerig.arrays import Array
 from telerig.estimator.physics.frames import AXES
 from telerig.estimator.physics.means import SD, Lasting, mean_of_body
 from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillation
-from telerig.io.results.bubbles import SUMMARY_COLUMNS, WHOLE
+from telerig.io.tables.smoothing import SUMMARY
 from telerig.rig.bubble_physics import Liquid
 
 _ABOVE_ZIGZAG = 2.6
@@ -45,8 +45,8 @@ def summary_table(
         _row(mine, up, liquid, known.get((int(mine["particle"].iloc[0]), len(mine))), common)
         for _, mine in groups
     ]
-    table = pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
-    return table.astype({name: np.int64 for name in WHOLE if name in table})
+    table = pd.DataFrame(rows, columns=SUMMARY.names())
+    return table.astype({c.name: np.int64 for c in SUMMARY.columns if c.kind == "whole"})
 
 
 def _row(

@@ -463,12 +463,11 @@ def load_smoothing(folder: str | Path) -> Smoothing:
     """
     from pydantic import TypeAdapter, ValidationError
 
-    from telerig.io.files.csv_table import read_table
     from telerig.io.files.hdf5 import read_arrays
     from telerig.io.files.names import absent
-    from telerig.io.results.bubbles import BODY_COLUMNS, BUBBLES
     from telerig.io.results.manifest import reading
-    from telerig.io.results.smoothing import TRAJECTORIES, SmoothingFile, shake_columns
+    from telerig.io.results.smoothing import SmoothingFile
+    from telerig.io.tables.smoothing import BODY_COLUMNS, BUBBLES, SHAKE, TRAJECTORIES
 
     place = Path(folder)
     if not place.is_dir():
@@ -480,11 +479,10 @@ def load_smoothing(folder: str | Path) -> Smoothing:
         file = place / "results.h5"
         if not (file.is_file() and StoredTables(place).of_pieces()):
             states = read_arrays(file, "states") if file.is_file() else {}
-            paths = read_table(place / names[0], TRAJECTORIES, extra=True, empty=True)
-            offsets = read_table(place / names[1], shake_columns(record.cameras), extra=True)
+            paths = TRAJECTORIES.read(place / names[0])
+            offsets = SHAKE.read(place / names[1], record.cameras)
             file = place / "bubbles.csv"
-            bodies = read_table(file, BUBBLES)[BODY_COLUMNS] if file.is_file() else None
-            paths, offsets = (table.reset_index(drop=True) for table in (paths, offsets))
+            bodies = BUBBLES.read(file)[BODY_COLUMNS] if file.is_file() else None
             tables = Tables(paths, offsets, states, bodies)
     content = record.content()
     verdict = {name: content.pop(name) for name in record.VERDICT if name in content}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from telerig.io.results.smoothing import SmoothingFile
-from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, share_words
+from telerig.io.results.tracking import share_words
 from telerig.io.results.verdict_words import (
     number_words,
     to_resolve,
@@ -15,6 +15,7 @@ from telerig.io.results.verdict_words import (
     words_of_axes,
     words_of_contradiction,
 )
+from telerig.io.tables.table import CALIBRATION_SHARE, EXTRAPOLATED
 
 if TYPE_CHECKING:
     from telerig.estimator.smoothing.result import Smoothing

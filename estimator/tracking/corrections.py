@@ -21,18 +21,12 @@ from telerig.estimator.tracking.filter import TrackEvent
 from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_path
-from telerig.io.files.csv_table import Column, read_table, write_table
+from telerig.io.files.csv_table import read_table, write_table
+from telerig.io.tables.run import CORRECTIONS as _ROWS
 from telerig.short_text import counted, counted_list
 
 _ONCE = ["frame", "particle", "camera"]
 ACTIONS = ("drop", "join", "split", "rename")
-_COLUMNS = [
-    Column("action", "text"),
-    Column("particle", "name"),
-    Column("other", "name", required=False, blank=True),
-    Column("frame", "whole", required=False, blank=True),
-    Column("reason", "text"),
-]
 _TODO = {
     "drop": "give particle (the track's id) and frame (the first one to drop; blank for all)",
     "join": "give particle (an id) and other (the id of the track that gets this id)",
@@ -205,10 +199,9 @@ def add_correction(run: Path, results: Path, row: Mapping[str, Any]) -> str:
     """
     found, file = load_tracks(results), run / CORRECTIONS
     numbered = found.table["particle"].dtype.kind == "i"
-    names = [column.name for column in _COLUMNS]
-    before = read_table(file, _COLUMNS, empty=True) if file.is_file() else pd.DataFrame()
+    before = read_table(file, _ROWS.of(), empty=True) if file.is_file() else pd.DataFrame()
     new = pd.DataFrame([row]).dropna(axis=1)
-    table = pd.concat([before, new], ignore_index=True).reindex(columns=names)
+    table = pd.concat([before, new], ignore_index=True).reindex(columns=_ROWS.names())
     with atomic_path(file) as staged:
         write_table(table.astype({"frame": "Int64"}), staged)
         *_, one = _read(staged, numbered).corrections
@@ -269,7 +262,7 @@ def read_corrections(run: Path, numbered: bool) -> Corrections:
 
 
 def _read(file: Path, numbered: bool) -> Corrections:
-    table = read_table(file, _COLUMNS, empty=True)
+    table = read_table(file, _ROWS.of(), empty=True)
     blank = pd.Series("", table.index)
     others = table.get("other", blank).fillna("").astype(str)
     frames = table.get("frame", pd.Series(np.nan, table.index))

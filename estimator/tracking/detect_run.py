@@ -38,7 +38,9 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import atomic_path, write_json_atomic
 from telerig.io.files.csv_table import write_table
+from telerig.io.files.hashing import hashed
 from telerig.io.machine.parallel import cores, keep_freed_memory, ordered_map, quick_workers
+from telerig.io.results.inputs import Source, fingerprints
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -291,30 +293,28 @@ def read_batch(path: Path) -> pd.DataFrame:
 
 
 def fingerprint(run: RunData, options: dict[str, Any]) -> str:
-    """Return a hash of the options, and of the names, sizes and times of the recording's files and
-    of the program's. Corrections of the tracks do not count.
+    """Return a hash of the options, of the program, and of what was recorded of the run.
+
+    Corrections of the tracks do not count, and images as `Source` has them.
     """
-    found = hashlib.sha256(json.dumps([version.VERSION, options], default=str).encode())
-    for place, name in [*sorted(_program_files()), *_recording_files(run)]:
-        state = (place / name).stat()
-        found.update(f"{name} {state.st_size} {state.st_mtime_ns}\n".encode())
+    tables = (p for p in run.path.iterdir() if p.is_file() and p.stem not in run.cameras)
+    recorded = fingerprints(
+        run.path,
+        [
+            Source(run.path, cameras=run.cameras),
+            *sorted(p for p in tables if CORRECTIONS not in p.name),
+        ],
+    )
+    stated = [version.VERSION, options, {k: v.model_dump() for k, v in recorded.items()}]
+    found = hashlib.sha256(json.dumps(stated, default=str).encode())
+    for file in sorted(_program_files()):
+        found.update(hashed(file).sha256.encode())
     return found.hexdigest()
 
 
-def _program_files() -> Iterator[tuple[Path, str]]:
-    place = Path(version.__file__).parent
-    for folder, _, names in os.walk(place, followlinks=True):
-        inside = Path(folder).relative_to(place)
-        yield from ((place, (inside / n).as_posix()) for n in names if n.endswith(".py"))
-
-
-def _recording_files(run: RunData) -> Iterator[tuple[Path, str]]:
-    for folder, folders, names in os.walk(run.path):
-        inputs = folders if Path(folder) != run.path else set(folders) & set(run.cameras)
-        folders[:] = sorted(inputs)  # results may lie in the run's folder, too
-        inside = Path(folder).relative_to(run.path)
-        found = [(inside / name).as_posix() for name in sorted(names)]
-        yield from ((run.path, name) for name in found if CORRECTIONS not in name)
+def _program_files() -> Iterator[Path]:
+    for folder, _, names in os.walk(Path(version.__file__).parent, followlinks=True):
+        yield from (Path(folder) / name for name in names if name.endswith(".py"))
 
 
 def detect_missing(

@@ -51,7 +51,7 @@ from telerig.io.files.atomic import plain
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.results.calibration_words import NO_COVARIANCE
-from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, POINT
+from telerig.io.tables.table import CALIBRATION_SHARE, EXTRAPOLATED, POINT
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
 from telerig.rig.camera import Camera

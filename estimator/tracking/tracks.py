@@ -4,25 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column, read_part, read_table
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.names import absent
 from telerig.io.results.manifest import reading, replaced_results
-from telerig.io.results.tracking import (
-    EVENTS,
-    POINT,
-    REFERENCES,
-    TrackingFile,
-    share_words,
-)
+from telerig.io.results.tracking import TrackingFile, share_words
+from telerig.io.tables.run import DETECTIONS, EVENTS, REFERENCES, TRACKS
+from telerig.io.tables.table import PIXEL, POINT
 from telerig.short_text import ShortText, counted, first_of
 
 if TYPE_CHECKING:
@@ -30,7 +23,8 @@ if TYPE_CHECKING:
 
     from telerig.estimator.tracking.filter import TrackEvent
 
-EVENT_COLUMNS = ["frame", "t_s", "kind", "particles", "reason"]
+_NEED, _OF_IMAGES = ("frame", "particle", "t_s", *POINT), ("frame", "camera", *PIXEL)
+"""Columns that the tables of tracks and of detections of other programs must have."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,7 +126,7 @@ class StoredTracks:
         table, detections = self.table.between(first, end), pd.DataFrame()
         if self.detections is not None:
             detections = self.detections.between(first, end)
-        return Tracks(self.name, detections, table, pd.DataFrame(columns=EVENT_COLUMNS))
+        return Tracks(self.name, detections, table, pd.DataFrame(columns=EVENTS.names()))
 
 
 def open_tracks(folder: str | Path) -> Tracks | StoredTracks:
@@ -146,21 +140,21 @@ def open_tracks(folder: str | Path) -> Tracks | StoredTracks:
     files = _files(place)
     marks = place / "references.csv"
     with reading(place, [file.name for file in (*files, marks)]):
-        table = FrameTable.of(files[1], partial(_read_part, files[1], TRACK_COLUMNS), _unseen)
+        table = FrameTable.of(files[1], TRACKS.reader_of_parts(files[1], need=_NEED), _unseen)
         detections = FrameTable.of(
-            files[0], partial(_read_part, files[0], DETECTION_COLUMNS), _unseen
+            files[0], DETECTIONS.reader_of_parts(files[0], need=_OF_IMAGES), _unseen
         )
         if table is None or detections is None:
             return load_tracks(folder)
         summary = TrackingFile.read(files[3]).content()
-        references = _read(marks, REFERENCES) if marks.is_file() else None
+        references = REFERENCES.read(marks) if marks.is_file() else None
     return StoredTracks(str(summary.get("run", place.name)), table, detections, summary, references)
 
 
 def open_track_table(file: Path) -> pd.DataFrame | StoredTracks:
     """Read a table as `read_track_table` does; of a large file return a `StoredTracks`, which reads
     the rows of single frames when they are needed."""
-    table = FrameTable.of(file, partial(_read_part, file, TRACK_COLUMNS), _unseen)
+    table = FrameTable.of(file, TRACKS.reader_of_parts(file, need=_NEED), _unseen)
     return read_track_table(file) if table is None else StoredTracks("", table, None)
 
 
@@ -169,12 +163,12 @@ def _unseen(_part: pd.DataFrame) -> None:
 
 
 def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
-    """Return the events as a table with the columns `EVENT_COLUMNS`, in the order of time."""
+    """Return the events as a table with the columns of events.csv, in the order of time."""
     rows = [
         (e.frame, e.t_s, e.kind, " ".join(str(p) for p in e.particles), e.reason)
         for e in sorted(events, key=lambda e: e.frame)
     ]
-    return pd.DataFrame(rows, columns=EVENT_COLUMNS)
+    return pd.DataFrame(rows, columns=EVENTS.names())
 
 
 def load_tracks(folder: str | Path) -> Tracks:
@@ -190,10 +184,10 @@ def load_tracks(folder: str | Path) -> Tracks:
     marks = place / "references.csv"
     with reading(place, [file.name for file in (*files, marks)]):
         summary = TrackingFile.read(files[3]).content()
-        detections = _read(files[0], DETECTION_COLUMNS)
+        detections = DETECTIONS.read(files[0], need=_OF_IMAGES)
         table = read_track_table(files[1])
-        events = _read(files[2], EVENTS)
-        references = _read(marks, REFERENCES) if marks.is_file() else None
+        events = EVENTS.read(files[2])
+        references = REFERENCES.read(marks) if marks.is_file() else None
     return Tracks(
         str(summary.get("run", place.name)), detections, table, events, summary, references
     )
@@ -208,51 +202,13 @@ def _files(place: Path) -> list[Path]:
     return files
 
 
-_FRAME = Column("frame", "whole")
-_PIXEL = [Column("u_px", blank=True), Column("v_px", blank=True)]
-DETECTION_COLUMNS = [_FRAME, Column("camera", "name"), *_PIXEL]
-TRACK_COLUMNS = [_FRAME, Column("particle", "name"), Column("t_s"), *map(Column, POINT)]
-
-
 def read_track_table(file: Path) -> pd.DataFrame:
     """Read tracks.csv, or a table of tracks that another program made.
 
     Returns all columns of the file. Raises InputError for a table without frame, particle, t_s and
     the position (mm), and for cells that are not what their column says.
     """
-    return _read(file, TRACK_COLUMNS)
-
-
-def _read(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
-    """Read a table with all its columns; ids of bubbles that are whole numbers become such."""
-    return _numbered(read_table(file, _with_texts(columns), extra=True, empty=True))
-
-
-def _read_part(
-    file: Path, columns: Sequence[Column], content: bytes, row: int
-) -> pd.DataFrame | None:
-    """Read some rows as `_read` reads all of them; None for an unusual text."""
-    table = read_part(file, content, row, _with_texts(columns))
-    return None if table is None else _numbered(table)
-
-
-def _with_texts(columns: Sequence[Column]) -> list[Column]:
-    """Return the columns, as text where a table has text."""
-    texts = [Column(name, "text", required=False, blank=True) for name in ("flags", "reason")]
-    named = {column.name for column in columns}
-    return [*columns, *(column for column in texts if column.name not in named)]
-
-
-def _numbered(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with ids of bubbles as whole numbers where they are numbers."""
-    table = table.reset_index(drop=True)
-    if "particle" in table:
-        ids = pd.to_numeric(table["particle"].replace("", np.nan), errors="coerce")
-        ids = ids.where(np.isfinite(ids))
-        if ids.notna().equals(table["particle"].replace("", np.nan).notna()):
-            whole = bool(len(ids)) and bool((ids % 1 == 0).all())
-            table["particle"] = ids.astype(np.int64) if whole else ids
-    return table
+    return TRACKS.read(file, need=_NEED)
 
 
 def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") -> str:

@@ -6,6 +6,7 @@ Every error names the file, the row (the header is row 1), the column, and what 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +20,9 @@ from telerig.io.files.csv_table import Column, Rows, read_part, read_table, rows
 from telerig.io.files.toml import read_toml
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
+from telerig.io.tables.calibration import DOTS
+from telerig.io.tables.run import ACCELEROMETER, DETECTIONS, FRAMES, REFERENCES, STAGE
+from telerig.io.tables.table import OF_PIXELS, PIXEL, PIXEL_COVARIANCE
 from telerig.rig.target import Target
 
 AnySource = TypeVar("AnySource", bound=str)
@@ -29,8 +33,7 @@ DEFAULT_SIGMA_PX = 0.02
 OUTSIDE_PX = 3.0
 """A centre may lie at most this far (px) outside the image, for example after cropping."""
 
-COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
-DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *COVARIANCE]
+DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", *PIXEL, *PIXEL_COVARIANCE]
 
 
 def choose_source(
@@ -89,19 +92,14 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
 
 def _columns(target: Target) -> list[Column]:
     """Return the columns that a dots.csv for this target may have."""
-    unbounded = not target.bounded
-    return [
-        Column("view", "name"),
-        Column("camera", "name"),
-        Column("dot", "text" if unbounded else "whole", blank=unbounded),
-        Column("u_px"),
-        Column("v_px"),
-        Column("sigma_px", required=False),
-        Column("row", "whole", required=unbounded),
-        Column("column", "whole", required=unbounded),
-        *(Column(name, required=False) for name in COVARIANCE),
-        Column("chi2_dof", required=False, blank=True),
-    ]
+    if target.bounded:
+        return DOTS.of()
+    own: dict[str, dict[str, Any]] = {
+        "dot": {"kind": "text", "blank": True},
+        "row": {"required": True},
+    }
+    own["column"] = own["row"]
+    return [replace(column, **own.get(column.name, {})) for column in DOTS.of()]
 
 
 def check_cameras(table: pd.DataFrame, names: list[str], file: Path) -> None:
@@ -187,16 +185,16 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
     Returns whether the file stated the noise. Raises InputError if only some of the columns exist,
     and for values that are no covariance.
     """
-    given = [name for name in COVARIANCE if name in table]
+    given = [name for name in PIXEL_COVARIANCE if name in table]
     if 0 < len(given) < 3:
-        missing = ", ".join(name for name in COVARIANCE if name not in table)
+        missing = ", ".join(name for name in PIXEL_COVARIANCE if name not in table)
         raise InputError(
             f"has {', '.join(given)} without {missing}",
             where=f"{file} row 1",
             todo="give all three columns, or sigma_px alone",
         )
     if given:
-        uu, uv, vv = (table[name].to_numpy() for name in COVARIANCE)
+        uu, uv, vv = (table[name].to_numpy() for name in PIXEL_COVARIANCE)
         rows_of(table, file).refuse(
             (uu <= 0) | (vv <= 0) | (uu * vv <= uv**2),
             "suu_px2",
@@ -237,12 +235,7 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
     Raises InputError for times that do not increase, a frame without a time or without an image,
     and an unknown camera in ``missing``.
     """
-    columns = [
-        Column("frame", "whole"),
-        Column("t_s"),
-        Column("missing", "text", required=False, blank=True),
-    ]
-    table = read_table(path, columns, extra=True)
+    table = read_table(path, FRAMES.of(), extra=True)
     rows = rows_of(table, path)
     _check_frames(table, frame_count, rows)
     frame, t = table["frame"].to_numpy(), table["t_s"].to_numpy()
@@ -325,7 +318,7 @@ def read_stage_csv(path: Path) -> pd.DataFrame:
 
     Raises InputError for fewer than two rows and for times that do not increase.
     """
-    table = read_table(path, [Column("t_s"), Column("position_mm")], extra=True)
+    table = read_table(path, STAGE.of(), extra=True)
     if len(table) < 2:
         raise InputError(
             "has a single row, between which nothing can be interpolated",
@@ -344,8 +337,7 @@ def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFram
     axes) and all further ones. Raises InputError for an unknown sensor and times that do not
     increase.
     """
-    axes = [Column(f"a{axis}_m_s2") for axis in "xyz"]
-    table = read_table(path, [Column("t_s"), Column("sensor", "name"), *axes], extra=True)
+    table = read_table(path, ACCELEROMETER.of(), extra=True)
     if sensors is not None:
         check_names(table, "sensor", "accelerometer", sensors, path)
     for _, one in table.groupby("sensor"):
@@ -375,7 +367,7 @@ def read_references_csv(
     `fill_covariance`, from `REFERENCE_SIGMA_PX` where the file states none. Raises InputError for
     impossible values.
     """
-    table = read_table(path, _pixel_columns([Column("mark", "name")]), extra=True)
+    table = read_table(path, REFERENCES.of(), extra=True)
     _check_pixels(table, path, cameras, sizes_px, frame_count)
     _check_named_once(table, "mark", path)
     known = fill_covariance(table, path, REFERENCE_SIGMA_PX, of="the mark's place")
@@ -396,7 +388,7 @@ def read_detections_csv(
     ``attrs["sigma_known"]`` is True when it does.
     Raises InputError, with the row and the column, for values that are not possible.
     """
-    table = read_table(path, _pixel_columns(_OF_BUBBLES), extra=True)
+    table = read_table(path, _DETECTIONS, extra=True)
     return _detections(table, path, cameras, sizes_px, frame_count)
 
 
@@ -409,17 +401,18 @@ def read_detections_part(
     content : the header and some rows as bytes. row : number of the first of these rows in the
     file. Returns None for an unusual text, as `read_part` does.
     """
-    table = read_part(path, content, row, _pixel_columns(_OF_BUBBLES))
+    table = read_part(path, content, row, _DETECTIONS)
     if table is None:
         return None
     return _detections(table, path, cameras, sizes_px, frame_count)
 
 
-_OF_BUBBLES = [
-    Column("particle", "name", required=False, blank=True),
-    *(Column(name, required=False, blank=True) for name in ("a_px", "b_px", "angle_rad")),
-    Column("flags", "text", required=False, blank=True),
+_MEASURED = (*PIXEL, *(column.name for column in OF_PIXELS))
+_DETECTIONS = [
+    replace(column, blank=False) if column.name in _MEASURED else column
+    for column in DETECTIONS.of(need=("frame", "camera", *PIXEL), ids="name")
 ]
+"""Ids that a lab gives stay as they are; every row of an input has a place."""
 
 
 def _detections(
@@ -433,19 +426,6 @@ def _detections(
     _check_axes(table, path)
     known = fill_covariance(table, path, DETECTION_SIGMA_PX, of="the bubble's centre")
     return _finished(table, known)
-
-
-def _pixel_columns(own: list[Column]) -> list[Column]:
-    """Return the columns of a table of pixels with ``own`` columns."""
-    return [
-        Column("frame", "whole"),
-        Column("camera", "name"),
-        Column("u_px"),
-        Column("v_px"),
-        Column("sigma_px", required=False),
-        *(Column(name, required=False) for name in COVARIANCE),
-        *own,
-    ]
 
 
 def _check_pixels(

@@ -42,14 +42,17 @@ LARGEST_NUMBER = 1e15
 class Column:
     """Describe a column that a table may have; a blank cell is read as NaN or "".
 
-    kind : "number" (float), "whole" (whole number), "text" or "name" (text that follows the rule of
-        `telerig.io.files.names`).
+    kind : "number" (float), "whole" (whole number), "text", "name" (text that follows the rule of
+        `telerig.io.files.names`) or "id" (names that are read as numbers if all are whole numbers).
+    unit : in the notation of UDUNITS, "" for none. what : the meaning in words.
     """
 
     name: str
-    kind: Literal["number", "whole", "text", "name"] = "number"
+    kind: Literal["number", "whole", "text", "name", "id"] = "number"
     required: bool = True
     blank: bool = False
+    unit: str = ""
+    what: str = ""
 
 
 def read_table(
@@ -218,14 +221,14 @@ def _sound_table(
         if name not in numeric:
             cells = cells.str.strip()
             bad = (cells == "") & (not column.blank)
-            if column.kind == "name":
+            if column.kind in ("name", "id"):
                 bad |= cells.isin([one for one in cells.unique() if one and fault_of_name(one)])
         else:
             bad = ~(cells.abs() <= LARGEST_NUMBER) & ~(cells.isna() & column.blank)
             bad |= (cells % 1 > 0) & (column.kind == "whole")
         if bad.any():
             return None
-        values[name] = cells
+        values[name] = _as_ids(cells) if column.kind == "id" else cells
     return pd.DataFrame(values, index=table.index).set_index(rows.numbers)
 
 
@@ -321,6 +324,19 @@ def _name(cells: Sequence[str], column: Column, rows: Rows) -> Any:
     return found
 
 
+def _id(cells: Sequence[str], column: Column, rows: Rows) -> Any:
+    return _as_ids(pd.Series(_name(cells, column, rows), dtype=object)).to_numpy()
+
+
+def _as_ids(names: pd.Series[Any]) -> pd.Series[Any]:
+    """Return names as int64 if all are whole numbers, as float64 with NaN if some are blank."""
+    every = [name for name in names.unique() if name]
+    if not all(map(_WHOLE_ID.fullmatch, every)):
+        return names
+    numbers = names.map({"": np.nan} | {name: int(float(name)) for name in every})
+    return numbers.astype(float if (names == "").any() else np.int64)
+
+
 def _number(cells: Sequence[str], column: Column, rows: Rows) -> Array:
     values = _floats(cells)
     bad = ~(np.abs(values) <= LARGEST_NUMBER)
@@ -348,15 +364,17 @@ def _whole(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
     return values if column.blank else values.astype(np.int64)
 
 
-_TEXTS = ("text", "name")
+_TEXTS = ("text", "name", "id")
+_WHOLE_ID = re.compile(r"(?:0|-?[1-9]\d{0,14})(?:\.0*)?")
+"""Not "007", which is a name; "3.0" is what programs make of 3 where other cells are blank."""
 _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 _CONVERT: dict[str, Callable[..., Any]] = {
-    "number": _number, "whole": _whole, "text": _text, "name": _name,
+    "number": _number, "whole": _whole, "text": _text, "name": _name, "id": _id,
 }  # fmt: skip
 _DTYPES: dict[tuple[str, bool], Any] = {
     ("number", False): np.float64, ("number", True): np.float64,
     ("whole", False): np.int64, ("whole", True): np.float64,
-    ("text", False): str, ("text", True): str, ("name", False): str, ("name", True): str,
+    **{(kind, blank): str for kind in _TEXTS for blank in (False, True)},
 }  # fmt: skip
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
-from telerig.io.files.csv_table import Column, read_table
 from telerig.io.recording.replay import (
     GAP_INTERVALS,
     REGULAR_CLOCK,
@@ -26,6 +25,7 @@ from telerig.io.recording.replay import (
     replay,
 )
 from telerig.io.rig_file.description import DeviceDescription
+from telerig.io.tables.run import ACCELEROMETER
 
 _ROWS = 20_000
 _LISTED_GAPS = 200
@@ -33,7 +33,6 @@ _LONGEST_LINE = 200
 _MOST_FRAMES = 100
 """More frames than so many for each line that reports one cannot be right."""
 REFUSED_NAME = "refused.csv"
-_READINGS = ("ax_m_s2", "ay_m_s2", "az_m_s2")
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def _stage(records: Sequence[DeviceRecord]) -> Iterator[str]:
 
 
 def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
-    yield f"t_s,sensor,{','.join(_READINGS)}\n"
+    yield f"{','.join(ACCELEROMETER.names())}\n"
     for record in records:
         if len(record.t_s):
             unit = record.device.unit_m_s2
@@ -150,10 +149,9 @@ def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
 def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
     """Return the rows of an existing table whose sensors are not in this recording."""
     if file.is_file():
-        known = [Column("t_s"), Column("sensor", "name"), *map(Column, _READINGS)]
-        found = read_table(file, known, extra=True, empty=True)
+        found = ACCELEROMETER.read(file)
         others = found[~found["sensor"].isin(recorded)]
-        columns = [others[n].to_numpy() for n in ("t_s", "sensor", *_READINGS)]
+        columns = [others[n].to_numpy() for n in ACCELEROMETER.names()]
         yield from _rows("%r,%s,%r,%r,%r\n", columns)
 
 

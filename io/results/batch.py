@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from pathlib import PurePath
 from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator
@@ -58,7 +59,10 @@ class JobRecord(Part):
 
 
 class BatchFile(Record):
-    """Hold the content of batch.json: the name of the batch and the records of its jobs."""
+    """Hold the content of batch.json: the name of the batch and the records of its jobs.
+
+    fluid : the keys of [fluid] in rig.toml if it is the same in all smoothed runs, else empty.
+    """
 
     MISSING: ClassVar[str] = "no batch here"
     MAKE: ClassVar[str] = "telerig batch DATASETS --out FOLDER"
@@ -67,6 +71,7 @@ class BatchFile(Record):
     schema_: int = Field(1, alias="schema")
     name: str | None = None
     jobs: tuple[JobRecord, ...]
+    fluid: dict[str, Any] = Field(default_factory=dict)
 
 
 def verdict_of(record: Mapping[str, Any]) -> str:
@@ -83,3 +88,19 @@ def verdict_counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     """Return how often each verdict occurs among the jobs that were done."""
     found = (verdict_of(record) for record in records if record.get("status") == "done")
     return dict(Counter(word for word in found if word))
+
+
+def short_names(datasets: Iterable[str]) -> dict[str, str]:
+    """Return for each dataset's folder the shortest end of its path that no other one has."""
+    every = list(dict.fromkeys(datasets))
+    parts = {place: PurePath(place).parts for place in every}
+
+    def end(place: str, count: int) -> str:
+        return "/".join(parts[place][-count:])
+
+    found = {}
+    for place in every:
+        counts = range(1, len(parts[place]) + 1)
+        alone = (n for n in counts if [end(p, n) for p in every].count(end(place, n)) == 1)
+        found[place] = end(place, next(alone, len(parts[place])))
+    return found

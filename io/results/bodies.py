@@ -7,15 +7,6 @@ import pandas as pd
 
 from telerig.arrays import Array, Bools
 
-SHAPE_COLUMNS = [
-    "aspect", "s_aspect", "tilt_deg", "s_tilt_deg", "equator_mm", "s_equator_mm", "polar_mm",
-    "s_polar_mm", "pole_x", "pole_y", "pole_z", "r_size_aspect", "spheroid_chi2",
-    "noise_eq_mm", "fixed_eq_mm", "noise_aspect", "fixed_aspect", "stretch",
-    "noise_stretch",
-]  # fmt: skip
-"""Of tracks.csv and bubbles.csv: what outlines tell of a bubble's shape beside its size; blank
-where an outline is missing, cut or covered."""
-
 
 def ellipsoids_of(rows: pd.DataFrame) -> tuple[Array, Bools]:
     """Return Q (N, 3, 3) in mm^2 and rig axes of the spheroids x^T Q^-1 x = 1 of N bubbles.

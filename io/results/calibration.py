@@ -19,7 +19,6 @@ from pydantic import (
 
 from telerig.arrays import Array
 from telerig.errors import InputError, TelerigError
-from telerig.io.files.csv_table import Column
 from telerig.io.results.findings import (
     Code,
     Finding,
@@ -465,19 +464,6 @@ class ComparisonFile(Record):
     changes: tuple[Change, ...] = ()
 
 
-RESIDUALS = [
-    *(Column(name, "name") for name in ("view", "camera")),
-    *(Column(name, "whole") for name in ("dot", "row", "column")),
-    *(Column(name) for name in ("u_px", "v_px", "du_px", "dv_px", "weight")),
-    Column("reason", "text", blank=True),
-]
-DOT_COVARIANCE = ("suu_px2", "suv_px2", "svv_px2")
-DOTS = [
-    *(Column(name, "name") for name in ("view", "camera")),
-    Column("dot", "whole"),
-    *(Column(name, "whole", required=False) for name in ("row", "column")),
-    *(Column(name, required=False) for name in DOT_COVARIANCE),
-]
 _UNCERTAINTY = ("points_mm", "calibration_mm2", "measurement_mm2", "sigma_px")
 _DOT_EXAMPLE = ("patch", "model", "u0", "v0", "u_px", "v_px", "a_px", "b_px", "angle_rad", "noise")
 

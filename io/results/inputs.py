@@ -35,14 +35,15 @@ class Input(Part):
     bytes: int | None = None
     sampled: str | None = None
 
-    def change(self, path: Path) -> str:
+    def change(self, path: Path, *, alone: bool = True) -> str:
         """Return in words how ``path`` differs from the fingerprint; "" if it does not differ.
 
-        An input that no longer exists does not count as changed, because a results folder may be
-        copied without its inputs.
+        alone : whether the results may have been copied without their inputs, so that one that is
+            no longer there does not count as changed.
         """
         if not path.exists():
-            return ""
+            there = self.sha256 is not None or bool(self.files)
+            return "is no longer there" if there and not alone else ""
         if self.sha256 is None and not self.cameras:
             return "was added after they were made"
         now = Source(path, self.tables, self.cameras).fingerprint()

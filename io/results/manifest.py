@@ -106,6 +106,14 @@ class Section(Part):
                 raise ValueError(f"names no file: {name[:60]!r}")
         return names
 
+    def changes(self, folder: Path, *, alone: bool = True) -> dict[str, str]:
+        """Return by the path of each input that has changed since in words how, see `Input.change`.
+
+        folder : the results folder.
+        """
+        found = {name: one.change(folder / name, alone=alone) for name, one in self.inputs.items()}
+        return {name: how for name, how in found.items() if how}
+
     def changing(self) -> set[str]:
         """Return the names of the files that are being renamed or removed."""
         return set(self.found or ())

@@ -1,25 +1,17 @@
-"""Describe the files of a smoothed run: smoothing.json, trajectories.csv and shake.csv."""
+"""Describe smoothing.json, the summary of a smoothed run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from telerig.io.files.csv_table import Column
 from telerig.io.results.record import Name, Part, Record, Vector3
-from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, RigChange
-
-AXES = ("x", "y", "z")
-POSITION, VELOCITY, ACCELERATION = "{}_mm", "v{}_mm_s", "a{}_mm_s2"
-"""Patterns of column names in trajectories.csv for one axis: position (mm), velocity (mm/s) and
-acceleration (mm/s^2).
-
-A leading "s" marks the standard deviation, "naive_" and "rts_" two simpler estimates.
-"""
+from telerig.io.results.tracking import RigChange
+from telerig.io.tables.smoothing import AXES
 
 
 class Verdict(StrEnum):
@@ -339,35 +331,3 @@ class SmoothingFile(Record):
     seconds: dict[str, float] = Field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     accepted: tuple[str, ...] = ()
-
-
-def _optional(names: Sequence[str]) -> list[Column]:
-    """Return columns of numbers that a table may lack and whose cells may be blank."""
-    return [Column(name, required=False, blank=True) for name in names]
-
-
-def shake_columns(cameras: Sequence[str]) -> list[Column]:
-    """Return the columns of shake.csv, which has one row per frame.
-
-    They are frame, t_s (s), for each camera and axis the shake and its standard deviation in mm,
-    and the stage position with its standard deviation in mm.
-    """
-    columns = [Column("frame", "whole"), Column("t_s")]
-    for camera in cameras:
-        columns += [Column(f"{camera}_{axis}_mm") for axis in AXES]
-        columns += _optional([f"s{camera}_{axis}_mm" for axis in AXES])
-    return columns + _optional(["position_mm", "sposition_mm"])
-
-
-STATE = tuple(pattern.format(axis) for pattern in (POSITION, VELOCITY) for axis in AXES)
-"""The names of the position columns (mm) and velocity columns (mm/s) of trajectories.csv."""
-
-TRAJECTORIES = [
-    Column("frame", "whole"),
-    Column("particle", "whole"),
-    Column("t_s"),
-    *_optional([f"{kind}{name}" for kind in ("", "s", "naive_", "rts_") for name in STATE]),
-    Column("observed", "whole", required=False),
-    *_optional([prefix + ACCELERATION.format(axis) for prefix in ("", "s") for axis in AXES]),
-    *_optional([*CALIBRATION_SHARE, EXTRAPOLATED]),
-]

@@ -78,13 +78,13 @@ def _search(
 
 
 def _sentence(folder: Path, section: Section, found: dict[tuple[Path, str], str]) -> str:
-    reasons = []
-    for name, recorded in section.inputs.items():
+    reasons, changes = [], section.changes(folder)
+    for name in section.inputs:
         path = folder / name
         shown = name.lstrip("./")[-_LONGEST_NAME:]
         upstream = path.is_file() and _search(path.parent, [path.name], found)
-        if why := recorded.change(path):
-            reasons.append(f"{shown} {why}")
+        if name in changes:
+            reasons.append(f"{shown} {changes[name]}")
         elif upstream:
             reasons.append(f"{shown} is stale itself")
     if not reasons:

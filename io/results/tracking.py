@@ -1,4 +1,4 @@
-"""Describe the files of a tracked run: tracking.json, and the CSV tables beside it."""
+"""Describe tracking.json, the summary of a tracked run."""
 
 from __future__ import annotations
 
@@ -8,14 +8,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from telerig.arrays import Array
-from telerig.io.files.csv_table import Column
-from telerig.io.results.bodies import SHAPE_COLUMNS
 from telerig.io.results.record import Name, Part, Record, Vector3
-
-POINT = ("x_mm", "y_mm", "z_mm")
-SILHOUETTES = ("silhouettes_x_mm", "silhouettes_y_mm", "silhouettes_z_mm")
-COVARIANCE = ("sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2")
-PIXEL = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 
 
 class WorstFrame(Part):
@@ -116,13 +109,6 @@ class TrackingFile(Record):
     calibration_sd_mm: Vector3 | None = None
 
 
-CALIBRATION_SHARE = ("calibration_sx_mm", "calibration_sy_mm", "calibration_sz_mm")
-"""Columns of tracks.csv and trajectories.csv: standard deviation of a position by the errors of the
-calibration, which are common to the run."""
-EXTRAPOLATED = "extrapolated"
-"""Column of both tables: whether a position lies beyond the dots of the calibration (0/1)."""
-
-
 def share_words(sd_mm: Sequence[float] | Array | None, extrapolated: float | None) -> list[str]:
     """Return sentences on the errors that the calibration causes, and on extrapolated positions.
 
@@ -143,51 +129,3 @@ def share_words(sd_mm: Sequence[float] | Array | None, extrapolated: float | Non
             "there would show how good it is."
         )
     return words
-
-
-def _numbers(names: Sequence[str], *, required: bool = True) -> list[Column]:
-    """Return columns of numbers whose cells may be blank."""
-    return [Column(name, required=required, blank=True) for name in names]
-
-
-def tracks_columns(cameras: Sequence[str]) -> list[Column]:
-    """Return the columns of tracks.csv, which has one row per frame and bubble.
-
-    They are frame, particle, t_s (s), the position (mm) and its covariance (mm^2), for each camera
-    the pixel (px) and its covariance (px^2), the ray miss and the equivalent diameter (mm), and
-    further columns.
-    """
-    per_camera = [f"{camera}_{name}" for camera in cameras for name in PIXEL]
-    return [
-        Column("frame", "whole"),
-        Column("particle", "whole"),
-        Column("t_s"),
-        *_numbers([*POINT, *COVARIANCE, *per_camera, "ray_miss_mm", "d_eq_mm", "confidence"]),
-        *_numbers(["sd_eq_mm", *SHAPE_COLUMNS, *SILHOUETTES], required=False),
-        *(Column(name, "text", required=False, blank=True) for name in ("centre", "flags")),
-        *_numbers([*CALIBRATION_SHARE, EXTRAPOLATED], required=False),
-    ]
-
-
-DETECTIONS = [
-    Column("frame", "whole"),
-    Column("camera", "name"),
-    Column("particle", "whole", blank=True),
-    *_numbers(["u_px", "v_px"]),
-    *_numbers(["a_px", "b_px", "d_eq_px", "edge_px", "chi2_dof"], required=False),
-    *(Column(name, "text", required=False, blank=True) for name in ("flags", "reason")),
-]
-REFERENCES = [
-    Column("frame", "whole"),
-    Column("camera", "name"),
-    Column("mark", "name"),
-    *_numbers(["u_px", "v_px"]),
-    *_numbers(["sigma_px"], required=False),
-]
-EVENTS = [
-    Column("frame", "whole"),
-    Column("t_s", blank=True),
-    Column("kind", "text"),
-    Column("particles", "text", blank=True),
-    Column("reason", "text", blank=True),
-]

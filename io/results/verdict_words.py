@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from telerig.io.results.smoothing import (
-    AXES,
     RESOLVED_ETA,
     RESOLVED_Q,
     AxisVerdict,
@@ -25,6 +24,7 @@ from telerig.io.results.smoothing import (
     Use,
     Verdict,
 )
+from telerig.io.tables.smoothing import AXES
 from telerig.short_text import number, share
 
 _MUCH = 0.5

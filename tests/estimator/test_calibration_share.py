@@ -25,8 +25,9 @@ from telerig.estimator.smoothing.problem.tables import calibration_share
 from telerig.estimator.smoothing.terminal_summary import smoothing_words
 from telerig.estimator.tracking.tracks import Tracks, load_tracks, tracking_words
 from telerig.io.results.calibration_words import NO_COVARIANCE
-from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED, tracks_columns
 from telerig.io.simulation.presets import run_preset
+from telerig.io.tables.run import TRACKS
+from telerig.io.tables.table import CALIBRATION_SHARE, EXTRAPOLATED
 from telerig.rig.pose import Pose
 
 pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
@@ -125,7 +126,7 @@ def test_beyond_dots_is_outside_their_hull_in_any_camera(swarm: Swarm, tmp_path:
 def test_tracks_have_the_share_at_their_end(swarm: Swarm, tmp_path: Path) -> None:
     table, tracks = swarm.tracks.table, swarm.tracks
     assert list(table.columns[-4:]) == COLUMNS
-    assert [c.name for c in tracks_columns(["left", "right"])[-4:]] == COLUMNS
+    assert TRACKS.names(["left", "right"])[-4:] == COLUMNS
     points = table[["x_mm", "y_mm", "z_mm"]].to_numpy()
     share = swarm.calibration.common_covariance(points)
     sd = table[list(CALIBRATION_SHARE)].to_numpy()

@@ -80,6 +80,13 @@ def test_large_bubbles_in_tomiyamas_law_follow_the_wave_analogy() -> None:
     assert small[0] > small[1] >= small[2]
 
 
+def test_drag_of_spheres_is_stokes_at_creep_and_the_standard_curve_above() -> None:
+    """The standard drag curve has 1.09 at Re = 100 and 0.46 at Re = 1000 (Clift et al., 1978)."""
+    assert np.isclose(physics.schiller_naumann_drag(1e-4), 24e4, rtol=1e-3)
+    found = physics.schiller_naumann_drag([100.0, 999.0, 1000.0])
+    assert np.allclose(found[:2], [1.09, 0.46], rtol=0.05) and np.isnan(found[2])
+
+
 def test_moores_drag_of_a_sphere_is_levichs() -> None:
     found = physics.moore_drag(400.0, 1.0)
     assert np.isclose(found, 48 / 400 * (1 - 2.211 / np.sqrt(400)), rtol=1e-3)

@@ -233,7 +233,9 @@ def test_processes_that_are_killed(tmp_path: Path) -> None:
         while (ended := telerig(folder, step, *words)).returncode == 9:
             step += 1
             left = [p for p in data.rglob(".*.part*") if p.parent != folder]
-            assert len(left) == 1, "the files that were not renamed"
+            if not left:  # the results are whole; only the rows before corrections move in last
+                assert (folder.parent / f".{folder.name}.work").is_dir() and words[0] == "track"
+            assert len(left) <= 1, "the files that were not renamed"
             read = telerig(Path("/nowhere"), 0, "export", str(data), "--to", "trackpy")
             assert read.returncode in (0, 2), read.stderr
         assert ended.returncode == 0, ended.stderr

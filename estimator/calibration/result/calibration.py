@@ -19,7 +19,7 @@ from telerig.arrays import Array, as_points
 from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.result.summary import summary
 from telerig.io.files.atomic import atomic_path, plain
-from telerig.io.files.csv_table import read_table, write_table
+from telerig.io.files.csv_table import write_table
 from telerig.io.files.names import absent
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
@@ -105,8 +105,9 @@ class Calibration(ShortText):
         return self._table("residuals.csv")
 
     def _table(self, name: str) -> pd.DataFrame:
-        from telerig.io.results.calibration import DOTS, RESIDUALS, CalibrationFile
+        from telerig.io.results.calibration import CalibrationFile
         from telerig.io.results.manifest import reading
+        from telerig.io.tables.calibration import DOTS, RESIDUALS
 
         if not isinstance(self.tables, Path):
             if name in self.tables:
@@ -126,8 +127,7 @@ class Calibration(ShortText):
                     where=str(self.tables),
                     todo="load it again",
                 )
-            columns = DOTS if name == "dots.csv" else RESIDUALS
-            return read_table(file, columns, extra=True).reset_index(drop=True)
+            return (DOTS if name == "dots.csv" else RESIDUALS).read(file)
 
     @property
     def covariance_known(self) -> bool:
@@ -211,7 +211,7 @@ class Calibration(ShortText):
         lies; ``covariance`` (parameter, parameter_of) is 0 for parameters that were held fixed, and
         NaN if it is not known. Raises InputError if xarray is not installed.
         """
-        from telerig.io.exchange.export.run_results import unit_of
+        from telerig.rig.lens_parameters import unit_of_parameter
 
         table = self.to_pandas()
         place = {name: i for i, name in enumerate(table.index)}
@@ -229,7 +229,7 @@ class Calibration(ShortText):
             },
             {
                 "parameter": names, "parameter_of": names,
-                "units": ("parameter", [unit_of(name) for name in names]),
+                "units": ("parameter", [unit_of_parameter(name) for name in names]),
             },
             {"title": self.title()},
         )  # fmt: skip
@@ -419,7 +419,7 @@ class Calibration(ShortText):
         covariance is known, and `EXTRAPOLATED`, if its dots are known (see
         `telerig.io.results.tracking`).
         """
-        from telerig.io.results.tracking import CALIBRATION_SHARE, EXTRAPOLATED
+        from telerig.io.tables.table import CALIBRATION_SHARE, EXTRAPOLATED
 
         columns: dict[str, NDArray[Any]] = {}
         if self.covariance_known:

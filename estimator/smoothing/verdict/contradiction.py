@@ -25,7 +25,8 @@ from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
 from telerig.estimator.smoothing.verdict.evidence import BUBBLES, ENCODER, MARKS, Evidence, Tally
-from telerig.io.results.smoothing import AXES, Contradiction, Disagreement
+from telerig.io.results.smoothing import Contradiction, Disagreement
+from telerig.io.tables.smoothing import AXES
 
 HIGHEST_SPEED_MM_S = 10_000.0
 MOST_OUTLIERS = 0.2

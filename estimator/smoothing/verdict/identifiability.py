@@ -35,7 +35,6 @@ from telerig.estimator.smoothing.problem.window import Window, cut_out
 from telerig.estimator.smoothing.verdict.evidence import Shake, shake_of
 from telerig.factors.motion import start
 from telerig.io.results.smoothing import (
-    AXES,
     PARTIAL_ETA,
     PARTIAL_Q,
     RESOLVED_ETA,
@@ -45,6 +44,7 @@ from telerig.io.results.smoothing import (
     Flag,
     Verdict,
 )
+from telerig.io.tables.smoothing import AXES
 
 _MOST_FRAMES, _MOST_BUBBLES = 2000, 3
 _EDGE = 0.1

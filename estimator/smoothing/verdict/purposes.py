@@ -15,7 +15,8 @@ from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.draws import DRAWS, Draws
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
-from telerig.io.results.smoothing import AXES, Grade, Quantity, Use
+from telerig.io.results.smoothing import Grade, Quantity, Use
+from telerig.io.tables.smoothing import AXES
 
 GOOD, LIMITED = 10.0, 3.0
 """Signal over standard deviation from which a quantity is called good, or limited."""

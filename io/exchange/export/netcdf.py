@@ -19,6 +19,8 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import RunResults, facts, numbered, unit_of
 from telerig.io.files.atomic import atomic_path
+from telerig.io.tables.run import TRACKS
+from telerig.io.tables.smoothing import TRAJECTORIES
 from telerig.short_text import xarray_dataset
 
 if TYPE_CHECKING:
@@ -26,14 +28,10 @@ if TYPE_CHECKING:
 
 _LARGEST = np.iinfo(np.int32).max
 _NAMES = {"t_s": "time", "x_mm": "x", "y_mm": "y", "z_mm": "z"}
-_WORDS = {
-    "t_s": "time of mid-exposure by the clock of the record, which has no date",
-    "x_mm": "position along x, right in the first camera's image",
-    "y_mm": "position along y, down in the first camera's image",
-    "z_mm": "position along z, away from the first camera",
-    "frame": "index of the frame, from 0",
-    "observed": "1 where the bubble was detected in the frame",
-    "extrapolated": "1 where the position lies beyond the dots of the calibration",
+_DIRECTIONS = {
+    "x_mm": "along x, right in the first camera's image",
+    "y_mm": "along y, down in the first camera's image",
+    "z_mm": "along z, away from the first camera",
 }
 
 
@@ -135,14 +133,18 @@ def to_xarray(results: RunResults, covariance_mm2: Array | None = None) -> xarra
 
 
 def _attributes(column: str) -> dict[str, Any]:
+    known = TRAJECTORIES.column(column) or TRACKS.column(column)
+    words = known.what if known and known.what else column.replace("_", " ")
+    if column in _DIRECTIONS:
+        words += f", {_DIRECTIONS[column]}"
     if column == "t_s":
         return {
             "standard_name": "time",
-            "long_name": _WORDS[column],
+            "long_name": f"{words}, which has no date",
             "units": "s",  # "seconds" would become time differences in xarray, "since" dates
             "axis": "T",
         }
-    out = {"units": unit_of(column), "long_name": _WORDS.get(column, column.replace("_", " "))}
+    out = {"units": unit_of(column), "long_name": words}
     return out if column in _NAMES else out | {"coordinates": "time x y z"}
 
 

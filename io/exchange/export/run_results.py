@@ -14,12 +14,15 @@ import pandas as pd
 
 from telerig.arrays import Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column, read_table
+from telerig.io.files.csv_table import read_table
 from telerig.io.files.names import absent
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import SmoothingFile
 from telerig.io.results.stale import refuse_stale
+from telerig.io.tables.run import TRACKS
+from telerig.io.tables.smoothing import SHAKE, TRAJECTORIES
+from telerig.io.tables.table import POINT
 from telerig.rig.camera import Camera
 
 _TRAJECTORIES = ("trajectories.csv", "tracks.csv")
@@ -30,12 +33,6 @@ LAB = (
     "without shake"
 )
 RIG = "rig: the first camera's frame, which rides on the stage; shake and travel are still in it"
-
-_UNITS = {
-    "_px_per_mm": "px mm-1", "_per_mm": "mm-1",
-    "_mm_s2": "mm s-2", "_mm_s": "mm s-1", "_mm2": "mm2", "_mm": "mm", "_m_s2": "m s-2",
-    "_px2": "px2", "_px": "px", "_rad": "rad", "_s": "s",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,30 +80,19 @@ def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -
 
 
 def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunResults:
-    required = [Column("frame", "whole"), Column("particle", "name"), Column("t_s")]
-    required += [Column(f"{axis}_mm") for axis in "xyz"]
-    points = _whole_particles(read_table(place / source, required, extra=True))
     shake, smoothed = place / "shake.csv", source == "trajectories.csv"
+    columns = TRACKS.of(need=("frame", "particle", "t_s", *POINT))
+    points = read_table(place / source, columns, extra=True)
     return RunResults(
         name=place.name,
         frame=LAB if smoothed else RIG,
         points=points.sort_values(["particle", "frame"], kind="stable").reset_index(drop=True),
-        shake=read_table(shake, [Column("frame", "whole")], extra=True)
-        if shake.is_file() and smoothed
-        else None,
+        shake=SHAKE.read(shake) if shake.is_file() and smoothed else None,
         verdict=_verdict(place / "smoothing.json") if smoothed else "",
         source=source,
         accepted=accepted,
         folder=place,
     )
-
-
-def _whole_particles(points: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with whole numbers as particle ids if all are such; "007" is not one."""
-    text = points["particle"].astype(str)
-    if text.str.fullmatch(r"0|-?[1-9]\d{0,17}").all():
-        return points.assign(particle=text.astype(np.int64))
-    return points.assign(particle=text.astype(object))
 
 
 def _verdict(file: Path) -> str:
@@ -119,8 +105,9 @@ def _verdict(file: Path) -> str:
 
 
 def unit_of(column: str) -> str:
-    """Return the UDUNITS name of a column's unit, "1" for none, from the end of its name."""
-    return next((unit for end, unit in _UNITS.items() if column.endswith(end)), "1")
+    """Return the unit of a column of trajectories or shake, as UDUNITS has it; "1" for none."""
+    found = next(filter(None, (one.column(column) for one in (TRAJECTORIES, TRACKS, SHAKE))), None)
+    return (found and found.unit) or "1"
 
 
 def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:

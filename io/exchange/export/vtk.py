@@ -21,19 +21,15 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import RunResults, facts, numbered
 from telerig.io.files.atomic import atomic_folder
-from telerig.io.files.csv_table import Column, read_table
-from telerig.io.results.bodies import SHAPE_COLUMNS, ellipsoids_of
+from telerig.io.results.bodies import ellipsoids_of
+from telerig.io.tables.run import TRACKS
+from telerig.io.tables.table import SHAPE_COLUMNS
 
 SERIES, PATHS = "bubbles.pvd", "paths.vtp"
 _FRAMES = "frames"
 _VECTORS = {"velocity_mm_s": "v{}_mm_s", "acceleration_mm_s2": "a{}_mm_s2", "sd_mm": "s{}_mm"}
 _TYPES = {"f": "Float64", "i": "Int64", "u": "UInt8"}
 _POINT = ["x_mm", "y_mm", "z_mm"]
-_TRACKED = [
-    Column("frame", "whole"),
-    Column("particle", "name"),
-    *(Column(name, required=False, blank=True) for name in SHAPE_COLUMNS),
-]
 
 
 def write_vtk(results: RunResults, out: str | PathLike[str]) -> None:
@@ -96,7 +92,8 @@ def _diameters(results: RunResults) -> Array | None:
         return None
     file = None if results.folder is None else results.folder / "tracks.csv"
     if file is not None and file.is_file():
-        tracks = read_table(file, _TRACKED, extra=True)
+        tracks = TRACKS.read(file, need=("frame", "particle"))
+        tracks["particle"] = tracks["particle"].astype(str)
         shape = [name for name in SHAPE_COLUMNS if name in tracks]
         points = points[["frame", "d_eq_mm"]].assign(particle=points["particle"].astype(str))
         points = points.merge(tracks[["frame", "particle", *shape]], "left")

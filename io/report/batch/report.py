@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from telerig.errors import InputError
 from telerig.io.files.atomic import write_text_atomic
+from telerig.io.report import plot
 from telerig.io.report.page.figures import (
     CAMERA_COLOURS,
     LEFT_OUT,
@@ -19,11 +22,20 @@ from telerig.io.report.page.figures import (
     Picture,
     draw_curves,
     drawing,
+    svg_text,
 )
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, link_to, render_page
-from telerig.io.results.batch import BatchFile, verdict_and_flags, verdict_counts, verdict_of
+from telerig.io.report.plot.axes import colour_of
+from telerig.io.results.batch import (
+    BatchFile,
+    short_names,
+    verdict_and_flags,
+    verdict_counts,
+    verdict_of,
+)
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import Verdict
+from telerig.io.tables.smoothing import BATCH_BUBBLES
 from telerig.short_text import ABSENT, counted, is_number, number
 
 Job = Mapping[str, Any]
@@ -32,6 +44,7 @@ KINDS = {"calibrate": "calibrated", "track": "tracked", "smooth": "smoothed"}
 _DONE = "done"
 _COLOUR = {"calibrate": CAMERA_COLOURS[0], "track": CAMERA_COLOURS[1], "smooth": CAMERA_COLOURS[2]}
 _LONGEST_WORDS = 600
+_LEFT_OUT, _MOST_LOST = "left out", 4
 
 
 @dataclass(frozen=True)
@@ -46,22 +59,32 @@ class Line:
 
 def write_batch_report(folder: Path, out: Path | None = None) -> Path:
     """Write report.html beside batch.json, or into ``out``; InputError where there is no batch."""
-    with reading(Path(folder), ["batch.json"]):
+    bubbles = pd.DataFrame()
+    with reading(Path(folder), ["batch.json", "bubbles.csv"]):
         file = BatchFile.read(Path(folder) / "batch.json")
+        if (Path(folder) / "bubbles.csv").is_file():
+            bubbles = BATCH_BUBBLES.read(Path(folder) / "bubbles.csv")
     jobs = [job.content() for job in file.jobs]
     name = file.name or Path(folder).resolve().name
     place = Path(folder) if out is None else Path(out)
-    write_text_atomic(place / "report.html", render(jobs, place, name))
+    write_text_atomic(place / "report.html", render(jobs, place, name, bubbles, file.fluid))
     return place / "report.html"
 
 
-def render(jobs: Sequence[Job], folder: Path, name: str) -> str:
-    """Return the page as text. folder : where it will lie, for the links. name : of the batch."""
+def render(
+    jobs: Sequence[Job], folder: Path, name: str, bubbles: pd.DataFrame, fluid: Mapping[str, Any]
+) -> str:
+    """Return the page as text.
+
+    folder : where it will lie, for the links. name : of the batch. bubbles, fluid : of all runs.
+    """
+    names = short_names(str(j["dataset"]) for j in jobs)
     failed = [j for j in jobs if j["status"] != _DONE]
     runs = {(j["dataset"], j["run"]) for j in jobs if j["run"]}
     lost = {(j["dataset"], j["run"]) for j in failed if j["run"]}
     datasets = len({j["dataset"] for j in jobs})
     words = f"{len(runs) - len(lost)} of {len(runs)} runs done" if runs else "No runs"
+    drawn = _of_bubbles(bubbles, fluid, names)
     lines: dict[tuple[str, str], dict[str, Job]] = {}
     for job in jobs:
         if job["run"]:
@@ -69,13 +92,18 @@ def render(jobs: Sequence[Job], folder: Path, name: str) -> str:
     context = {
         "name": name,
         "headline": f"{words}, {datasets} dataset" + ("s" if datasets != 1 else ""),
+        "lost": _lost(failed, names),
         "colour": _colour(jobs),
         "words": _words(jobs),
         "figures": _key_numbers(jobs),
         "failures": [_failure(j) for j in failed],
-        "calibrations": [_calibration(j, folder) for j in jobs if j["kind"] == "calibrate"],
-        "runs": [_run(dataset, run, kinds, folder) for (dataset, run), kinds in lines.items()],
+        "calibrations": [_calibration(j, folder, names) for j in jobs if j["kind"] == "calibrate"],
+        "runs": [
+            _run(f"{names[dataset]} / {run}", run, kinds, folder)
+            for (dataset, run), kinds in lines.items()
+        ],
         "pictures": [p for p in drawn_over_cores(_drawings(jobs)) if p is not None],
+        "bubbles": drawn,
     }
     return render_page("template_batch.html", context, "")
 
@@ -115,6 +143,55 @@ def _words(jobs: Sequence[Job]) -> str:
     return " ".join(words)
 
 
+def _lost(failed: Sequence[Job], names: Mapping[str, str]) -> str:
+    """Return which jobs failed by themselves, for the headline; "" if none did."""
+    own = [j for j in failed if j["status"] != _LEFT_OUT]
+    words = [f"{j['kind']} {names[j['dataset']]}" + (j["run"] and f" / {j['run']}") for j in own]
+    more = len(words) - _MOST_LOST
+    return "; ".join(words[:_MOST_LOST]) + (f"; and {more} more" if more > 0 else "")
+
+
+@dataclass(frozen=True)
+class BubblePictures:
+    """What all runs say of bubbles: drawings as SVG, each with a caption, and the runs' colours."""
+
+    count: int
+    pictures: tuple[tuple[str, str, str], ...]
+    runs: tuple[tuple[int, str, str], ...]
+
+
+def _of_bubbles(
+    bubbles: pd.DataFrame, fluid: Mapping[str, Any], names: Mapping[str, str]
+) -> BubblePictures | None:
+    """Return pictures of the bubbles of all runs, beside published laws; None without bubbles."""
+    if not len(bubbles):
+        return None
+    whose = bubbles["dataset"].map(lambda place: names.get(place, place)) + " / " + bubbles["run"]
+    table, liquid = bubbles.assign(whose=whose), fluid or None
+    drawings = (
+        ("Speed against diameter", partial(plot.velocity, table, liquid, by="whose"),
+         "Mean speed along the path against the diameter, and laws of the rise velocity."),
+        ("Drag against Reynolds number", partial(plot.drag, table, liquid, by="whose"),
+         "The laws are for bubbles of these sizes that rise steadily."),
+        ("Aspect ratio against Weber number", partial(plot.aspect, table, by="whose"),
+         "Equatorial over polar semi-axis, and Moore's law for pure liquids."),
+    )  # fmt: skip
+    pictures = []
+    for title, draw, caption in drawings:
+        try:
+            with drawing(3.2, grid=True) as sheet:
+                draw(axes=sheet.axes)
+                lines = [line for line in sheet.axes.get_lines() if line.get_gid() is None]
+                known = [line for line in lines if not str(line.get_label()).startswith("_")]
+                sheet.axes.legend(handles=known, loc="best")
+        except InputError:  # no bubble of which these numbers are known
+            continue
+        pictures.append((title, svg_text(sheet.source), caption))
+    labels = pd.factorize(whose)[1]
+    runs = tuple((k, str(label), colour_of(k)) for k, label in enumerate(labels))
+    return BubblePictures(len(bubbles), tuple(pictures), runs)
+
+
 def _key_numbers(jobs: Sequence[Job]) -> list[Figure]:
     figures = []
     for kind, word in KINDS.items():
@@ -139,7 +216,7 @@ def _failure(job: Job) -> Row:
     return Row((f"{job['dataset']}{run}", f"{job['kind']} {job['status']}", words))
 
 
-def _calibration(job: Job, folder: Path) -> Line:
+def _calibration(job: Job, folder: Path, names: Mapping[str, str]) -> Line:
     found = job.get("figures") or {}
     share: Any = found.get("share_kept")
     cells = (
@@ -150,10 +227,10 @@ def _calibration(job: Job, folder: Path) -> Line:
         _text(found.get("rms_px")),
     )
     link = _link(job, folder, "calibration")
-    return Line(Path(job["dataset"]).name, link, cells, job["status"] != _DONE)
+    return Line(names[job["dataset"]], link, cells, job["status"] != _DONE)
 
 
-def _run(dataset: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
+def _run(name: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
     tracked, smoothed = (kinds.get(k, {}).get("figures") or {} for k in ("track", "smooth"))
     failed = [j for j in kinds.values() if j["status"] != _DONE]
     verdict = verdict_and_flags(kinds.get("smooth", {})) or (
@@ -169,7 +246,7 @@ def _run(dataset: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line
     )
     link = _link(next(iter(kinds.values())), folder, run)
     off = bool(failed) or verdict_of(kinds.get("smooth", {})) == Verdict.CONTRADICTED
-    return Line(f"{Path(dataset).name} / {run}", link, cells, off)
+    return Line(name, link, cells, off)
 
 
 def _text(value: Any) -> str:

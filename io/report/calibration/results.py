@@ -14,9 +14,6 @@ from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import read_table, rows_of
 from telerig.io.results.calibration import (
-    DOT_COVARIANCE,
-    DOTS,
-    RESIDUALS,
     CalibrationFile,
     ComparisonFile,
     read_dot_example,
@@ -26,6 +23,8 @@ from telerig.io.results.calibration import (
 from telerig.io.results.findings import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
+from telerig.io.tables.calibration import DOTS, RESIDUALS
+from telerig.io.tables.table import PIXEL_COVARIANCE
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -151,7 +150,7 @@ def _residuals(
             where=str(place),
             todo=CalibrationFile.AGAIN,
         )
-    table = read_table(place, RESIDUALS, extra=True)
+    table = read_table(place, RESIDUALS.of(), extra=True)
     for column, known in (("camera", [c.name for c in cameras]), ("view", list(views))):
         strange = ~table[column].isin(known).to_numpy()
         name = table[column][strange].iloc[0] if strange.any() else ""
@@ -169,8 +168,8 @@ def _with_whitened(table: pd.DataFrame, file: Path, floor_px: float) -> pd.DataF
     """Return residuals in units of the dots' own covariance, the common noise floor added to it."""
     if not file.is_file():
         return table
-    names = list(DOT_COVARIANCE)
-    dots = read_table(file, DOTS, extra=True)
+    names = list(PIXEL_COVARIANCE)
+    dots = DOTS.read(file)
     if not set(names) <= set(dots.columns):
         return table
     keys = ["view", "camera", "dot"]

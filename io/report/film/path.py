@@ -18,8 +18,9 @@ from telerig.io.report.film.mp4 import Picture, Progress, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.results import TrackResults, read_track_results
 from telerig.io.report.run.tracking.scene import thinned, track_colour
-from telerig.io.results.bodies import SHAPE_COLUMNS, ellipsoids_of
+from telerig.io.results.bodies import ellipsoids_of
 from telerig.io.results.manifest import reading
+from telerig.io.tables.table import SHAPE_COLUMNS
 
 STEP_DEG = 2
 MOST_POINTS = 3_000

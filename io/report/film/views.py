@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.mp4 import Progress, write_film
 from telerig.io.report.film.path import font
 from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
 from telerig.io.results.manifest import reading
+from telerig.io.tables.run import DETECTIONS
 
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
@@ -94,10 +94,7 @@ def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
             "is not there, so nothing can be drawn into the images", where=str(file),
             todo="track the run again (`telerig track`)",
         )  # fmt: skip
-    numbers = [Column(name, required=False, blank=True) for name in (*_ELLIPSE, *_SHAPE)]
-    keys = [Column("frame", "whole"), Column("camera", "text")]
-    particle = Column("particle", "text", blank=True)
-    table = read_columns(file, [*keys, particle, *numbers])
+    table = DETECTIONS.read_known(file)
     absent: dict[str, Any] = {name: 0.0 for name in _SHAPE if name not in table}
     absent |= {name: np.nan for name in _ELLIPSE if name not in table}
     table = table.assign(**absent)
@@ -141,13 +138,12 @@ def view_frames(
         for camera in cameras:
             found = []
             for row in where.get((frame, camera), np.zeros(0, np.int64)):
-                name = str(names[row])
-                tail = np.zeros((0, 2))
-                if name:
+                tail, tracked = np.zeros((0, 2)), not np.isnan(names[row])
+                if tracked:
                     path = paths[camera, names[row]]
                     late = path[(number[path] <= frame) & (number[path] >= frame - TAIL_FRAMES)]
                     tail = centres[late]
-                found.append(Found(outlines[row], int(float(name)) if name else None, tail))
+                found.append(Found(outlines[row], int(names[row]) if tracked else None, tail))
             views.append(tuple(found))
         yield ViewFrame(frame, None if t_s is None else float(t_s[frame]), tuple(views))
 

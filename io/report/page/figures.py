@@ -112,6 +112,12 @@ def svg(figure: Any) -> str:
     return data_uri("image/svg+xml", stream.getvalue())
 
 
+def svg_text(source: str) -> str:
+    """Return the element of an SVG picture, to stand in a page itself, where scripts reach it."""
+    text = base64.b64decode(source.partition(",")[2]).decode("utf-8")
+    return text[text.index("<svg") :]
+
+
 def png(figure: Any, dpi: int = 130, colours: int | None = None) -> str:
     """Return ``figure`` as a data URI of pixels; few ``colours`` make drawings of lines small."""
     stream = io.BytesIO()

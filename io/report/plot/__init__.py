@@ -4,11 +4,12 @@ In: tables as `telerig` returns and writes them, and optionally the axes to draw
 axes. Read ``bubbles`` first.
 """
 
-from telerig.io.report.plot.bubbles import drag, path, sizes, spectra, velocity
+from telerig.io.report.plot.bubbles import aspect, drag, path, sizes, spectra, velocity
 from telerig.io.report.plot.rig import coverage, residuals, shake, uncertainty
 
 __all__ = [
-    "coverage", "drag", "path", "residuals", "shake", "sizes", "spectra", "uncertainty", "velocity",
+    "aspect", "coverage", "drag", "path", "residuals", "shake", "sizes", "spectra", "uncertainty",
+    "velocity",
 ]  # fmt: skip
 
 

@@ -16,6 +16,14 @@ COLOURS = ("#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0")
 MUTED = "#8a8f98"
 
 
+_MANY_COLOURS = (*COLOURS, "#0a8f8f", "#b8860b", "#ad1457", "#5d4037", "#455a64", "#7cb342")
+
+
+def colour_of(k: int) -> str:
+    """Return the colour of the k-th of many groups; they repeat after ten."""
+    return _MANY_COLOURS[k % len(_MANY_COLOURS)]
+
+
 def axes_of(axes: Any, **settings: Any) -> Any:
     """Return the given axes, or new ones, with settings; ``projection`` "3d" makes them 3-D."""
     if axes is None:

@@ -13,6 +13,7 @@ from telerig.io.report.plot.axes import (
     COLOURS,
     MUTED,
     axes_of,
+    colour_of,
     columns_of,
     finite,
     height_and_sides,
@@ -24,7 +25,9 @@ from telerig.rig.bubble_physics import (
     clift_clean_velocity,
     clift_velocity,
     mendelson_velocity,
+    moore_aspect_weber,
     moore_velocity,
+    schiller_naumann_drag,
     tomiyama_velocity,
 )
 
@@ -77,21 +80,21 @@ def path(
     return axes
 
 
-def velocity(summary: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
+def velocity(
+    summary: pd.DataFrame, fluid: Any = None, *, by: str | None = None, axes: Any = None
+) -> Any:
     """Draw each bubble's mean speed against its diameter, beside published laws; returns axes.
 
     The speed is ``slip_mm_s``, along the path and relative to the liquid. The laws are of the rise
     velocity, which is smaller for a bubble that zigzags.
 
     summary : what `telerig.bubble_summary` returns. fluid : a mapping with the keys of [fluid] in
-    rig.toml, for the laws (`telerig.rig.bubble_physics`); None for none.
+    rig.toml, for the laws (`telerig.rig.bubble_physics`); None for none. by : column whose values
+    have a colour each, like "run" of a batch's bubbles.csv; None for one colour.
     Bars are one standard deviation. Raises InputError for a table without sizes or velocities.
     """
-    found = columns_of(summary, "d_eq_mm", "sd_eq_mm", "slip_mm_s", "s_slip_mm_s", made_by=_SUMMARY)
-    d, _, speed, _ = finite(found[0], 0 * found[0], found[2], 0 * found[2])
-    known = np.isfinite(found[0]) & np.isfinite(found[2])
     axes = axes_of(axes, xlabel="equivalent diameter / mm", ylabel="speed along the path / (mm/s)")
-    _points(axes, d, speed, found[1][known], found[3][known])
+    d, speed = _points(axes, summary, "d_eq_mm", "slip_mm_s", by)
     known_liquid = liquid_of(fluid)
     if known_liquid is not None:
         grid = _grid(d)
@@ -102,24 +105,22 @@ def velocity(summary: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> A
     return axes
 
 
-def drag(table: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
+def drag(table: pd.DataFrame, fluid: Any = None, *, by: str | None = None, axes: Any = None) -> Any:
     """Draw drag coefficients against Reynolds numbers, beside published laws; returns axes.
 
     table : what `telerig.bubble_summary` returns (with one standard deviation), or
-    `telerig.bubble_table` (a point per frame). fluid : as for `velocity`: the laws are drawn for
-    bubbles of these sizes that rise steadily.
+    `telerig.bubble_table` (a point per frame). fluid, by : as for `velocity`; the laws are drawn
+    for bubbles of these sizes that rise steadily, and for a rigid sphere.
     Raises InputError for a table without drag coefficients.
     """
-    found = columns_of(table, "reynolds", "drag", "s_reynolds", "s_drag", made_by=_SUMMARY)
-    good = np.isfinite(found[0]) & np.isfinite(found[1])
-    re, coefficient = finite(*found[:2])
     axes = axes_of(axes, xlabel="Reynolds number", ylabel="drag coefficient")
     if "frame" in table:
+        re, coefficient = finite(*columns_of(table, "reynolds", "drag", made_by=_SUMMARY))
         every = len(re) // _MOST_CLOUD + 1
         dots = {"markersize": 2, "alpha": 0.3, "color": COLOURS[0], "markeredgewidth": 0}
         axes.plot(re[::every], coefficient[::every], ".", label="frames", **dots)
     else:
-        _points(axes, re, coefficient, found[2][good], found[3][good])
+        re, coefficient = _points(axes, table, "reynolds", "drag", by)
     liquid = liquid_of(fluid)
     d = table["d_eq_mm"].to_numpy(float) if "d_eq_mm" in table else np.zeros(0)
     d = d[np.isfinite(d)]
@@ -134,13 +135,55 @@ def drag(table: pd.DataFrame, fluid: Any = None, *, axes: Any = None) -> Any:
     axes.set_ylim(low - margin if low < 0 else max(0.0, low - margin), high + margin)
     margin = 0.15 * (re.max() - re.min()) + 0.05 * re.max()
     axes.set_xlim(max(0.0, re.min() - margin), re.max() + margin)
+    low, high = axes.get_xlim()
+    sphere = np.linspace(low, high, 160)[1:]
+    if np.isfinite(schiller_naumann_drag(sphere)).any():
+        axes.plot(sphere, schiller_naumann_drag(sphere), ":", color=COLOURS[3], linewidth=1.0,
+                  label="Schiller, Naumann 1933, sphere")  # fmt: skip
     return axes
 
 
-def _points(axes: Any, x: Array, y: Array, x_sd: Array, y_sd: Array) -> None:
-    bars = [np.nan_to_num(sd) for sd in (x_sd, y_sd)]
-    axes.errorbar(x, y, bars[1], bars[0], fmt="o", markersize=4, color=COLOURS[0], linewidth=1.0,
-                  capsize=2, label="bubbles, ± 1 sd")  # fmt: skip
+def aspect(summary: pd.DataFrame, *, by: str | None = None, axes: Any = None) -> Any:
+    """Draw aspect ratios against Weber numbers, beside Moore's law of 1965; returns axes.
+
+    summary, by : as for `velocity`. Bars are one standard deviation. Raises InputError for a table
+    without aspect ratios or Weber numbers.
+    """
+    axes = axes_of(axes, xlabel="Weber number", ylabel="aspect ratio")
+    weber, ratio = _points(axes, summary, "weber", "aspect", by)
+    law = np.linspace(1.0 + 1e-3, 1.15 * max(float(ratio.max()), 1.2), 160)
+    clean = moore_aspect_weber(law)
+    seen = clean < 1.15 * weber.max()
+    axes.plot(
+        clean[seen], law[seen], "--", color=COLOURS[3], linewidth=1.0, label="Moore 1965, pure"
+    )
+    return axes
+
+
+def _points(axes: Any, table: pd.DataFrame, x: str, y: str, by: str | None) -> tuple[Array, Array]:
+    """Draw points with bars of one standard deviation; return the coordinates of those known.
+
+    Those of the k-th value of the column ``by`` have an id with ".k." in an SVG.
+    """
+    sds = [f"s{name}" if name == "d_eq_mm" else f"s_{name}" for name in (x, y)]
+    found = columns_of(table, x, y, *sds, made_by=_SUMMARY)
+    finite(*found[:2])
+    good = np.isfinite(found[0]) & np.isfinite(found[1])
+    u, v, su, sv = (np.nan_to_num(column[good]) for column in found)
+    groups = np.zeros(len(u), np.int64)
+    names = ["bubbles, ± 1 sd"]
+    if by is not None:
+        every, unique = pd.factorize(table[by])
+        groups, names = every[good], [str(name) for name in unique]
+    for k in np.unique(groups).tolist():
+        mine = groups == k
+        drawn = axes.errorbar(
+            u[mine], v[mine], sv[mine], su[mine], fmt="o", markersize=4, color=colour_of(k),
+            linewidth=1.0, capsize=2, label=names[k],
+        )  # fmt: skip
+        for part in drawn.get_children():
+            part.set_gid(f"{y}.{k}.{id(part)}")
+    return u, v
 
 
 def _grid(d_mm: Array) -> Array:

@@ -14,7 +14,10 @@ from typer.testing import CliRunner
 
 from telerig.estimator.batch import batch as work
 from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
-from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
+from telerig.estimator.batch.jobs import Job, jobs_of, share_of
+from telerig.io.results.inputs import Source, fingerprints
+from telerig.io.results.manifest import replaced_results
+from telerig.io.tables.smoothing import BATCH_BUBBLES
 from telerig.scripts.main import app
 
 pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes", "undrawn")
@@ -34,11 +37,18 @@ def _begun(monkeypatch, result=lambda job: {"status": "done", "words": "", "figu
 
     def perform_nothing(job: Job) -> dict:
         begun.append((job.kind, job.only_report))
+        place = Path(job.dataset)
+        used = [Source(place / "rig.toml", tables=("cameras",))]
+        if job.run:
+            used += [place / "runs" / job.run / name for name in ("detections.csv", "stage.csv")]
         if job.report:
-            job.results.mkdir(parents=True, exist_ok=True)
+            inputs = fingerprints(job.results, used)
+        found = result(job)
+        if job.report:
+            with replaced_results(job.results, job.kind, again="", inputs=inputs) as staged:
+                (staged / job.result.name).write_text("{}")
             (job.results / "report.html").touch()
-            job.result.write_text("{}")
-        return result(job)
+        return found
 
     monkeypatch.setattr(work, "perform", perform_nothing)
     return begun
@@ -84,6 +94,10 @@ def test_all_is_done_and_summed_up(tank):
     calibrated = json.loads((tank / "results/calibration/calibration.json").read_bytes())
     assert table["rms_px"][0] == pytest.approx(calibrated["statistics"]["rms_px"])
     assert table["sy_um"][2] > 0
+    bubbles = pd.read_csv(tank / "batch" / "bubbles.csv")
+    assert list(bubbles) == BATCH_BUBBLES.names() and set(bubbles["run"]) == {"rise"}
+    own = pd.read_csv(tank / "results" / "rise" / "bubble_summary.csv")
+    pd.testing.assert_frame_equal(bubbles[list(own)], own)
     assert all((tank / "results" / name).is_file() for name in RESULTS)
     said = (tank / "batch" / "said.txt").read_text(encoding="utf-8").splitlines()
     assert said[3:5] == ["calibrate: 1 done (1 GOOD)", "track: 1 done"]
@@ -99,12 +113,16 @@ def test_what_is_done_is_not_done_again_until_an_input_changes(tmp_path, monkeyp
     assert _again(jobs, out) == [True] * 3
     assert begun and all(drawn for _, drawn in begun)
     begun.clear()
-    same = fingerprint(jobs[1])
-    os.utime(data / "runs" / "rise" / "detections.csv", ns=(1, 1))
-    assert fingerprint(jobs[1]) != same
+    rig, found = data / "rig.toml", data / "runs" / "rise" / "detections.csv"
+    rig.write_text("# the tank at the window\n" + rig.read_text())
+    os.utime(found, ns=(1, 1))
+    assert _again(jobs, out) == [True] * 3 and not begun, "the content is the same"
+    found.write_text("\n".join(found.read_text().split("\n")[:-3]) + "\n")
     assert _again(jobs, out) == [True, False, False]
     assert begun == [("track", False), ("smooth", False)]
     assert _again(jobs, out) == [True] * 3
+    (data / "runs" / "rise" / "stage.csv").unlink()
+    assert _again(jobs, out) == [True, False, False], "an input was removed"
 
 
 def test_a_missing_report_is_drawn(tank_copy):
@@ -221,7 +239,8 @@ def test_an_input_that_changes_during_the_work_is_done_again(tmp_path, monkeypat
     data = make_dataset(tmp_path / "data", 5)
 
     def slowly(job: Job) -> dict:
-        os.utime(data / "rig.toml", ns=(1, 1))
+        text = (data / "rig.toml").read_text(encoding="utf-8")
+        (data / "rig.toml").write_text(text.replace("[512, 512]", "[512, 500]"), encoding="utf-8")
         return {"status": "done", "words": "", "figures": {}}
 
     _begun(monkeypatch, slowly)

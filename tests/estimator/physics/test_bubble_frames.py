@@ -12,8 +12,8 @@ from telerig.estimator.physics.frames import frames_table
 from telerig.estimator.physics.means import Lasting, mean_of_body
 from telerig.estimator.physics.oscillation import dominant_oscillation
 from telerig.estimator.physics.summary import summary_table
-from telerig.io.results.bubbles import BODY_COLUMNS, FRAME_COLUMNS, NUMBERS, SUMMARY_COLUMNS
 from telerig.io.rig_file.fluid import liquid_of
+from telerig.io.tables.smoothing import BODY_COLUMNS, BUBBLES, NUMBERS, SUMMARY
 
 UP = np.array([0.0, -1.0, 0.0])
 WATER = {"density_kg_m3": 998.2, "viscosity_pa_s": 1e-3, "surface_tension_n_m": 0.0728}
@@ -108,7 +108,7 @@ def test_liquid_that_moves_is_taken_off() -> None:
 
 def test_what_is_not_known_is_not_a_number() -> None:
     none = frames_table(motion(3), None, UP, G)
-    assert list(none) == FRAME_COLUMNS and len(none) == 3
+    assert list(none) == BUBBLES.names() and len(none) == 3
     assert none[["d_eq_mm", "drag", "reynolds"]].isna().all(axis=None)
     assert none["slip_mm_s"].notna().all()
     slow = motion(2).drop(columns=[c for c in motion() if c.endswith("mm_s2")])
@@ -240,7 +240,7 @@ def test_a_bubble_is_summarised() -> None:
     liquid = liquid_of(WATER, G)
     assert liquid is not None
     found = summary_table(frames, UP, liquid[0])
-    assert list(found) == SUMMARY_COLUMNS and len(found) == 1
+    assert list(found) == SUMMARY.names() and len(found) == 1
     row = found.iloc[0]
     assert row["rise_mm_s"] == pytest.approx(0.25) and row["lifetime_s"] == pytest.approx(399 / 500)
     particle = int(row["particle"])

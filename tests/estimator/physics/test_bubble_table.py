@@ -10,9 +10,9 @@ import pytest
 
 import telerig
 from telerig.estimator.smoothing.result import Smoothing
-from telerig.io.results.bubbles import FRAME_COLUMNS
 from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.run.motion import Forces, added_mass_along, driven_paths
+from telerig.io.tables.smoothing import BUBBLES
 from telerig.rig.bubble_physics import Liquid, added_mass, clift_velocity, drag_coefficient
 
 pytestmark = pytest.mark.usefixtures("without_advice")
@@ -74,7 +74,7 @@ def test_the_table_has_the_columns_of_the_contract(run: tuple[Smoothing, pd.Data
         "reynolds s_reynolds weber s_weber eotvos s_eotvos drag s_drag"
     )
     assert list(table)[:28] == first.split()
-    assert list(table) == FRAME_COLUMNS and len(table) == len(run[0].trajectories)
+    assert list(table) == BUBBLES.names() and len(table) == len(run[0].trajectories)
 
 
 def test_another_liquid_can_be_given(run: tuple[Smoothing, pd.DataFrame]) -> None:

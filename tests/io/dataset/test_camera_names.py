@@ -11,9 +11,9 @@ from rig_text import changed, error_of
 from telerig.errors import InputError
 from telerig.io.dataset.new_dataset import NewCamera, new_dataset
 from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes, nominal_toml
-from telerig.io.results.smoothing import shake_columns
 from telerig.io.rig_file.camera_names import camera_name_faults
 from telerig.io.rig_file.rig_file import read_rig_toml
+from telerig.io.tables.smoothing import SHAKE
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -61,7 +61,7 @@ def test_names_that_rig_toml_refuses_are_refused_where_they_are_first_given(
     [("ide", "side"), ("ss", "s"), ("x", "y", "sx"), ("left", "right"), ("sleft", "right-s")],
 )
 def test_names_that_would_share_a_column_are_refused_and_no_others(names: tuple[str, ...]) -> None:
-    columns = [column.name for column in shake_columns(names)]
+    columns = SHAKE.names(names)
     assert bool(camera_name_faults(names)) == (len(set(columns)) < len(columns))
 
 

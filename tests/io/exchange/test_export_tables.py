@@ -207,8 +207,9 @@ def test_given_names_reach_the_export_unchanged(folder: Path, tmp_path: Path) ->
     assert read.groupby("particle_name").size().to_dict() == {"007": 25, "7": 30, "12": 1}
 
 
-def test_units_come_from_the_names() -> None:
-    expected = {"svx_mm_s": "mm s-1", "sxx_mm2": "mm2", "left_u_px": "px", "frame": "1", "t_s": "s"}
+def test_units_come_from_the_declarations() -> None:
+    expected = {"svx_mm_s": "mm s-1", "sxx_mm2": "mm2", "left_u_px": "px", "frame": "1", "t_s": "s",
+                "heat_mm": "1"}  # fmt: skip
     assert {name: unit_of(name) for name in expected} == expected
 
 

@@ -13,8 +13,8 @@ import pytest
 
 import telerig
 from telerig.errors import InputError
-from telerig.io.results.bubbles import FRAME_COLUMNS, SUMMARY_COLUMNS
-from telerig.rig.bubble_physics import Liquid, mendelson_velocity
+from telerig.io.tables.smoothing import BUBBLES, SUMMARY
+from telerig.rig.bubble_physics import Liquid, mendelson_velocity, moore_aspect_weber
 
 WATER = {"density_kg_m3": 998.2, "viscosity_pa_s": 1e-3, "surface_tension_n_m": 0.0728}
 
@@ -30,7 +30,7 @@ def _closed() -> Iterator[None]:
 
 def summary(count: int = 5) -> pd.DataFrame:
     d = np.linspace(2.0, 4.0, count)
-    table = pd.DataFrame({"particle": np.arange(count)}).reindex(columns=SUMMARY_COLUMNS)
+    table = pd.DataFrame({"particle": np.arange(count)}).reindex(columns=SUMMARY.names())
     speed = 1e3 * mendelson_velocity(1e-3 * d, Liquid(998.2, 1e-3, 0.0728))
     re = 998.2 * d * 1e-3 * speed * 1e-3 / 1e-3
     known = {"d_eq_mm": d, "sd_eq_mm": 0.05, "slip_mm_s": speed, "s_slip_mm_s": 3.0,
@@ -40,7 +40,9 @@ def summary(count: int = 5) -> pd.DataFrame:
 
 def frames(count: int = 200) -> pd.DataFrame:
     t = np.arange(count) / 500
-    table = pd.DataFrame({"frame": np.arange(count), "particle": 3}).reindex(columns=FRAME_COLUMNS)
+    table = pd.DataFrame({"frame": np.arange(count), "particle": 3}).reindex(
+        columns=BUBBLES.names()
+    )
     swing = np.cos(2 * np.pi * 20 * t)
     known = {"t_s": t, "x_mm": swing, "y_mm": -250 * t, "z_mm": 0.0, "vx_mm_s": 40 * swing,
              "vy_mm_s": -250.0 + swing, "vz_mm_s": swing, "slip_mm_s": 250 + swing,
@@ -95,6 +97,19 @@ def test_drag_of_bubbles_and_of_frames() -> None:
         telerig.plot.drag(summary().assign(drag=np.nan))
     with pytest.raises(InputError, match=r"the dict has no column reynolds(.|\n)*bubble_summary"):
         telerig.plot.drag({})
+
+
+def test_aspect_ratios_lie_on_moores_law_and_groups_have_their_colours() -> None:
+    ratio = np.array([1.1, 1.4, 1.7, 2.0])
+    weber = moore_aspect_weber(ratio)
+    table = summary(4).assign(aspect=ratio, s_aspect=0.01, weber=weber, s_weber=0.1)
+    axes = telerig.plot.aspect(table.assign(run=["a", "a", "b", "b"]), by="run")
+    law = next(line for line in axes.get_lines() if line.get_label() == "Moore 1965, pure")
+    assert np.allclose(np.interp(weber, *law.get_data()), ratio, atol=2e-3)
+    handles, labels = axes.get_legend_handles_labels()
+    assert labels == ["Moore 1965, pure", "a", "b"]
+    colours = {handle.lines[0].get_color() for handle in handles[1:]}
+    assert len(colours) == 2
 
 
 def test_sizes_by_number_and_volume() -> None:

@@ -7,11 +7,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+import numpy as np
+import pandas as pd
 import pytest
 from report_page import Page
 
 from telerig.errors import InputError
+from telerig.io.files.csv_table import write_table
 from telerig.io.report.batch.report import write_batch_report
+from telerig.io.results.batch import short_names
+from telerig.io.tables.smoothing import BATCH_BUBBLES
 
 
 def _job(kind: str, run: str, status: str = "done", words: str = "", **figures: Any) -> Any:
@@ -52,6 +57,39 @@ def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
         assert words in page.spaced, words
     assert evil not in file.read_text(encoding="utf-8")
     assert 'class="verdict usable"' in file.read_text(encoding="utf-8")
+
+
+def test_bubbles_of_all_runs_are_drawn_by_run(tmp_path: Path) -> None:
+    jobs = [_job("smooth", "rise", verdict="RESOLVED"), _job("smooth", "fall", verdict="RESOLVED")]
+    jobs[1]["dataset"] = "/other/tank"
+    folder = _write(tmp_path / "out", jobs)
+    rows = pd.DataFrame(index=range(6), columns=BATCH_BUBBLES.names(), dtype=float)
+    d = np.linspace(1.5, 4.0, 6)
+    rows = rows.assign(
+        dataset=["/data/tank"] * 3 + ["/other/tank"] * 3, run=["rise"] * 3 + ["fall"] * 3,
+        particle=[0, 1, 2] * 2, first_frame=0, last_frame=9, frames=10, d_eq_mm=d, sd_eq_mm=0.02,
+        slip_mm_s=240.0, s_slip_mm_s=2.0, reynolds=240 * d, s_reynolds=5.0, drag=0.6, s_drag=0.05,
+    )  # fmt: skip
+    write_table(rows, folder / "bubbles.csv")
+    text = write_batch_report(folder).read_text(encoding="utf-8")
+    section = text[text.index('id="bubbles"') : text.index('id="calibrations"')
+                   if 'id="calibrations"' in text else text.index('id="runs"')]  # fmt: skip
+    assert section.count("<svg") == 2, "aspect ratios are not known"
+    assert section.count('type="checkbox"') == 2
+    assert "data/tank / rise" in section and "other/tank / fall" in section
+    for name in ("slip_mm_s", "drag"):
+        assert all(f'id="{name}.{k}.' in section for k in (0, 1))
+    assert "6 bubbles of 2 runs" in section
+
+
+def test_the_headline_names_what_failed_and_short_names_tell_datasets_apart(tmp_path: Path) -> None:
+    places = ["/a/x/tank", "/b/x/tank", "/b/pool"]
+    assert short_names(places) == dict(zip(places, ("a/x/tank", "b/x/tank", "pool")))
+    jobs = [_job("track", f"run{k}", "failed", "no light") for k in range(6)]
+    jobs += [_job("smooth", f"run{k}", "left out", "needs") for k in range(6)]
+    page = Page(write_batch_report(_write(tmp_path / "out", jobs)))
+    assert "Failed: track tank / run0; track tank / run1" in page.spaced
+    assert "and 2 more" in page.spaced and "Failed: smooth" not in page.spaced
 
 
 @pytest.mark.parametrize(

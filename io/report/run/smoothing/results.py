@@ -15,7 +15,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.io.files.csv_table import header_of, read_columns
+from telerig.io.files.csv_table import header_of
 from telerig.io.report.plot.spectrum import (
     LEAST_FRAMES,
     segment,
@@ -23,17 +23,11 @@ from telerig.io.report.plot.spectrum import (
     welch_density,
 )
 from telerig.io.report.run.tracking.results import median, rms
-from telerig.io.results.bubbles import BUBBLES, SUMMARY
 from telerig.io.results.manifest import reading
-from telerig.io.results.smoothing import (
-    AXES,
-    STATE,
-    TRAJECTORIES,
-    SmoothingFile,
-    shake_columns,
-)
-from telerig.io.results.smoothing import POSITION as PLACE
-from telerig.io.results.smoothing import VELOCITY as SPEED
+from telerig.io.results.smoothing import SmoothingFile
+from telerig.io.tables.smoothing import AXES, BUBBLES, SHAKE, STATE, SUMMARY, TRAJECTORIES
+from telerig.io.tables.smoothing import POSITION as PLACE
+from telerig.io.tables.smoothing import VELOCITY as SPEED
 
 __all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
 
@@ -126,10 +120,10 @@ def _read_smoothing_results(folder: Path, up: Array) -> SmoothingResults:
     if not cameras or sorted(known) != sorted(cameras):
         what = f"its columns are of cameras {list(cameras)}, smoothing.json's are {list(known)}"
         raise InputError(what, where=f"{file} row 1", todo=SmoothingFile.AGAIN)
-    shake = read_columns(file, shake_columns(known))
+    shake = SHAKE.read_known(file, known)
     _check_times(shake, file, "")
     file = folder / "trajectories.csv"
-    table = read_columns(file, TRAJECTORIES)
+    table = TRAJECTORIES.read_known(file)
     missing = [name for name in STATE if name not in table]
     if len(table) and missing:
         what = f"has no column {missing[0]}"
@@ -138,10 +132,7 @@ def _read_smoothing_results(folder: Path, up: Array) -> SmoothingResults:
     table = table.sort_values(["particle", "frame"], kind="stable", ignore_index=True)
     for particle, mine in table.groupby("particle", sort=False):
         _check_times(mine, file, f" of bubble {particle}")
-    more = (
-        read_columns(folder / name, columns, optional=True)
-        for name, columns in (("bubbles.csv", BUBBLES), ("bubble_summary.csv", SUMMARY))
-    )
+    more = (one.read_known(folder / one.file, optional=True) for one in (BUBBLES, SUMMARY))
     return SmoothingResults(stated, tuple(known), table, shake, up, *more)
 
 

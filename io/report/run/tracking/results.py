@@ -16,20 +16,13 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Rows, header_of, read_columns
+from telerig.io.files.csv_table import Rows, header_of
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
-from telerig.io.results.tracking import (
-    DETECTIONS,
-    EVENTS,
-    POINT,
-    REFERENCES,
-    SILHOUETTES,
-    Pairs,
-    TrackingFile,
-    tracks_columns,
-)
+from telerig.io.results.tracking import Pairs, TrackingFile
+from telerig.io.tables.run import DETECTIONS, EVENTS, REFERENCES, TRACKS
+from telerig.io.tables.table import POINT, SILHOUETTES
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate_views
 
@@ -119,12 +112,10 @@ def _read_track_results(folder: Path) -> TrackResults:
         what = f"its columns are of cameras {list(cameras)}, tracking.json's are {known}"
         raise InputError(what, where=f"{file} row 1", todo=TrackingFile.AGAIN)
     tables = {
-        name: read_columns(folder / f"{name}.csv", columns, optional=True)
-        for name, columns in (
-            ("detections", DETECTIONS), ("events", EVENTS), ("references", REFERENCES)
-        )
-    }  # fmt: skip
-    found = tables["detections"]
+        one.file: one.read_known(folder / one.file, optional=True)
+        for one in (DETECTIONS, EVENTS, REFERENCES)
+    }
+    found = tables[DETECTIONS.file]
     camera = found["camera"].to_numpy()
     Rows(folder / "detections.csv", np.arange(len(found)) + 2).refuse(
         ~np.isin(camera, cameras),
@@ -149,10 +140,10 @@ def _read_track_results(folder: Path) -> TrackResults:
     return TrackResults(
         file=stated,
         cameras=cameras,
-        tracks=read_columns(file, tracks_columns(cameras)),
+        tracks=TRACKS.read_known(file, cameras),
         detections=found[np.isfinite(found["u_px"])].reset_index(drop=True),
-        events=tables["events"],
-        references=tables["references"],
+        events=tables[EVENTS.file],
+        references=tables[REFERENCES.file],
         run=run,
         up=unit_vector(UP if stated.up is None else stated.up),
         pictures=pictures,

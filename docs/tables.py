@@ -1,0 +1,45 @@
+"""Write the columns of all tables into docs/files.md from their declarations: docs/tables.py
+
+``--check`` writes nothing, and ends with 1 if the page is not up to date.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from telerig.io.tables import calibration, run, smoothing
+from telerig.io.tables.table import CAMERA, Table
+
+PAGE = Path(__file__).parent / "files.md"
+BEGIN, END = "<!-- made by docs/tables.py -->\n", "<!-- end of tables -->\n"
+TABLES = (
+    calibration.DOTS, calibration.RESIDUALS, calibration.REJECTED, calibration.POSITIONS,
+    run.FRAMES, run.STAGE, run.ACCELEROMETER, run.REFERENCES, run.CORRECTIONS,
+    run.DETECTIONS, run.TRACKS, run.EVENTS,
+    smoothing.TRAJECTORIES, smoothing.SHAKE, smoothing.BUBBLES, smoothing.SUMMARY,
+    smoothing.BATCH_BUBBLES,
+)  # fmt: skip
+
+
+def markdown(table: Table) -> str:
+    """Return one table's columns as Markdown: those of one meaning stand in one row."""
+    lines = [f"### {table.file}\n", f"One row: {table.row}.\n"]
+    lines += ["| column | unit | what |", "|---|---|---|"]
+    for names, unit, what in table.rows_of_words():
+        shown = ", ".join(f"`{name.replace(CAMERA, '<camera>')}`" for name in names)
+        lines.append(f"| {shown} | {unit} | {what.replace('|', '&#124;')} |")
+    return "\n".join(lines) + "\n"
+
+
+def page() -> str:
+    """Return docs/files.md as it should be."""
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    after = rest.partition(END)[2]
+    return before + BEGIN + "\n" + "\n".join(map(markdown, TABLES)) + "\n" + END + after
+
+
+if __name__ == "__main__":
+    if "--check" in sys.argv:
+        sys.exit(page() != PAGE.read_text(encoding="utf-8"))
+    PAGE.write_text(page(), encoding="utf-8")

@@ -138,8 +138,8 @@ def against_joint(seeds: int) -> list[str]:
         for seed in range(1, seeds + 1):
             problem, lab = tracked(np.random.default_rng(seed), 400, 20, track)
             found, seconds = [], []
-            for most in (10**9, 0):
-                crowd.MOST_JOINT = most
+            for joint in (True, False):
+                crowd.jointly = lambda _, joint=joint: joint
                 begun = time.process_time()
                 found.append(solve(problem, true_model(), Options(robust=False)))
                 seconds.append(time.process_time() - begun)
@@ -252,7 +252,7 @@ def growing(frames: list[int], bubbles: list[int], tracks: list[int]) -> list[st
         lines.append(f"Exponent in frames: {growth(by_frames, 0)}.")
     if len(by_bubbles) > 1:
         lines.append(f"Exponent in bubbles: {growth(by_bubbles, 1)}.")
-        crowds = [c for c in by_bubbles if c[1] > crowd.MOST_JOINT]
+        crowds = [c for c in by_bubbles if c[1] > 1]
         lines.append(f"Exponent in bubbles from {crowds[0][1]} on: {growth(crowds, 1)}.")
     print("\n".join(lines[-3:]))
     return lines

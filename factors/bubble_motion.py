@@ -3,8 +3,8 @@
 Over a run, the position along each axis is a path plus zigzags. The velocity of the path is a
 constant mean U plus an Ornstein-Uhlenbeck process; a zigzag is a stochastic oscillator. Smoothing
 and learning represent these processes by states (`bubble_processes`). White noise drives both, so
-that their acceleration has no finite variance. For the acceleration their sum passes a low-pass
-(`inertial_bubble_path`), whose time is learned (`INERTIA_S`).
+that their acceleration has no finite variance. In the smoothing of a run their sum passes a
+low-pass (`inertial_bubble_path`), whose time is learned (`INERTIA_S`).
 
 A tracker works from one frame to the next. It needs an acceleration to set its gates, and it has no
 run from which a mean velocity could be known. Along the direction of rise the acceleration is
@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -44,6 +43,28 @@ class Zigzag:
 
 
 @dataclass(frozen=True)
+class Inertia:
+    """Describes the first-order low-pass filter through which forces move a bubble.
+
+    time_s : time constant of the filter along the rig's x, y and z axes.
+    forces : intensity of the forces along these axes, divided by their intensity in the model. The
+        zigzags keep their RMS; their damping is multiplied by this factor instead.
+    noise : standard deviation of the pixels' white noise along the rise and across it, divided by
+        the stated one.
+    unseen : variances of the velocity (mm^2/s^2) along the axes that a shorter low-pass, which the
+        run does not exclude, would add.
+    cancelled : variances of velocity (mm^2/s^2) and acceleration (mm^2/s^4) by which errors along
+        the path are smaller than independent errors along the axes would make them.
+    """
+
+    time_s: Triple
+    forces: Triple = (1.0, 1.0, 1.0)
+    noise: tuple[float, float] = (1.0, 1.0)
+    unseen: Triple = (0.0, 0.0, 0.0)
+    cancelled: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
 class BubbleModel:
     """Describes the prior distribution of the motion of every bubble.
 
@@ -54,8 +75,9 @@ class BubbleModel:
     zigzags : oscillations that are added to the path.
     wander_px, wander_tau_s : RMS and correlation time of the centroid's error in each image; 0 px
         for none.
-    inertia_s : time of the low-pass through which the forces of path and zigzags move a bubble, for
-        its acceleration; None if it is learned from the run.
+    inertia : low-pass through which the forces of path and zigzags move a bubble, so that its
+        acceleration is a state; None for forces without one. `telerig.smooth` learns it from the
+        run where it is None.
     """
 
     velocity_sigma_mm_s: float = 10.0
@@ -65,7 +87,7 @@ class BubbleModel:
     zigzags: tuple[Zigzag, ...] = ()
     wander_px: float = 0.0
     wander_tau_s: float = 0.1
-    inertia_s: float | None = None
+    inertia: Inertia | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +128,7 @@ name."""
 
 
 INERTIA_S = Prior(0.0005, 0.05, 0.002, 1.0, 0.7)
-"""Prior of `BubbleModel.inertia_s`. The median is short: it gives a bubble more acceleration than
+"""Prior of the time of an `Inertia`. The median is short: it gives a bubble more acceleration than
 most have, where a run does not show how much."""
 
 FORCES = Prior(0.02, 10.0, 1.0, 1.0, 0.7)
@@ -115,34 +137,6 @@ FORCES = Prior(0.02, 10.0, 1.0, 1.0, 0.7)
 NOISE = Prior(0.03, 2.0, 1.0, 0.5, 0.3)
 """Prior of the white noise of a bubble's pixels over the stated one, which contains what changes
 slowly, too: the effect of an unknown shape on the centre."""
-
-
-@dataclass(frozen=True)
-class Inertia:
-    """Describes the first-order low-pass filter through which forces move a bubble.
-
-    time_s : time constant of the filter along the rig's x, y and z axes.
-    forces : intensity of the forces along these axes, divided by their intensity in the model. The
-        zigzags keep their RMS; their damping is multiplied by this factor instead.
-    noise : standard deviation of the pixels' white noise along the rise and across it, divided by
-        the stated one.
-    """
-
-    time_s: Triple
-    forces: Triple = (1.0, 1.0, 1.0)
-    noise: tuple[float, float] = (1.0, 1.0)
-
-
-class LowPasses(NamedTuple):
-    """The most probable low-pass filter, and the shortest one that the run does not exclude.
-
-    cancelled : variances of velocity (mm^2/s^2) and acceleration (mm^2/s^4) by which errors along
-        the path are smaller than independent errors along the axes would make them.
-    """
-
-    probable: Inertia
-    shortest: Inertia
-    cancelled: tuple[float, float] = (0.0, 0.0)
 
 
 def learned_names(model: BubbleModel) -> list[str]:

@@ -28,8 +28,8 @@ from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.calibrate import nominal_cameras
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.estimator.smoothing.graph import accelerations
-from telerig.factors.bubble_motion import Inertia, LowPasses
+from telerig.estimator.smoothing import smooth
+from telerig.factors.bubble_motion import Inertia
 from telerig.io.machine import parallel
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.simulation.calibration.scene import View, hand_held_views, true_cameras, true_target
@@ -220,9 +220,9 @@ def tank_copy(tank: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="module")
 def known_low_passes() -> Iterator[None]:
     """Smoothings of this module are given the bubbles' low-pass; to learn it takes seconds."""
-    known = Inertia((0.01,) * 3)
+    known = Inertia((0.001,) * 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(accelerations, "learned_low_passes", lambda *_: LowPasses(known, known))
+        patch.setattr(smooth, "learned_inertia", lambda _: known)
         yield
 
 

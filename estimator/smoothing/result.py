@@ -11,8 +11,9 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
+from telerig.estimator.smoothing.graph.accelerations import Accelerations
 from telerig.estimator.smoothing.graph.layout import points_in_rig
-from telerig.estimator.smoothing.graph.solve import Accelerations, Solution
+from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     carriage,
     carriage_sigma,
@@ -327,7 +328,7 @@ def _along_path(solution: Solution, found: Accelerations) -> dict[str, float]:
     share = square / np.maximum(square.sum(-1, keepdims=True), 1e-18)
     speed = solution.velocity_variances() + considered_variance(solution)[1]
     totals = [(share * v).sum(-1).mean() for v in (speed, found.sd_mm_s2**2)]
-    left = 1 - np.divide(found.low_passes.cancelled, totals)
+    left = 1 - np.divide(found.inertia.cancelled, totals)
     return dict(zip(("velocity", "acceleration"), left.clip(_LEAST_LEFT, 1).tolist(), strict=True))
 
 

@@ -16,8 +16,6 @@ from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
-from telerig.estimator.smoothing.graph.accelerations import accelerations_of
-from telerig.estimator.smoothing.graph.low_pass import LEARNED_ROWS
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import carriage, travel_of
 from telerig.estimator.smoothing.learning.cross_validation import learning_record
@@ -30,6 +28,7 @@ from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.learning.likelihood import (
     with_hyperparameter_uncertainty,
 )
+from telerig.estimator.smoothing.learning.low_pass import LEARNED_ROWS, learned_inertia
 from telerig.estimator.smoothing.learning.window import MOST_FRAMES, first_of_most_seen
 from telerig.estimator.smoothing.phases import Phases
 from telerig.estimator.smoothing.pieces import (
@@ -88,7 +87,6 @@ if TYPE_CHECKING:
 
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.rig_drift import DriftPrior, Movement
-    from telerig.factors.bubble_motion import LowPasses
     from telerig.io.dataset.run import RunData
     from telerig.io.rig_file.description import RigDescription
 
@@ -277,8 +275,6 @@ class _Run:
         problem = self.problem
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
             solution = self._solved(problem, step)
-        with self.phases.phase("accelerations", "estimating accelerations"):
-            solution = _with_accelerations(solution)
         with self.phases.phase("verdict", "judging the result"):
             from telerig.estimator.smoothing.verdict.judge import judge
 
@@ -325,10 +321,8 @@ class _Run:
 
     def _solved(self, problem: SmoothingProblem, step: Progress) -> Solution:
         """Solve a run, or a piece; hyper-parameters that are not given are set by the result."""
-        if self.given:
-            return solve(problem, self.model, self.options, step)
-        solution = _adapted_solution(problem, self.model, self.options, step)
-        if solution.graph.model.learned:
+        solution = _adapted_solution(problem, self.model, self.options, step, given=self.given)
+        if solution.graph.model.learned and not self.given:
             step("uncertainty of what was learned", 0.9)
             solution = with_hyperparameter_uncertainty(solution)
         return solution
@@ -338,19 +332,17 @@ class _Run:
 
         Hyper-parameters that are not given are set by the piece in the middle, which is solved
         again at the end for what the verdict takes from the middle of a run. If far more is seen in
-        another piece, it takes the place of that in the middle. The low-pass of the
-        accelerations is that of the first piece with enough bubbles.
+        another piece, it takes the place of that in the middle.
         """
         from telerig.estimator.smoothing.verdict.judge import judge
 
         problem, model, parts = self.problem, self.model, list[Evidence]()
         sensors = dict[str, Any]()
-        swarm = low_passes = moved = None
+        swarm = None
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
             middle = piece_with_most(problem, pieces)
-            if not self.given:
-                step("a piece in the middle", 0.0)
-                model = self._solved(pieces[middle].cut(problem).problem, _silent).graph.model
+            step("a piece in the middle", 0.0)
+            model = self._solved(pieces[middle].cut(problem).problem, _silent).graph.model
             step("what is constant along the run", 0.0)
             constants = Constants.of(problem, model, pieces, self.options, step)
             with results_file(tables.folder) as file:
@@ -358,9 +350,6 @@ class _Run:
                     problem, model, pieces, self.options, step, constants
                 ):
                     solution = with_hyperparameter_uncertainty(solution)
-                    solution = _with_accelerations(solution, low_passes)
-                    if solution.accelerations and solution.graph.rows >= LEARNED_ROWS:
-                        low_passes = solution.accelerations.low_passes
                     span = Span(piece.own, piece.low, problem.t_s)
                     parts.append(Evidence.of(solution, drawn(solution), span))
                     sensors |= sensors_of(solution)
@@ -369,7 +358,6 @@ class _Run:
                     file.append(paths, offsets, states_of(solution, span), _beside(paths, bodies))
                     if piece == pieces[middle]:
                         swarm = self._swarm(solution, paths, bodies, span)
-                        moved = solution.accelerations
                     del window, solution, paths, offsets, bodies
                 with self.phases.phase("verdict", "judging the result"):
                     evidence = evidence_of(parts)
@@ -379,7 +367,6 @@ class _Run:
                         )
                     )
                     solution = with_hyperparameter_uncertainty(solution)
-                    solution = replace(solution, accelerations=moved)
                     verdict = judge(window.problem, model, solution, evidence)
                 inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
                 file.widen(inflation)
@@ -402,16 +389,6 @@ class _Run:
         own = (part[span.holds(part["frame"].to_numpy())] for part in every)
         paths, offsets = (part.assign(frame=part["frame"] + piece.low) for part in own)
         return paths, offsets
-
-
-def _with_accelerations(solution: Solution, low_passes: LowPasses | None = None) -> Solution:
-    """Return the solution with accelerations if it has bubbles and covariances.
-
-    low_passes : of the bubbles' forces; None to learn them.
-    """
-    if not solution.graph.problem.bubbles or solution.covariances is None:
-        return solution
-    return replace(solution, accelerations=accelerations_of(solution, drawn(solution), low_passes))
 
 
 def _beside(paths: pd.DataFrame, bodies: pd.DataFrame | None) -> pd.DataFrame | None:
@@ -633,27 +610,46 @@ def _longest_s(problem: SmoothingProblem) -> float:
 
 
 def _adapted_solution(
-    problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress | None
+    problem: SmoothingProblem,
+    model: ShakeModel,
+    options: Options,
+    progress: Progress | None,
+    *,
+    given: bool,
 ) -> Solution:
-    """Return the solution whose noise, RMS and delays have been set from a first solution, which
-    uses few samples of the sensors. The RMS of guessed modes is set by frames in which much is
-    seen, in the middle if possible.
+    """Return the solution whose hyper-parameters have been set from a first solution.
+
+    These are noise, RMS and delays, unless the model is given, and the low-pass of the bubbles'
+    forces. With broad bands the first solution uses few samples of the sensors. The RMS of guessed
+    modes is set by frames in which much is seen, in the middle if possible, and so is the low-pass
+    where nothing else is.
     """
-    if guessed_modes(model):
-        begin = first_of_most_seen(problem, _SIZED_FRAMES)
-        middle, found = all_of(problem, begin, begin + _SIZED_FRAMES).problem, None
-        for _ in range(_SIZING_PASSES):
-            found = solve(middle, model, options, progress, start=found)
-            better = adapted(found)
-            if better is None:
-                break
-            model, found = better, replace(found, covariances=None, draws=None)
-        return solve(problem, model, options, progress)
-    sensors = problem.accelerometers
-    coarse = replace(problem, accelerometers=thinned(sensors, _COARSE_STEP_S))
-    first = solve(coarse, model, options, progress)
-    better = adapted(first)
-    if better is None and not sensors:
-        return first
-    first = replace(first, covariances=None, draws=None)
-    return solve(problem, better or model, options, progress, start=first)
+    guessed, part, last = guessed_modes(model) and not given, problem, None
+    frames = max(_SIZED_FRAMES, int(LEARNED_ROWS / max(_mean_in_sight(problem), 1e-9)))
+    if model.broad_bands and not given:
+        if problem.accelerometers:
+            few = thinned(problem.accelerometers, _COARSE_STEP_S)
+            part = replace(problem, accelerometers=few)
+    elif frames < len(problem.t_s):
+        begin = first_of_most_seen(problem, frames)
+        part = all_of(problem, begin, begin + frames).problem
+    for _ in range(_SIZING_PASSES if guessed else 1):
+        bare = None if last is None else replace(last, covariances=None, draws=None)
+        last = solve(part, model, options, progress, start=bare)
+        better = None if given else adapted(last)
+        if better is None:
+            break
+        model = better
+    assert last is not None
+    if model.bubble.inertia is None and options.covariances:
+        model = replace(model, bubble=replace(model.bubble, inertia=learned_inertia(last)))
+    if model == last.graph.model and part is problem:
+        return last
+    bare = None
+    if len(part.t_s) == len(problem.t_s):
+        bare = replace(last, covariances=None, draws=None)
+    return solve(problem, model, options, progress, start=bare)
+
+
+def _mean_in_sight(problem: SmoothingProblem) -> float:
+    return sum(len(bubble) for bubble in problem.bubbles) / len(problem.t_s)

@@ -209,15 +209,15 @@ def test_every_bubble_of_a_crowd_has_the_calibrations_errors_at_its_own_place(
 ) -> None:
     problem, lab = spread_out(6)
     sd = []
-    for most in (100, 0):
-        monkeypatch.setattr(crowd, "MOST_JOINT", most)
+    for joint in (True, False):
+        monkeypatch.setattr(crowd, "jointly", lambda _, joint=joint: joint)
         solution = solve(problem, true_model(), Options(robust=False))
         assert solution.covariances is not None
         rows = solution.graph.bubble.position
         variance = np.diagonal(rows @ solution.covariances.bubbles @ rows.T, axis1=1, axis2=2)
         sd.append(np.sqrt(variance).reshape(6, -1, 3)[:, 30, 0])
-    joint, many = sd
+    alone, many = sd
     prior = np.sqrt(LENS.common_covariance(lab[:, 30])[:, 0, 0])
-    assert prior[0] > 0.025 and joint[0] > 1.2 * joint[2], (prior, joint, many)
-    assert (many > 0.97 * joint).all(), "no error is hidden"
-    assert (many < 1.5 * joint).all(), "what the run tells of the lens is left out, no more"
+    assert prior[0] > 0.025 and alone[0] > 1.2 * alone[2], (prior, alone, many)
+    assert (many > 0.97 * alone).all(), "no error is hidden"
+    assert (many < 1.5 * alone).all(), "what the run tells of the lens is left out, no more"

@@ -14,8 +14,8 @@ from telerig.errors import TelerigError
 from telerig.estimator.batch import batch
 from telerig.estimator.batch.jobs import Job
 from telerig.estimator.calibration import self_calibration
-from telerig.estimator.smoothing.graph import accelerations
-from telerig.factors.bubble_motion import Inertia, LowPasses
+from telerig.estimator.smoothing import smooth
+from telerig.factors.bubble_motion import Inertia
 from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
 from telerig.scripts.main import app
@@ -43,12 +43,12 @@ def make_results(folder: Path) -> None:
     No next view is proposed, and the bubbles' low-pass is given: each takes seconds.
     """
     make_dataset(folder, 5)
-    known = Inertia((0.01,) * 3)
+    known = Inertia((0.001,) * 3)
     words = ["batch", str(folder), "--out", str(folder / "batch"), "--no-report", "--workers", "1"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "_outcome", outcome_here)
         patch.setattr(self_calibration, "next_view", lambda *_: None)
-        patch.setattr(accelerations, "learned_low_passes", lambda *_: LowPasses(known, known))
+        patch.setattr(smooth, "learned_inertia", lambda _: known)
         done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     (folder / "batch" / "said.txt").write_text(done.output, encoding="utf-8")

@@ -43,8 +43,8 @@ from telerig.factors.linear_factors import LinearFactors, product, transposed_pr
 from telerig.io.machine.parallel import give_back_freed_memory
 from telerig.rig.triangulation import point_shift_jacobian
 
-MOST_JOINT = 8
-"""So many bubbles in sight are eliminated jointly."""
+_FEW, _MORE, _SHORT_S = 3, 8, 0.2
+"""So many bubbles in sight are eliminated jointly, and so many if their tracks are short."""
 _LEFT = 1e-4
 """Squared distance, in posterior standard deviations summed over all states, at which the
 conjugate gradients end."""
@@ -63,9 +63,23 @@ def eliminated(
     """
     only_frames = len(graph.nodes.t_s) == len(graph.problem.t_s)
     quick = only_frames and not graph.model.broad_bands
-    if most_in_sight(graph) <= MOST_JOINT:
+    if jointly(graph):
         return eliminate(graph, factors, cholesky=quick)
     return eliminate_crowd(graph, factors, cholesky=quick)
+
+
+def jointly(graph: GraphLayout) -> bool:
+    """Return whether all bubbles are eliminated in one graph, which is exact.
+
+    With a few bubbles that costs no more. The mean bubble's covariances are not good enough for
+    short tracks that nothing but images separates from the shake.
+    """
+    sight, problem = most_in_sight(graph), graph.problem
+    if sight <= _FEW:
+        return True
+    lasting = [float(problem.t_s[b.last] - problem.t_s[b.first]) for b in problem.bubbles]
+    short = float(np.median(lasting)) < _SHORT_S
+    return sight <= _MORE and short and not problem.measures_shake
 
 
 def most_in_sight(graph: GraphLayout) -> int:

@@ -6,7 +6,7 @@ Which component sits where in a node's vector, when nodes are, the keys of all v
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -17,15 +17,12 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     BroadBand,
-    Bubble,
-    Observations,
     RigMode,
     ShakeModel,
     SmoothingProblem,
 )
 from telerig.factors.bubble_motion import (
     BubbleModel,
-    Inertia,
     bubble_processes,
     inertial_bubble_path,
 )
@@ -228,12 +225,9 @@ def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
     return out
 
 
-def bubble_layout(model: BubbleModel, cameras: int, inertia: Inertia | None = None) -> BubbleLayout:
-    """Return the layout, which is the same for all bubbles. Each axis begins with its path.
-
-    inertia : low-pass after which a bubble's acceleration is a state; None without.
-    """
-    if inertia is None:
+def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
+    """Return the layout, which is the same for all bubbles. Each axis begins with its path."""
+    if model.inertia is None:
         processes = [
             (process, axis, number == 0)
             for axis, direction in enumerate(np.eye(3))
@@ -243,7 +237,7 @@ def bubble_layout(model: BubbleModel, cameras: int, inertia: Inertia | None = No
         parts = [(process.component, axis, is_path) for process, axis, is_path in processes]
     else:
         parts = [
-            (inertial_bubble_path(model, direction, inertia), axis, True)
+            (inertial_bubble_path(model, direction, model.inertia), axis, True)
             for axis, direction in enumerate(np.eye(3))
         ]
     motion = sum(c.size for c, *_ in parts)
@@ -557,40 +551,20 @@ def graph_layout(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) 
     if stage is not None:
         nominal = np.interp(nodes.t_s, stage.t_s, stage.position_mm)
     shake = shake_layout(problem, model)
-    return GraphLayout(
-        problem, model, shake, nodes=nodes, delays_s=delays_s, clock_of=clocks_of(problem),
-        nominal_mm=nominal, shake_motion=motion(shake.components, np.diff(nodes.t_s)),
-        **_of_bubbles(problem, nodes, bubble_layout(model.bubble, len(problem.cameras))),
-    )  # fmt: skip
-
-
-def with_bubbles(
-    graph: GraphLayout, bubbles: Sequence[Bubble], observations: Observations, layout: BubbleLayout
-) -> GraphLayout:
-    """Return the graph of the same rig with other bubbles, of another layout."""
-    problem = replace(graph.problem, bubbles=tuple(bubbles), observations=observations)
-    other = replace(graph, problem=problem, **_of_bubbles(problem, graph.nodes, layout))
-    vars(other)["to_frames"] = graph.to_frames  # of the rig alone, and worked out once
-    return other
-
-
-def _of_bubbles(problem: SmoothingProblem, nodes: Nodes, bubble: BubbleLayout) -> dict[str, Any]:
-    """Return the fields of `GraphLayout` that depend on the bubbles."""
+    bubble = bubble_layout(model.bubble, len(problem.cameras))
     lengths = np.array([len(b) for b in problem.bubbles], np.int64)
     first_row = np.r_[0, np.cumsum(lengths)].astype(np.int64)
     frames = [np.arange(b.first, b.last + 1) for b in problem.bubbles]
     frame_of_row = np.concatenate([*frames, np.zeros(0, np.int64)]).astype(np.int64)
     moving = np.setdiff1d(np.arange(len(frame_of_row)), first_row[1:] - 1)
     t = problem.t_s[frame_of_row]
-    return {
-        "bubble": bubble,
-        "first_row": first_row,
-        "node_of_row": nodes.of_frame[frame_of_row],
-        "bubble_of_row": np.repeat(np.arange(len(lengths)), lengths),
-        "frame_of_row": frame_of_row,
-        "bubble_motion": motion(bubble.components, t[moving + 1] - t[moving]),
-        "moving_rows": moving,
-    }
+    return GraphLayout(
+        problem, model, shake, bubble, nodes, delays_s, clocks_of(problem), nominal, first_row,
+        node_of_row=nodes.of_frame[frame_of_row],
+        bubble_of_row=np.repeat(np.arange(len(lengths)), lengths), frame_of_row=frame_of_row,
+        shake_motion=motion(shake.components, np.diff(nodes.t_s)),
+        bubble_motion=motion(bubble.components, t[moving + 1] - t[moving]), moving_rows=moving,
+    )  # fmt: skip
 
 
 def clocks_of(problem: SmoothingProblem) -> Ints:

@@ -25,13 +25,15 @@ from telerig.factors import measurements
 from telerig.factors.linear_factors import LinearFactors, prior_factors
 from telerig.factors.motion import start_factors
 from telerig.factors.state_space import log_det_of, whitener_of
-from telerig.rig.triangulation import rig_jacobian
+from telerig.rig.triangulation import rig_jacobian, stacked_jacobian
 
 SampleWeights = tuple[Array | None, ...]
 """Weights (N,) of the samples of each accelerometer; None where all are 1."""
 
 _AT_ONCE = 8192
 """Pixels whose factors are worked out together."""
+
+_LEAST_RISE = 1e-6
 
 _UNUSED = 1e8
 """Variance of an axis that is not used, in units of the others'."""
@@ -165,12 +167,29 @@ class Seen:
     residual: Array
 
 
+def white_noise(graph: GraphLayout, most: float = np.inf) -> Array:
+    """Return for each camera (C, 2, 2) the factor from the stated noise of a bubble's pixels to
+    the part of it that is white; what changes slowly is left out.
+
+    most : limit of the factors along the rise and across it.
+    """
+    cameras, inertia = graph.problem.cameras, graph.model.bubble.inertia
+    along, across = np.minimum((1.0, 1.0) if inertia is None else inertia.noise, most).tolist()
+    out = np.tile(across * np.eye(2), (len(cameras), 1, 1))
+    for factor, camera in zip(out, cameras, strict=True):
+        rise = stacked_jacobian((camera,), np.zeros((1, 3)))[1][0] @ graph.problem.up
+        length = np.linalg.norm(rise)
+        if length > _LEAST_RISE:
+            factor += (along - across) * np.outer(rise, rise) / length**2
+    return out
+
+
 def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
     """Return the factors of the bubbles' M pixels.
 
     weight : (M,) weights of a robust fit; None for the residuals alone.
     """
-    problem, layout = graph.problem, graph.bubble
+    problem, layout, white = graph.problem, graph.bubble, white_noise(graph)
     obs = problem.observations
     rows = graph.row(obs.item, obs.frame)
 
@@ -184,7 +203,8 @@ def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
             wander = layout.wander[obs.camera[mine]]
             shift = np.einsum("mid,md->mi", wander, each)
             by_shift = graph.in_bubble_basis(wander, row)
-        return _Moving(each @ layout.position.T, by_state, shift, by_shift)
+        noise = white[obs.camera[mine]]
+        return _Moving(each @ layout.position.T, by_state, shift, by_shift, noise)
 
     return _seen(graph, state, obs, weight, graph.base().bubbles + rows, states)
 
@@ -199,7 +219,7 @@ def references(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
     def states(mine: Ints) -> _Moving:
         by_state = np.broadcast_to(np.eye(3), (len(mine), 3, 3))
         shift = np.zeros((len(mine), 2))
-        return _Moving(state.marks[obs.item[mine]], by_state, shift, np.zeros((1, 2, 3)))
+        return _Moving(state.marks[obs.item[mine]], by_state, shift, np.zeros((1, 2, 3)), np.eye(2))
 
     return _seen(graph, state, obs, weight, graph.base().marks + obs.item, states)
 
@@ -208,12 +228,14 @@ class _Moving(NamedTuple):
     """What is seen: points (n, 3) in the lab, and by how much images are shifted (n, 2) px.
 
     by_state (n, 3, d), by_shift (n or 1, 2, d) : their derivatives by a state.
+    noise : (n or none, 2, 2) white noise over the stated one.
     """
 
     point_mm: Array
     by_state: Array
     shift_px: Array
     by_shift: Array
+    noise: Array
 
 
 def _seen(
@@ -260,7 +282,8 @@ def _one_camera(
 ) -> LinearFactors:  # fmt: skip
     """Return factors of some pixels of one camera; at_frames : (F, D) states of the shake."""
     problem, layout, frame = graph.problem, graph.shake, obs.frame[mine]
-    w = whitener_of(obs.covariance_px2[mine]) / graph.model.pixel_inflation
+    white = moving.noise @ obs.covariance_px2[mine] @ moving.noise
+    w = whitener_of(white) / graph.model.pixel_inflation
     shake = at_frames[frame]
     gain = 1 / (1 + state.encoder_scale(graph))
     position = gain * (shake @ layout.position)

@@ -6,6 +6,7 @@ import gc
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -13,6 +14,13 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError
+from telerig.estimator.smoothing.graph.accelerations import (
+    Accelerations,
+    accelerations_of,
+    add_slow_noise,
+    way_variances,
+)
+from telerig.estimator.smoothing.graph.bubble_chains import bubble_chains
 from telerig.estimator.smoothing.graph.crowd import (
     EliminatedCrowd,
     add_own_calibration,
@@ -35,7 +43,6 @@ from telerig.estimator.smoothing.graph.linear import (
     sample_weights,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
-from telerig.factors.bubble_motion import Inertia, LowPasses
 from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.robust_loss import truncation_weights
 from telerig.io.machine.parallel import give_back_freed_memory
@@ -109,41 +116,6 @@ class Covariances:
 
 
 @dataclass(frozen=True)
-class Accelerations:
-    """Hold the bubbles' velocities and accelerations in the laboratory frame (rig axes).
-
-    velocity_mm_s : (rows, 3).
-    velocity_covariance : (rows, 3, 3), rows as in the graph.
-    displacement_variance_mm2 : (bubbles, 3) of the way from the first frame to the last one.
-    length_variance_mm2 : (bubbles,) of the length of that way.
-    value_mm_s2 : (rows, 3).
-    covariance : (rows, 3, 3) in mm^2/s^4.
-    bandwidth_hz : (3,) along each axis the frequency up to which accelerations are followed by at
-        least half; 0 where the images say no more than the prior.
-    low_passes : the filters that were used, for the accelerations and for the velocities.
-    """
-
-    velocity_mm_s: Array
-    velocity_covariance: Array
-    displacement_variance_mm2: Array
-    length_variance_mm2: Array
-    value_mm_s2: Array
-    covariance: Array
-    bandwidth_hz: Array
-    low_passes: LowPasses
-
-    @property
-    def inertia(self) -> Inertia:
-        """The low-pass filter of the accelerations."""
-        return self.low_passes.probable
-
-    @property
-    def sd_mm_s2(self) -> Array:
-        """(rows, 3) standard deviations."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
-
-
-@dataclass(frozen=True)
 class Solution:
     """Hold the posterior of a smoothing problem.
 
@@ -158,8 +130,8 @@ class Solution:
     sample_weights, sample_residuals : weights (N,) of each accelerometer's samples, None where all
         are 1, and their whitened residuals (N, k) along the k directions of modelled motion.
     draws : None if they were not asked for.
-    accelerations : with the velocities; None where they were not asked for
-        (`accelerations.accelerations_of`).
+    ways : what `way_variances` returns; None without draws, or without a low-pass of the bubbles'
+        forces.
     constants : joint covariance of the constants in the order of their keys (sensors, encoder and
         calibration, marks, clocks); None if it was not asked for.
     """
@@ -174,7 +146,7 @@ class Solution:
     sample_weights: SampleWeights = ()
     sample_residuals: tuple[Array, ...] = ()
     draws: Draws | None = None
-    accelerations: Accelerations | None = None
+    ways: tuple[Array, Array] | None = None
     constants: Array | None = None
 
     @property
@@ -188,19 +160,24 @@ class Solution:
     @property
     def velocities_mm_s(self) -> Array:
         """Velocities (rows, 3) of the bubbles in the laboratory frame."""
-        if self.accelerations is not None:
-            return self.accelerations.velocity_mm_s
         return np.asarray(self.state.bubbles @ self.graph.bubble.velocity.T)
 
     def velocity_variances(self) -> Array:
-        """Return their variances (rows, 3); NaN without covariances."""
+        """Return their variances (rows, 3), with what a shorter low-pass of the forces would add;
+        NaN without covariances."""
         rows, found = self.graph.bubble.velocity, self.covariances
-        if self.accelerations is not None:
-            covariance = self.accelerations.velocity_covariance
-            return np.diagonal(covariance, axis1=1, axis2=2)
         if found is None:
             return np.full((self.graph.rows, 3), np.nan)
-        return np.asarray(((rows @ found.bubbles) * rows).sum(-1).clip(0))
+        inertia = self.graph.model.bubble.inertia
+        unseen = (0.0,) * 3 if inertia is None else inertia.unseen
+        return np.asarray(((rows @ found.bubbles) * rows).sum(-1).clip(0) + unseen)
+
+    @cached_property
+    def accelerations(self) -> Accelerations | None:
+        """The bubbles' accelerations; None without covariances, or without a low-pass."""
+        if self.covariances is None:
+            return None
+        return accelerations_of(self.graph, self.state, self.covariances.bubbles)
 
 
 def solve(
@@ -421,31 +398,48 @@ def _finish(
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
     evidence -= last.done.log_det()
     draws = draws_of(graph, last.factors, last.done) if options.draws else None
-    constants = _constants_covariance(graph, last.done) if options.constants else None
+    constants = _joint_covariance(graph, last.done, (3, 4, 5, 6)) if options.constants else None
+    ways = shared = None
+    if draws is not None and graph.rows and graph.model.bubble.inertia is not None:
+        if isinstance(last.done, EliminatedCrowd):
+            chains = last.done.chains
+        else:
+            chains = bubble_chains(graph, last.factors)
+        ways = way_variances(graph, state, last.factors, chains, draws)
+    if isinstance(last.done, EliminatedCrowd) and options.covariances and graph.share_size:
+        shared = _joint_covariance(graph, last.done, (4,))
     last.factors.clear()
     give_back_freed_memory()
     found = None
     if options.covariances:
         progress("covariances", 0.0)
         found = _covariances(graph, last.done.blocks())
-        if isinstance(last.done, EliminatedCrowd):
+        if shared is not None:
+            encoder, rig = np.split(np.arange(len(shared)), [graph.encoder_size])
+            of_encoder, of_rig = (shared[np.ix_(mine, mine)] for mine in (encoder, rig))
+            found = replace(found, encoder=of_encoder, calibration=of_rig)
             add_own_calibration(graph, state, found.bubbles, found.calibration)
+        add_slow_noise(graph, state, found.bubbles)
     progress("smoothing", 1.0)
     return Solution(
-        graph, state, found, *fitted, float(evidence), done, draws=draws, constants=constants
-    )
+        graph, state, found, *fitted, float(evidence), done, draws=draws, ways=ways,
+        constants=constants,
+    )  # fmt: skip
 
 
-def _constants_covariance(graph: GraphLayout, done: EliminatedGraph | EliminatedCrowd) -> Array:
-    """Joint covariance of what does not change along a run; its keys are the last ones."""
-    sizes = [n * d for n, d in graph.counts()]
-    count, every = sum(sizes[3:]), sum(sizes)
-    out = np.zeros((count, count))
-    for first in range(0, count, _COLUMNS_AT_ONCE):
-        mine = np.arange(first, min(first + _COLUMNS_AT_ONCE, count))
-        side = np.zeros((every, len(mine)))
-        side[every - count + mine, np.arange(len(mine))] = 1.0
-        out[:, mine] = done.solved(side)[every - count :]
+def _joint_covariance(
+    graph: GraphLayout, done: EliminatedGraph | EliminatedCrowd, families: Sequence[int]
+) -> Array:
+    """Return the joint covariance of some families of variables, such as what does not change along
+    a run."""
+    ends = np.cumsum([0, *(n * d for n, d in graph.counts())])
+    rows = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in families])
+    out = np.zeros((len(rows), len(rows)))
+    for first in range(0, len(rows), _COLUMNS_AT_ONCE):
+        mine = np.arange(first, min(first + _COLUMNS_AT_ONCE, len(rows)))
+        side = np.zeros((int(ends[-1]), len(mine)))
+        side[rows[mine], np.arange(len(mine))] = 1.0
+        out[:, mine] = done.solved(side)[rows]
     return (out + out.T) / 2
 
 

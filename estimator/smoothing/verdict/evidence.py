@@ -322,22 +322,22 @@ def _lost(solution: Solution, span: Span) -> dict[str, Lost]:
 
 def _means(solution: Solution, span: Span) -> dict[int, Mean]:
     """Return the mean velocity of each bubble that is seen in the span."""
-    found, moved, out = solution.covariances, solution.accelerations, {}
-    graph = solution.graph
-    speed = considered_variance(solution)[1] if moved is not None else np.zeros((graph.rows, 3))
+    found, ways, out = solution.covariances, solution.ways, {}
+    graph, velocity = solution.graph, solution.velocities_mm_s
+    speed = considered_variance(solution)[1] if ways is not None else np.zeros((graph.rows, 3))
     for i, bubble in enumerate(graph.problem.bubbles):
         if bubble.last < span.own.start or bubble.first >= span.own.stop:
             continue
         sigma = None if found is None else np.sqrt(np.diagonal(found.means[i]))
         way = length = None
-        if moved is not None:
+        if ways is not None:
             begin, end = graph.problem.t_s[[bubble.first, bubble.last]]
             rows = slice(graph.first_row[i], graph.first_row[i + 1])
             stage = speed[rows].mean(0) * (end - begin) ** 2
-            way = np.sqrt(moved.displacement_variance_mm2[i] + stage)
-            share = (moved.velocity_mm_s[rows] ** 2).mean(0)
+            way = np.sqrt(ways[0][i] + stage)
+            share = (velocity[rows] ** 2).mean(0)
             along = float(stage @ share / max(share.sum(), _STILL))
-            length = float(np.sqrt(moved.length_variance_mm2[i] + along))
+            length = float(np.sqrt(ways[1][i] + along))
         out[bubble.particle] = Mean(len(bubble), solution.state.means[i], sigma, way, length)
     return out
 

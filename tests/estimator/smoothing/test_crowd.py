@@ -22,9 +22,9 @@ def _both(
     problem: SmoothingProblem, model: ShakeModel, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Solution, Solution]:
     """The solution of the joint graph, and that of the crowd."""
-    monkeypatch.setattr(crowd, "MOST_JOINT", 10**9)
+    monkeypatch.setattr(crowd, "jointly", lambda _: True)
     joint = solve(problem, model)
-    monkeypatch.setattr(crowd, "MOST_JOINT", 0)
+    monkeypatch.setattr(crowd, "jointly", lambda _: False)
     return joint, solve(problem, model)
 
 
@@ -126,13 +126,13 @@ def test_sensors_and_marks_join_the_crowd(
 
 def test_draws_of_a_crowds_errors_have_the_spread_that_it_states() -> None:
     rng = np.random.default_rng(4)
-    problem, *_ = run(rng, bubbles=crowd.MOST_JOINT + 4, seconds=0.3)
+    problem, *_ = run(rng, bubbles=12, seconds=0.3)
     cut = with_comings_and_goings(problem, rng, 40)
     found = solve(cut, true_model(), Options(draws=True))
     draws, anew = found.draws, drawn(replace(found, draws=None))
     assert draws is not None
     assert drawn(found) is draws
-    assert crowd.most_in_sight(found.graph) > crowd.MOST_JOINT
+    assert not crowd.jointly(found.graph)
     rows = found.graph.bubble.position
     each = found.graph.bubbles_moved(draws.of_family(found.graph, 1)[..., 0]) @ rows.T
     assert 0.7 < np.sqrt(np.mean((each / _sigma(found, rows)) ** 2)) < 1.3

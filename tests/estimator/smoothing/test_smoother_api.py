@@ -306,7 +306,7 @@ def test_two_frames_and_a_bubble_seen_once() -> None:
     assert seen[-1][1] == 1.0
     assert all(0 <= share <= 1 for _, share in seen)
     assert list(found.summary["seconds"]) == [
-        "checks", "learning", "smoothing", "accelerations", "verdict", "tables",
+        "checks", "learning", "smoothing", "verdict", "tables",
     ]  # fmt: skip
 
 

@@ -1,4 +1,7 @@
-"""The low-pass of the bubbles' forces, and the white noise of their pixels, learned from a run.
+"""Learns the low-pass of the bubbles' forces, and the white noise of their pixels, from a solution.
+
+The stated covariance of a pixel contains what the bubble's unknown shape adds. That part changes
+slowly: it belongs to a position, not to a velocity. So the white noise is learned, too.
 
 Along the rise and across it, the time of the low-pass, the intensity of the forces and the noise
 maximise the expectation of the log-likelihood of triangulated positions over draws of the rig's
@@ -19,15 +22,13 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.layout import GraphLayout
 from telerig.estimator.smoothing.graph.linear import images
-from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.factors.bubble_motion import (
     FORCES,
     INERTIA_S,
     NOISE,
     BubbleModel,
     Inertia,
-    LowPasses,
-    Prior,
     Triple,
     bubble_processes,
     inertial_bubble_path,
@@ -40,7 +41,8 @@ RigErrors = tuple[Array, Array]
 _PIECE_FRAMES, LEARNED_ROWS, _DRAWS = 250, 6000, 2
 """Pieces of tracks of at most so many frames, so many together, with so many draws of the rig."""
 _LEAST_INFORMATION = 1e-6
-_SPECTRUM_HZ, _FREQUENCIES, _STILL_MM_S = (0.1, 3e4), 4000, 1e-9
+_FREQUENCY_HZ = np.geomspace(0.1, 3e4, 4000)
+_STILL_MM_S, _NONE = 1e-9, np.zeros(0)
 _EXCLUDED, _HALVINGS, _SHORTEST_S = 0.5, 6, 1e-5
 """A low-pass is excluded if its log-likelihood is so much less than that of the most probable."""
 _ENOUGH = 1e-6
@@ -60,72 +62,98 @@ class Series(NamedTuple):
     variance: Array
 
 
-def learned_low_passes(solution: Solution, rig: RigErrors) -> LowPasses:
-    """Return low-passes with their intensity of the forces and white noise.
+def learned_inertia(solution: Solution) -> Inertia | None:
+    """Return the most probable low-pass with its intensity of the forces and white noise.
 
-    The shorter a low-pass is, the more velocity it allows that no image shows: with the shortest
-    one a velocity is never stated too well. An acceleration grows without limit with it.
+    The shorter a low-pass is, the more velocity it allows that no image shows. What the shortest
+    one that is not excluded would add is stated with it, so that a velocity is never stated too
+    well. None without bubbles.
+
+    solution : of bubbles without a low-pass, with covariances.
     """
-    graph = solution.graph
+    graph, draws = solution.graph, drawn(solution)
+    if not graph.rows:
+        return None
+    rig = draws.of_family(graph, 0)[..., :_DRAWS], draws.of_family(graph, 4)[0, :, :_DRAWS]
     pieces = _pieces(graph)
-    place, information = _positions(
-        solution, (rig[0][..., :_DRAWS], rig[1][..., :_DRAWS]), np.concatenate(pieces)
-    )
+    place, information = _positions(solution, rig, np.concatenate(pieces))
     t_s, up, bubble = graph.problem.t_s[graph.frame_of_row], graph.problem.up, graph.model.bubble
     dt_s, step = distinct_steps(np.concatenate([np.diff(t_s[p]) for p in pieces]))
     steps = np.split(step, np.cumsum([len(p) - 1 for p in pieces])[:-1])
     ends = np.cumsum([len(p) for p in pieces])[:-1]
 
-    def learned(directions: Array, bubble: BubbleModel = bubble) -> Array:
-        paths = []
+    def paths(directions: Array, bubble: BubbleModel = bubble) -> _Paths:
+        every = []
         for direction in np.broadcast_to(directions, (len(directions), len(place), 3)):
             cut = (np.split(x, ends) for x in (direction, place, _variance(direction, information)))
-            paths.append([_series(*part) for part in zip(steps, *cut, strict=True)])
-        return _Paths(bubble, directions[:, 0], dt_s, paths).learned()
+            every.append([_series(*part) for part in zip(steps, *cut, strict=True)])
+        return _Paths(bubble, directions[:, 0], dt_s, every)
 
-    along, across = learned(up[None, None]), learned(np.linalg.svd(up[None])[2][1:, None])
-    probable, shortest = (_by_axis(*both, up) for both in zip(along, across, strict=True))
+    both = [paths(up[None, None]).learned(), paths(np.linalg.svd(up[None])[2][1:, None]).learned()]
+    probable, shortest = (_by_axis(a, b, up) for a, b in zip(*both, strict=True))
     seen = information.any((1, 2))
     if not seen.any():
-        return LowPasses(probable, shortest)
+        return probable
     path = solution.state.bubbles[np.concatenate(pieces)] @ graph.bubble.velocity.T
     path = path / np.maximum(np.linalg.norm(path, axis=-1, keepdims=True), _STILL_MM_S)
     share = (path**2).mean(0)
-    plain = _without_swing(bubble, share)
-
-    def left_out(inertia: Inertia, derivative: int) -> float:
-        time_s = float(share @ inertia.time_s)
-        force = float(learned(path[None], replace(plain, inertia_s=time_s))[0, 1])
-        white = inertia.noise[1] + (inertia.noise[0] - inertia.noise[1]) * up**2
-        return _cancelled(
-            [inertial_bubble_path(bubble, axis, inertia) for axis in np.eye(3)],
-            inertial_bubble_path(plain, up, Inertia((time_s,) * 3, (force,) * 3)),
-            white**2 * noise, share, derivative,
-        )  # fmt: skip
-
+    plain, time_s = _without_swing(bubble, share), float(share @ probable.time_s)
+    force = float(paths(path[None], plain).best(np.array([time_s]))[1])
+    along = inertial_bubble_path(plain, up, Inertia((time_s,) * 3, (force,) * 3))
     every = np.diagonal(np.linalg.inv(information[seen]), axis1=1, axis2=2)
-    noise = 2 * float(np.median(dt_s[step])) * np.median(every, axis=0)
-    return LowPasses(probable, shortest, (left_out(shortest, 1), left_out(probable, 2)))
+    stated = 2 * float(np.median(dt_s[step])) * np.median(every, axis=0)
+    used, other = (_Filtered.of(bubble, one, up, stated) for one in (probable, shortest))
+    x, y, z = used.unseen(other).tolist()
+    cancelled = used.cancelled(along, share, 1), used.cancelled(along, share, 2)
+    return replace(probable, unseen=(x, y, z), cancelled=cancelled)
 
 
-def _cancelled(
-    axes: Sequence[Component], along: Component, noise: Array, share: Array, derivative: int
-) -> float:
-    """Return the variance by which a derivative's errors along the path are smaller than errors of
-    axes that are independent.
+@dataclass(frozen=True)
+class _Filtered:
+    """The axes' motion and noise, whose filter S / (S + N) makes the estimate.
 
-    axes : processes along the axes, whose filters S / (S + N) made the estimate. along : process
-    that moves the bubbles along their paths. noise : (3,) one-sided densities N of the positions'
-    white noise, mm^2/Hz. share : (3,) mean squares of the components of the paths' directions.
+    density, noise : (3, F) and (3, 1) one-sided densities S and N of the positions, mm^2/Hz.
     """
-    frequency = np.geomspace(*_SPECTRUM_HZ, _FREQUENCIES)
-    density = np.stack([process.density(frequency) for process in axes])
-    kept = density / (density + noise[:, None])
-    mean = share @ kept
-    # forces across the path cancel along it where all axes are filtered alike
-    hidden = (1 - mean) ** 2 * along.density(frequency) + share @ ((kept - mean) ** 2 * density)
-    less = share @ (kept * (1 - kept) * noise[:, None]) - hidden
-    return float(np.trapezoid((2 * np.pi * frequency) ** (2 * derivative) * less, frequency))
+
+    density: Array
+    noise: Array
+
+    @classmethod
+    def of(cls, bubble: BubbleModel, inertia: Inertia, up: Array, stated: Array) -> _Filtered:
+        """stated : (3,) density of the noise if all that is stated were white."""
+        axes = [inertial_bubble_path(bubble, axis, inertia) for axis in np.eye(3)]
+        white = inertia.noise[1] + (inertia.noise[0] - inertia.noise[1]) * up**2
+        return cls(np.stack([a.density(_FREQUENCY_HZ) for a in axes]), (white**2 * stated)[:, None])
+
+    @property
+    def kept(self) -> Array:
+        return np.asarray(self.density / (self.density + self.noise))
+
+    def unseen(self, other: _Filtered) -> Array:
+        """Return the variances (3,) of the velocity that are stated too small, at least 0, if the
+        other motion and noise are true."""
+        kept = self.kept
+        left = (1 - kept) ** 2 * other.density + kept**2 * other.noise - kept * self.noise
+        return _integral(left, 1).clip(0.0)
+
+    def cancelled(self, along: Component, share: Array, derivative: int) -> float:
+        """Return the variance by which a derivative's errors along the path are smaller than errors
+        of axes that are independent.
+
+        along : process that moves the bubbles along their paths. share : (3,) mean squares of the
+        components of the paths' directions.
+        """
+        kept, mean = self.kept, share @ self.kept
+        # forces across the path cancel along it where all axes are filtered alike
+        hidden = (1 - mean) ** 2 * along.density(_FREQUENCY_HZ)
+        hidden += share @ ((kept - mean) ** 2 * self.density)
+        return float(_integral(share @ (kept * (1 - kept) * self.noise) - hidden, derivative))
+
+
+def _integral(density: Array, derivative: int) -> Array:
+    """Return the variances (...) of a derivative of positions with densities (..., F)."""
+    weight = (2 * np.pi * _FREQUENCY_HZ) ** (2 * derivative)
+    return np.asarray(np.trapezoid(weight * density, _FREQUENCY_HZ, axis=-1))
 
 
 def _without_swing(bubble: BubbleModel, share: Array) -> BubbleModel:
@@ -221,25 +249,23 @@ class _Paths:
     def learned(self) -> Array:
         """Return (2, 3): time of the low-pass in s, intensity of the forces and noise over the
         stated one, of the most probable and of the shortest low-pass."""
-        fixed, free = self.bubble.inertia_s, [INERTIA_S, FORCES, NOISE]
-        probable = self._best(free, np.array([], float) if fixed is None else np.array([fixed]))
-        if fixed is not None:
-            return np.array([probable, probable])
+        probable = self.best()
         least = self.log_likelihood(probable) - _EXCLUDED
         low, high = np.log(_SHORTEST_S), np.log(probable[0])
         shortest = probable
         for _ in range(_HALVINGS):
-            middle = self._best(free, np.array([np.exp((low + high) / 2)]), shortest)
+            middle = self.best(np.array([np.exp((low + high) / 2)]), shortest)
             if self.log_likelihood(middle) > least:
                 shortest, high = middle, np.log(middle[0])
             else:
                 low = np.log(middle[0])
         return np.array([probable, shortest])
 
-    def _best(self, priors: list[Prior], held: Array, start: Array | None = None) -> Array:
-        """Return the most probable values (3,), the first ones held."""
+    def best(self, held: Array = _NONE, start: Array | None = None) -> Array:
+        """Return the most probable values (3,) of `learned`, the first ones held."""
         from scipy.optimize import minimize
 
+        priors = [INERTIA_S, FORCES, NOISE]
         free = priors[len(held) :]
         begin = np.array([p.median for p in free]) if start is None else start[len(held) :]
 
@@ -309,7 +335,7 @@ def moves_of(process: Component, mean_sigma_mm_s: float, dt_s: Array) -> Moves:
 
 def log_likelihood(moves: Moves, paths: Sequence[Series], noise: float) -> float:
     """Return its expectation over the draws of the rig, up to a constant."""
-    from telerig.estimator.smoothing.graph.kernels import filtered
+    from telerig.estimator.smoothing.learning.kernels import filtered
 
     total = 0.0
     for step, values, variance in paths:

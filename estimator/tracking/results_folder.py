@@ -51,7 +51,10 @@ if TYPE_CHECKING:
 
 WORK = ".work"
 """Folder inside the results with the rows before corrections."""
-WORST_FRAMES = 8
+WORST_FRAMES, _SAMPLED = 8, 3
+_DOUBTFUL = 0.05
+"""A frame is doubtful if one of its detections has no partner or is merged, a pair is ambiguous, or
+one in twenty such frames has a wrong pair."""
 _OUTLINE_POINTS = 72
 _TABLES = ("frames.csv", "run.toml", "stage.csv", "references.csv", CORRECTIONS)
 _RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "bubbles")
@@ -61,9 +64,13 @@ _GREEN, _ORANGE = (40, 200, 70), (255, 140, 40)
 
 @dataclass
 class _Worst:
-    """The frames that a person should look at first."""
+    """The frames that a person should look at first: doubtful ones, or some where none is.
+
+    heap : score, frame (negative) and reason of doubtful frames. seen : frames with detections.
+    """
 
     heap: list[tuple[float, int, str]] = field(default_factory=list)
+    seen: list[int] = field(default_factory=list)
 
     def add(self, part: Linked) -> None:
         flags = part.tracks["flags"]
@@ -83,12 +90,18 @@ class _Worst:
             }
             why = ", ".join(f"{int(n)} {what}" for what, n in parts.items() if n)
             score = sum(parts.values()) + float(uncertain)
+            self.seen.append(int(frame))
+            if score < _DOUBTFUL:
+                continue
             heapq.heappush(self.heap, (score, -int(frame), why or "least sure pairs"))
             if len(self.heap) > WORST_FRAMES:
                 heapq.heappop(self.heap)
 
     def frames(self) -> list[dict[str, Any]]:
         ranked = sorted(self.heap, reverse=True)
+        if not ranked and self.seen:
+            some = np.linspace(0, len(self.seen) - 1, _SAMPLED).astype(int)
+            ranked = [(0.0, -self.seen[k], "") for k in np.unique(some).tolist()]
         return [{"frame": -f, "score": round(s, 3), "why": why} for s, f, why in ranked]
 
 

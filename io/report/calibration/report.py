@@ -109,6 +109,7 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
     return {
         "figures": tables.key_numbers(results),
         "parameters": tables.parameter_rows(results),
+        "held": tables.held_everywhere(results),
         "pose": tables.pose_rows(results),
         "stage": stage,
         "ladder": tables.ladder_rows(results),
@@ -147,6 +148,8 @@ def _pictures(
             pictures[place].append(picture)
         else:
             pictures[place] = picture
+    beside = pictures["trust"] or pictures["spread"]
+    pictures["first"] = [pictures["fields"].pop(0), beside.pop(0)]
     return pictures
 
 

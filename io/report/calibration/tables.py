@@ -66,7 +66,9 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
     cameras = list(results.file.cameras.values())
     rows = []
     for name in PARAMETERS:
-        if name.startswith("wall_") and not results.file.walls:
+        if name in held_everywhere(results) or (
+            name.startswith("wall_") and not results.file.walls
+        ):
             continue
         cells = [_parameter_cell(camera, name) for camera in cameras]
         free = any(name in camera.free for camera in cameras)
@@ -79,6 +81,18 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
         Row(("scale lost per mm of depth", *perspective)),
         Row(("field of view, mm", *(_field(camera) for camera in results.cameras))),
     ]
+
+
+def held_everywhere(results: CalibrationResults) -> list[str]:
+    """Return the lens parameters that every camera holds at 0 (the aspect at 1)."""
+    cameras = results.file.cameras.values()
+    return [
+        name for name in PARAMETERS
+        if not name.startswith("wall_") and all(
+            name not in c.free and c.parameters.get(name, 0.0) == (name == "aspect")
+            for c in cameras
+        )
+    ]  # fmt: skip
 
 
 def _parameter_cell(camera: CameraRecord, name: str) -> str:

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.page.contact_sheet import BUDGET_BYTES, picture_sheet
 from telerig.io.report.page.page import drawn_over_cores, plotly_javascript, render_page
@@ -137,6 +139,7 @@ def _words(results: TrackResults) -> dict[str, Any]:
         "run": _rows(results.run, "run.json"),
         "absent": results.absent,
         "worst": tables.worst_words(results),
+        "doubtful": any(frame.why for frame in results.file.worst_frames),
     }
 
 
@@ -156,15 +159,20 @@ def _pictures(
     drawings: list[tuple[str, Callable[[], Any]]] = [
         *(("seen", partial(seen_where, results, i)) for i in every),
         *(("marks", partial(marks_followed, results, i)) for i in every if results.marked(i)),
-        *(("series", partial(time_series, results, axis)) for axis in range(3)),
-        ("rays", partial(ray_miss_histogram, results)),
+        ("rays" if smoothing is not None else "first", partial(ray_miss_histogram, results)),
         *(("rays", partial(ray_miss_in_space, results, *how)) for how in shared_pictures(results)),
         ("counts", partial(bubbles_in_time, results)),
         ("quality", partial(predicted_sd, results)),
         ("quality", partial(sizes, results)),
         ("quality", partial(confidence, results)),
     ]
-    pictures: dict[str, Any] = {place: [] for place in (*dict(drawings), "marks", *PLACES)}
+    if smoothing is None:  # else the same is drawn in the laboratory
+        up = int(np.argmax(np.abs(results.up)))
+        drawings += [("first" if axis == up else "series", partial(time_series, results, axis))
+                     for axis in range(3)]  # fmt: skip
+    pictures: dict[str, Any] = {
+        place: [] for place in (*dict(drawings), "marks", "series", *PLACES)
+    }
     if cameras is not None:
         drawings.append(("rays", partial(two_rays, results, cameras)))
     if smoothing is not None:

@@ -22,7 +22,8 @@ from telerig.estimator.calibration.result.calibration import (
 )
 from telerig.estimator.tracking import detect_run
 from telerig.estimator.tracking import track as track_module
-from telerig.estimator.tracking.results_folder import WORK, write_tracking
+from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.estimator.tracking.results_folder import WORK, _Worst, write_tracking
 from telerig.estimator.tracking.track import TrackOptions, tracking_stream
 from telerig.estimator.tracking.tracks import Tracks
 from telerig.io.results.calibration_words import NO_COVARIANCE
@@ -214,7 +215,7 @@ def test_pictures_show_what_the_tables_say(
     tracked(rise, tmp_path / "out")
     table = pd.read_csv(tmp_path / "out" / "detections.csv", dtype={"camera": str})
     pictures = sorted((tmp_path / "out" / "binary").glob("*/*.png"))
-    assert len(pictures) == 16
+    assert len(pictures) == 2 * 3  # of the first, a middle and the last frame
     for path in pictures:
         camera = path.parent.name
         row = table[(table["camera"] == camera) & (table["frame"] == int(path.stem))].iloc[0]
@@ -510,3 +511,18 @@ def test_frames_outside_the_encoders_record_do_not_blur_the_background() -> None
     assert np.isnan(shift[6:]).all()
     position[2:] = np.nan
     assert not detect_run.lab_shift_px(camera, axis, position, len(position)).any()
+
+
+def test_only_doubtful_frames_are_worst_and_where_none_is_three_are_shown() -> None:
+    frame = np.arange(10)
+    tracks = pd.DataFrame({"frame": frame, "flags": "", "confidence": 1.0})
+    seen = pd.DataFrame({"frame": frame, "u_px": 1.0, "particle": 4.0, "flags": ""})
+    sound = _Worst()
+    sound.add(Linked(tracks, seen))
+    assert [(w["frame"], w["why"]) for w in sound.frames()] == [(0, ""), (4, ""), (9, "")]
+    seen.loc[6, "particle"] = np.nan
+    tracks.loc[2, "confidence"] = 0.9
+    doubtful = _Worst()
+    doubtful.add(Linked(tracks, seen))
+    assert [w["frame"] for w in doubtful.frames()] == [6, 2]
+    assert doubtful.frames()[0]["why"] == "1 without partner or track"

@@ -19,7 +19,7 @@ from telerig.estimator.calibration.result.calibration import calibration_from_ca
 from telerig.io.report.calibration.figures import residual_field
 from telerig.io.report.calibration.report import contact_sheet, write_calibration_report
 from telerig.io.report.calibration.results import read_results
-from telerig.io.report.calibration.tables import parameter_rows, worst_rows
+from telerig.io.report.calibration.tables import held_everywhere, parameter_rows, worst_rows
 from telerig.io.report.page import contact_sheet as sheets
 from telerig.io.report.remake import ResultsFolder, remake_report
 from telerig.rig.camera import Camera
@@ -27,8 +27,8 @@ from telerig.rig.lens_parameters import PARAMETERS
 
 SIGMA_PX, BUMP_MM = 0.01, 0.05
 SECTIONS = [
-    *("verdict", "key", "parameters", "pose", "model", "residuals", "coverage", "worst", "target"),
-    *("overlays", "dot", "rig", "twin", "notes", "more", "origin"),
+    *("verdict", "look", "key", "parameters", "pose", "model", "residuals", "coverage", "worst"),
+    *("target", "overlays", "dot", "twin", "notes", "more", "origin"),
 ]
 OPTIONAL = ("dots.csv", "covariance.npz", "run.json", "dot_example.npz", "overlays")
 
@@ -64,7 +64,7 @@ def test_page_says_verdict_parameters_and_everything_else(report: Path) -> None:
     assert text.index("USABLE, with warnings") < text.index("only 6 views & <few> dots")
     assert text.index("only 6 views & <few> dots") < text.index("Cameras")
     for name in PARAMETERS:
-        assert (f"({name})" in text) != name.startswith("wall_")  # no wall, no word of it
+        assert (name in text) != name.startswith("wall_")  # no wall, no word of it
     for words in (
         "10.00000 ±\u00a00.00034", "0.002000 ±\u00a00.000048", "90.00000 ±\u00a00.00069", "98.9 %",
         "178 of 180", "0.510 µm", "none was enough", "99.25", "nominal rotation", "90 deviations",
@@ -173,8 +173,11 @@ def test_whitened_residuals_are_unit_normal(folder: Path) -> None:
 
 
 def test_parameter_rows_tell_held_from_free_and_distortion_in_px(folder: Path) -> None:
-    rows = {row.cells[0]: row for row in parameter_rows(read_results(folder))}
-    assert rows["skew (skew)"].faint and rows["skew (skew)"].cells[1] == "0 (held)"
+    results = read_results(folder)
+    rows = {row.cells[0]: row for row in parameter_rows(results)}
+    assert "skew" in held_everywhere(results) and "skew (skew)" not in rows
+    centre = rows["image centre u, px (centre_u_px)"]
+    assert centre.faint and centre.cells[1].endswith("(held)")
     moved = float(rows["largest distortion in the image"].cells[1].removesuffix(" px"))
     half_diagonal_px = np.hypot(512, 400) / 2
     assert moved == pytest.approx(0.002 * half_diagonal_px, rel=0.02)

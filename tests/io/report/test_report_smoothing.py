@@ -23,10 +23,10 @@ from telerig.io.report.run.smoothing.tables import smoothing_verdict, use_rows
 from telerig.io.report.run.tracking.results import read_track_results
 from telerig.io.results.verdict_words import uses_words, words_of_refusals
 
-TRACKING = ["verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events"]
-TRACKING += ["notes", "more", "origin"]
-SMOOTHING = ["smoothing", "smoothing-key", "lab", "taken", "velocity", "shake", "spectra"]
-SMOOTHING += ["residuals", "constants", "priors"]
+LAST = ["rays", "quality", "images", "worst", "events", "more", "origin"]
+SMOOTHING = ["smoothing", "look", "smoothing-key", "axes", "lab", "taken", "velocity", "shake"]
+SMOOTHING += ["spectra", "residuals", "constants", "priors", "verdict", "key", *LAST]
+TRACKING = ["verdict", "look", "key", "time", *LAST]
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +55,10 @@ def _judged(folder: Path) -> Any:
 
 def test_page_begins_with_the_smoothing_and_loads_nothing(whole: Path) -> None:
     page = Page(whole / "report.html")
-    assert page.ids == SMOOTHING + TRACKING
+    assert page.ids == SMOOTHING
     assert (whole / "report.html").stat().st_size < 5e6
     assert all(load.startswith("data:") for load in page.loads)
-    of_smoothing, of_tracking = 3 + 3 + 3 + 3 + 4 + 3 + 2, 2 + 3 + 4 + 1 + 3 + 2
+    of_smoothing, of_tracking = 3 + 3 + 3 + 3 + 4 + 3 + 2, 2 + 4 + 1 + 3 + 2
     assert page.pictures("svg+xml") and len(page.pictures("")) == of_smoothing + of_tracking
 
 
@@ -193,7 +193,7 @@ def test_nothing_judged_and_nothing_optional(folder: Path) -> None:
     shake = shake[[n for n in shake if not n.startswith(("sl", "sr", "sp", "pos"))]]
     shake.to_csv(folder / "shake.csv", index=False)
     page = Page(write_track_report(folder))
-    assert page.ids == SMOOTHING + TRACKING
+    assert page.ids == SMOOTHING
     for words in ("Not judged", "holds no verdict per axis", "No constant of encoder"):
         assert words in page.spaced, words
     captions = _captions(folder)

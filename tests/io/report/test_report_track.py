@@ -39,7 +39,7 @@ from telerig.io.report.run.tracking.scene import thinned, track_scene_json
 from telerig.io.report.run.tracking.tables import verdict
 
 SECTIONS = [
-    *("verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events", "notes"),
+    *("verdict", "look", "key", "time", "rays", "quality", "images", "worst", "events", "notes"),
     *("more", "origin"),
 ]
 OPTIONAL = ("detections.csv", "events.csv", "run.json", "overlays", "binary")
@@ -160,10 +160,11 @@ def test_nothing_optional(folder: Path) -> None:
     text = Page(write_track_report(folder)).text
     for words in (
         "No pictures in this folder", "There is no run.json", "Nothing is known of any event",
-        "events.csv (no history", "detections.csv is not in this folder", "There are no notes",
+        "events.csv (no history", "detections.csv is not in this folder",
         "How many bubbles the single images held is not known",
     ):  # fmt: skip
         assert words in text, words
+    assert "notes" not in Page(folder / "report.html").ids
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -15,6 +15,8 @@ from telerig.io.report.run.tracking.scene import track_colour
 from telerig.short_text import number, with_sd
 
 MOST_ROWS = 40
+LEAST_MANY = 10
+"""Fewer bubbles are no swarm: they say next to nothing of a distribution or of a volume."""
 _MOST_LINES = 12
 _NO_LIQUID = (
     "For Reynolds, Weber and Eötvös numbers, drag and published laws, describe the liquid under "
@@ -25,7 +27,7 @@ _NO_LIQUID = (
 def size_picture(results: SmoothingResults) -> Picture | None:
     """Draw the distribution of the diameters by number and by volume."""
     d = column(results.bubble_summary, "d_eq_mm")
-    if np.isfinite(d).sum() < 2:
+    if np.isfinite(d).sum() < LEAST_MANY:
         return None
     with drawing(2.6, legend="above") as sheet:
         plot.sizes(results.bubble_summary, axes=sheet.axes)
@@ -126,7 +128,7 @@ def swarm_figures(results: SmoothingResults) -> list[Figure]:
     def value(name: str, factor: float = 1.0) -> str:
         return with_sd(factor * swarm[name], factor * swarm[f"s_{name}"])
 
-    if "void_fraction" not in swarm:
+    if "void_fraction" not in swarm or (results.file.bubbles or 0) < LEAST_MANY:
         return []
     frames = number(results.file.frames)
     where = f"{number(1e-3 * swarm['volume_mm3'], 3)} cm³, mean of {frames} frames"
@@ -173,7 +175,7 @@ def bubble_words(results: SmoothingResults) -> str:
     more = len(results.bubble_summary) - MOST_ROWS
     if more > 0:
         words += f" The {MOST_ROWS} longest of {len(results.bubble_summary)} tracks are listed."
-    if results.file.swarm:
+    if swarm_figures(results):
         words += (
             " What is given per volume is corrected for bubbles that the border of an image cuts; "
             "its standard deviation is that of a random number of independent bubbles."

@@ -40,17 +40,18 @@ from telerig.io.report.run.tracking.results import median, rms
 from telerig.io.report.run.tracking.scene import track_colour
 from telerig.short_text import is_number, number
 
-PLACES = ("bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")
+PLACES = ("first", "bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")
 """Sections that hold drawings."""
 
 
 def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[], Any]]]:
     """Return (section, function); the function returns a `Picture`, or None without data."""
-    axes = range(3)
+    axes, up = range(3), int(np.argmax(np.abs(results.up)))
     bubbles = axes if len(results.trajectories) else range(0)
+    shaken = sorted(results.cameras, key=lambda c: -_largest_shake_um(results, c))
     drawings: list[tuple[str, Callable[[], Any]]] = [
         *(("lab", partial(places, results, axis)) for axis in bubbles),
-        *(("lab", partial(closer, results, axis)) for axis in bubbles),
+        *(("first" if axis == up else "lab", partial(closer, results, axis)) for axis in bubbles),
         *(("taken", partial(taken_off, results, axis)) for axis in bubbles),
         *(("velocity", partial(velocities, results, axis)) for axis in bubbles),
     ]
@@ -58,7 +59,8 @@ def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[]
         drawings += [("shake", partial(shake_in_time, results, camera, axis))
                      for axis in results.seen(camera)]  # fmt: skip
     drawings += [("spectra", partial(velocity_before_and_after, results, axis)) for axis in axes]
-    drawings += [("spectra", partial(shake_spectra, results, c)) for c in results.cameras]
+    drawings += [("first" if c == shaken[0] else "spectra", partial(shake_spectra, results, c))
+                 for c in results.cameras]  # fmt: skip
     drawings += [
         ("spectra", partial(accelerometer_before_and_after, results, sensor))
         for sensor in accelerometer_names(results)
@@ -66,6 +68,10 @@ def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[]
     judged = known_parts(results, "whiteness", "expected")
     drawings += [("bubbles", partial(draw, results)) for draw in BUBBLE_PICTURES]
     return [*drawings, *([("white", partial(autocorrelation, results))] if judged else [])]
+
+
+def _largest_shake_um(results: SmoothingResults, camera: str) -> float:
+    return max((shake_rms_um(results, camera, axis) or 0.0 for axis in AXES), default=0.0)
 
 
 _MOST_BUBBLES = 60

@@ -68,24 +68,30 @@ class Corrections:
 
     used : by correction, the first frame and time in which it changed something.
     kept : the joins whose staying track was found.
+    last_frame : of each corrected track so far, by its id as text.
     """
 
     file: Path
     corrections: tuple[Correction, ...] = ()
     used: dict[Correction, tuple[int, float]] = field(default_factory=dict)
     kept: set[Correction] = field(default_factory=set)
+    last_frame: dict[str, int] = field(default_factory=dict)
 
     def of_events(self, events: Sequence[TrackEvent]) -> list[TrackEvent]:
         """Return the events of the corrected tracks, then one for each correction that changed
         something.
 
-        Ids are those of the corrected rows, and each track has one birth and one death at most.
+        Ids are those of the corrected rows, and each track has one birth and one death at most: a
+        death is left out if the track has rows afterwards, because it was joined with another.
         Events of dropped tracks are left out, and so are splits and mergers of one track.
         """
         new = (
             [replace(e, particles=self._ids_at(e)) for e in events] if self.corrections else events
         )
-        known = [e for e in new if len(e.particles) > (e.kind in ("split", "merge"))]
+        known = [
+            e for e in new if len(e.particles) > (e.kind in ("split", "merge"))
+            and not (e.kind == "death" and self.last_frame.get(str(e.particles[0]), -1) >= e.frame)
+        ]  # fmt: skip
         births = {e.particles: e for e in reversed(known) if e.kind == "birth"}
         deaths = {e.particles: e for e in known if e.kind == "death"}
         own = [
@@ -150,6 +156,8 @@ class Corrections:
                 todo="join only tracks that follow each other in time; give another id to a track "
                 "that overlaps in time",
             )
+        last = tracks.groupby("particle")["frame"].max()
+        self.last_frame |= zip(_texts(last.index.to_series()), last.tolist())
         return replace(part, tracks=tracks, detections=detections)
 
     def _renamed(self, table: pd.DataFrame, *, counts: bool) -> pd.DataFrame:

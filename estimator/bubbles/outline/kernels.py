@@ -48,6 +48,8 @@ _UNLIKE_SHARE, _UNLIKE_FROM, _MARGIN_SIGMA = 0.015, 1.3, 0.9
 """A ring of pixels is unlike a rim beyond this share of the contrast, outside so many blurs; what
 lies so much nearer is left out, too."""
 _MOST_RINGS = 1000
+_LEAST_FREEDOM = 4.0
+"""Sectors of an outline that tell the variance of their errors."""
 _BEYOND_CHANCE = 3.0
 """Standard deviations beyond which a mean is no chance."""
 _THIN_ABOVE_PX = 10.0
@@ -561,16 +563,18 @@ def _judge(
 
 
 @compiled
-def _clustered(sector: Ints, rows: Array, step: Array, covariance: Array) -> float:
+def _clustered(sector: Ints, rows: Array, step: Array, covariance: Array, excess: float) -> float:
     """Return the variance of the centre with errors that pixels of a sector share, over that with
-    independent errors (the sandwich estimator for clusters, less what the fit absorbs); 1 if that
-    may be chance.
+    the independent errors of the weights (the sandwich estimator for clusters, less what the fit
+    absorbs; the variance of Student's t for as many sectors), times the excess: what misleads a fit
+    moves neighbouring sectors alike, too.
 
     sector : (M,) of the pixels. rows : (n + 1, M) whitened derivatives and residuals before the
-    last step (n,); covariance : (n, n), of the parameters.
+    last step (n,); covariance : (n, n), of the parameters by the weights alone.
+    excess : variance of independent errors over that of the weights.
     """
     many = rows.shape[0] - 1
-    shared = expected = chance = 0.0
+    shared = expected = squares = 0.0
     for axis in range(2):
         shift, own, gain = np.zeros(_SECTORS), np.zeros(_SECTORS), np.zeros((_SECTORS, many))
         for k in range(sector.size):
@@ -589,10 +593,10 @@ def _clustered(sector: Ints, rows: Array, step: Array, covariance: Array) -> flo
             share = own[s] / covariance[axis, axis]
             shared += shift[s] * shift[s] / covariance[axis, axis]
             expected += share
-            chance += 2.0 * share * share
-    if shared < expected + _BEYOND_CHANCE * np.sqrt(chance):
-        return 1.0
-    return float(shared / max(expected, 1e-9))
+            squares += share * share
+    freedom = max(expected * expected / max(squares, 1e-18), _LEAST_FREEDOM)
+    student = freedom / (freedom - 2.0)
+    return excess * max(1.0, student * shared / max(expected, 1e-9))
 
 
 @compiled
@@ -749,13 +753,12 @@ def fitted(
             _judge(table, pixels[2], foot, distance, hidden, weight, at, noise[0], result)
             dof = max(count - free, 1.0)
             result[CHI2] /= dof
+            excess, uneven = 1.0, 0.0
             if result[CHI2] > 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / dof):
-                for i in range(free):
-                    for j in range(free):
-                        covariance[i, j] *= result[CHI2]
-            misled, uneven = 1.0, 0.0
+                excess = result[CHI2]
+            misled = excess
             if result[COVERAGE] < misled_below and count > free:
-                misled = _clustered(sector, rows, step, covariance)
+                misled = _clustered(sector, rows, step, covariance, excess)
                 uneven = _light(foot, distance, pixels[2], hidden, at[BLUR], noise[0])
                 uneven *= (at[BLUR] / max(at[OUTER] - at[INNER], 1e-3)) ** 2 * _UNEVEN_LIGHT
             uu, vv = misled * covariance[0, 0] + uneven, misled * covariance[1, 1] + uneven
@@ -768,7 +771,7 @@ def fitted(
             if free > HARMONIC:
                 variance = 0.0
                 for i in range(HARMONIC, free):
-                    variance += covariance[i, i] / (free - HARMONIC)
+                    variance += excess * covariance[i, i] / (free - HARMONIC)
                 result[SIGMA_OUTLINE] = np.sqrt(max(variance, 0.0))
         turn = _move(outline, at)
         for i in range(BLUR, HARMONIC):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+
 import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from places import ROOT
 from scipy.special import ndtr
 
 from telerig import compiled
@@ -17,6 +20,9 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     profile_table,
     start_outlines,
 )
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from bubble_outline_renderer import Drawn, draw
 
 
 @pytest.mark.parametrize("many", [9, 17])
@@ -88,6 +94,20 @@ def test_impossible_starts_end_without_a_covariance() -> None:
     found = fit_outlines(np.ones((100, 100), np.float32), start, np.ones(2))
     assert not found.coverage[[0, 2, 3]].any()
     assert not found.covariance_px2[[0, 3]].any()
+
+
+def test_a_cut_outline_whose_residuals_are_large_states_its_error() -> None:
+    """With residuals of twice the stated noise the standard deviation was 100,000 px."""
+    truth, noise, squares, stated = (34.0, 13.0, 26.0, 24.0, 0.3), 0.03, [], []
+    image = draw([Drawn(truth, heart=0.0)], (80, 80), blur_px=1.2)
+    for seed in range(12):
+        soiled = image + noise * np.random.default_rng(seed).standard_normal(image.shape)
+        start = start_outlines(np.array([truth]), np.ones(1), np.full(1, 0.1))
+        found = fit_outlines(soiled.astype(np.float32), start, np.full(2, noise / 2))
+        assert found.coverage[0] < 0.9 and found.chi2_dof[0] > 3.0
+        squares.append(np.square(found.ellipse[0, :2] - truth[:2]).sum())
+        stated.append(np.trace(found.covariance_px2[0]))
+    assert 0.3 < np.mean(stated) / np.mean(squares) < 6.0
 
 
 def test_ellipses_along_arcs_are_found_again() -> None:

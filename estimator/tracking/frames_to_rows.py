@@ -47,7 +47,7 @@ from telerig.estimator.tracking.filter import (
 )
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import on_rays, stacked_jacobian
+from telerig.rig.triangulation import on_rays
 
 _BUBBLES_AT_ONCE = 512
 """Bubbles whose bodies are fitted and whose rows are written together."""
@@ -263,14 +263,13 @@ class RowMaker:
         }
         table |= dict(zip(["x_mm", "y_mm", "z_mm"], bodies.points_mm.T))
         table |= dict(zip(COVARIANCE_MM2, bodies.covariance_mm2[:, *np.triu_indices(3)].T))
-        shape = _shape_share_px2(self.cameras, bodies)
         words: list[set[str]] = [{"ambiguous"} if unsure else set() for unsure in bubbles.ambiguous]
         for c, (camera, found) in enumerate(zip(self.cameras, joined)):
             mine = np.flatnonzero(seen[:, c])
             rows = found.take(bubbles.rows[mine, c] + starts[mine, c])
             values = np.full((len(bubbles), 5), np.nan)
             values[mine] = rows[CENTRE_PX].to_numpy(float)
-            values[:, 2:] += shape[:, c][:, *np.triu_indices(2)]
+            values[:, 2:] += bodies.shift_covariance_px2[:, c][:, *np.triu_indices(2)]
             table |= {f"{camera.name}_{name}": v for name, v in zip(CENTRE_PX, values.T)}
             for k, name in enumerate(("du_px", "dv_px")):
                 shift = np.where(seen[:, c], bodies.shift_px[:, c, k], np.nan)
@@ -320,20 +319,6 @@ def _starts(frames: Sequence[Frame]) -> Ints:
     """Return the position (F, C) of each frame's first detection in the cameras' tables."""
     many = np.array([[len(table) for table in f.tables] for f in frames], np.int64)
     return np.asarray(np.cumsum(many, axis=0) - many)
-
-
-def _shape_share_px2(cameras: tuple[Camera, ...], bodies: Bodies) -> Array:
-    """Return the share (M, C, 2, 2) of the unknown shape in the centres' covariances, by camera."""
-    out = np.zeros((len(bodies.points_mm), len(cameras), 2, 2))
-    known = np.isfinite(bodies.covariance_mm2).all((1, 2))
-    share = (bodies.covariance_mm2 - bodies.silhouette_covariance_mm2)[known]
-    values, vectors = np.linalg.eigh(share)
-    share = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2)
-    _, jacobian = stacked_jacobian(cameras, bodies.points_mm[known])
-    for c in range(len(cameras)):
-        view = jacobian[:, 2 * c : 2 * c + 2]
-        out[known, c] = view @ share @ np.swapaxes(view, -1, -2)
-    return out
 
 
 def grouped_frame(

@@ -29,8 +29,8 @@ class Bodies(Rows):
     used : (B,) "volume": points_mm is corrected for the shape. "silhouettes": it is not, because
         harmonics are unknown, an outline is incomplete, or the rays pass farther apart than the
         bubble is large. "none": fewer than two centres are known, and the row is NaN.
-    shift_px : (B, C, 2) projected centre of volume minus the outline's centre; 0 unless used is
-        "volume".
+    shift_px, shift_covariance_px2 : (B, C, 2), (B, C, 2, 2) projected centre of volume minus the
+        outline's centre, 0 unless used is "volume", and its covariance.
     ray_miss_mm : (B,) of the outlines' centres: the distance between two rays, with a sign; with
         more views the RMS distance of the point from the rays.
     d_eq_mm, aspect : (B,) diameter of the sphere of equal volume; equatorial over polar semi-axis.
@@ -53,6 +53,7 @@ class Bodies(Rows):
     silhouette_covariance_mm2: Array
     used: NDArray[np.str_]
     shift_px: Array
+    shift_covariance_px2: Array
     ray_miss_mm: Array
     d_eq_mm: Array
     aspect: Array
@@ -74,8 +75,8 @@ class Bodies(Rows):
 
         return Bodies(
             nan(3), nan(3, 3), nan(3), nan(3, 3), np.full(count, "none", "<U11"),
-            np.zeros((count, cameras, 2)), nan(), nan(), nan(), nan(3, 3), nan(6, 6), nan(),
-            nan(3), nan(2), nan(), np.zeros(count, bool), nan(),
+            np.zeros((count, cameras, 2)), np.zeros((count, cameras, 2, 2)), nan(), nan(), nan(),
+            nan(3, 3), nan(6, 6), nan(), nan(3), nan(2), nan(), np.zeros(count, bool), nan(),
         )  # fmt: skip
 
     @staticmethod
@@ -137,17 +138,18 @@ def fit_bodies(
         stretch, own = _stretch(shape, cameras[0], up)
         noise = np.diagonal(shape.noise, axis1=1, axis2=2)[:, :2]
         centre = volume_centre(views, shape, shapes, gap_sigma_px)
-        whole = views.sightings.all_whole
+        known = np.asarray(views.sightings.whole.any(-1))
         bodies._put(
-            rows, points_mm=points[shaped] + np.where(whole[:, None], centre.step_mm, 0.0),
+            rows, points_mm=points[shaped] + np.where(known[:, None], centre.step_mm, 0.0),
             covariance_mm2=centre.covariance_mm2,
-            used=np.where(whole, "volume", "silhouettes"), zonal_probability=centre.zonal,
+            used=np.where(known, "volume", "silhouettes"), zonal_probability=centre.zonal,
             d_eq_mm=2 * np.exp(shape.value[:, 0]), aspect=np.exp(shape.value[:, 1]),
             frame=shape.frame, shape_covariance=shape.covariance, chi2=shape.chi2,
             stretch=stretch, noise=np.column_stack([noise, own]), fixed=shape.fixed,
             entire=views.sightings.all_entire,
         )  # fmt: skip
-        bodies.shift_px[np.ix_(rows, used)] = np.where(whole[:, None, None], centre.shift_px, 0.0)
+        bodies.shift_covariance_px2[np.ix_(rows, used)] = centre.shift_covariance_px2
+        bodies.shift_px[np.ix_(rows, used)] = np.where(known[:, None, None], centre.shift_px, 0.0)
     return bodies
 
 

@@ -54,10 +54,13 @@ def learn_shapes(sightings: Sightings, seen: Ints, cameras: Sequence[Camera], up
 
 
 def _learned_sigma(groups: Sequence[Sightings], degree: int) -> float:
-    """Return the sd of the coefficients of one degree, from bodies whose outlines are all whole."""
+    """Return the sd of the coefficients of one degree, from the whole outlines of each body."""
     default = getattr(DEFAULT_SHAPES, "third" if degree == 3 else "fourth")
-    whole = [g.take(g.all_whole) for g in groups]
-    variance = [degree_variance(g, degree).mean(-1) for g in whole if len(g.camera)]
+    some = [g.take(g.whole.any(-1)) for g in groups]
+    variance = [
+        np.average(degree_variance(g, degree), axis=-1, weights=g.whole)
+        for g in some if len(g.camera)
+    ]  # fmt: skip
     every = np.minimum(np.concatenate([np.zeros(0), *variance]), _LARGEST_SIGMA**2)
     total = max(every.sum(), 0.0) + _DEFAULT_WEIGHT * default**2
     return float(np.sqrt(total / (len(every) + _DEFAULT_WEIGHT)))

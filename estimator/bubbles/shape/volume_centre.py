@@ -23,7 +23,8 @@ from telerig.rig import silhouette
 _RUN_WEIGHT = 4.0  # the same for the bubble's sd of degree 3
 _ZONAL_SHARE = 0.2  # prior probability of modes that are axisymmetric about the pole
 _KNOWN_AXIS = 0.15  # rad: beyond this uncertainty of the pole that model is left out
-_MODEL_ERROR, _CROSS_TERM = 0.02, 8.0  # second order: of the third harmonic, times the fourth
+_FOURTH_TERM, _TRIAXIAL_TERM = 8.0, 4.0
+"""Second order: of the third harmonic, times degree 4 and times what no spheroid holds."""
 
 
 @dataclass(frozen=True)
@@ -32,27 +33,29 @@ class Centre:
 
     step_mm : (B, 3) from the triangulated point to the centre of volume.
     covariance_mm2 : (B, 3, 3) of the step.
-    shift_px : (B, n, 2) projected centre of volume minus the outline's centre.
+    shift_px, shift_covariance_px2 : (B, n, 2), (B, n, 2, 2) projected centre of volume minus the
+        outline's centre, and its covariance.
     zonal : (B,) probability of the axisymmetric model.
     """
 
     step_mm: Array
     covariance_mm2: Array
     shift_px: Array
+    shift_covariance_px2: Array
     zonal: Array
 
 
 def volume_centre(views: Views, shape: Shape, shapes: Shapes, gap_sigma_px: float) -> Centre:
     """Estimate centres of volume: the mean over both models of degree 3 by their evidence."""
-    measured, noise, conversion = _measured(views)
+    measured, noise, conversion = _measured(views, shapes)
     n, count = views.count, len(measured)
     jacobian = np.zeros((count, 4 * n, 3))
     jacobian[:, : 2 * n] = views.jacobian.reshape(count, 2 * n, 3)
     noise[:, : 2 * n, : 2 * n] += _gap_covariance(jacobian[:, : 2 * n], gap_sigma_px)
-    own = 2 * degree_variance(views.sightings, 3, less=2.0).sum(-1)  # no harmonics, no correction
-    whole = views.sightings.all_whole
-    own = np.where(whole, np.maximum(own, 0), (2 * n - 2) * shapes.third**2)
-    sigma2 = (_RUN_WEIGHT * shapes.third**2 + own) / (_RUN_WEIGHT + 2 * n - 2)
+    whole = views.sightings.whole  # of other outlines no harmonics are known
+    own = 2 * np.where(whole, degree_variance(views.sightings, 3, less=2.0), 0.0).sum(-1)
+    squares = _RUN_WEIGHT * shapes.third**2 + np.maximum(own, 0.0)
+    sigma2 = squares / (_RUN_WEIGHT + 2 * whole.sum(-1) - 2)  # mean of the inverse gamma
     frames = silhouette.rim_frames(shape.moments, views.jacobian, views.axes_px)
     effect = _effect(views.axes_px, *silhouette.third_degree_traces(frames))
     isotropic = _estimate(measured, noise, jacobian, sigma2[:, None, None] * (effect @ effect.mT))
@@ -70,20 +73,26 @@ def volume_centre(views: Views, shape: Shape, shapes: Shapes, gap_sigma_px: floa
     share = np.where(known, _ZONAL_SHARE, 1e-9)
     log_odds = zonal[3] - isotropic[3] + np.log(share / (1 - share))
     weight = np.stack([1 / (1 + np.exp(np.clip(s * log_odds, -700, 700))) for s in (1, -1)])
-    steps = np.stack([isotropic[0], zonal[0]])
-    step = (weight[..., None] * steps).sum(0)
-    apart = steps - step
-    second = np.stack([isotropic[1], zonal[1]]) + apart[..., :, None] * apart[..., None, :]
-    shift = (weight[..., None] * np.stack([isotropic[2], zonal[2]])).sum(0)
-    return Centre(
-        step,
-        (weight[..., None, None] * second).sum(0),
-        (conversion - shift[:, : 2 * n]).reshape(count, n, 2),
-        weight[1],
-    )
+    step, covariance = _mixed(weight, (isotropic[0], zonal[0]), (isotropic[1], zonal[1]))
+    effect_px, spread = _mixed(weight, (isotropic[2], zonal[2]), (isotropic[4], zonal[4]))
+    each = np.arange(n)
+    blocks = spread[:, : 2 * n, : 2 * n].reshape(count, n, 2, n, 2)[:, each, :, each]
+    shift = (conversion - effect_px[:, : 2 * n]).reshape(count, n, 2)
+    return Centre(step, covariance, shift, np.moveaxis(blocks, 0, 1), weight[1])
 
 
-def _measured(views: Views) -> tuple[Array, Array, Array]:
+def _mixed(
+    weight: Array, values: tuple[Array, Array], covariances: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Return mean (B, k) and covariance (B, k, k) of two models with weights (2, B)."""
+    every = np.stack(values)
+    mean = (weight[..., None] * every).sum(0)
+    apart = every - mean
+    second = np.stack(covariances) + apart[..., :, None] * apart[..., None, :]
+    return mean, (weight[..., None, None] * second).sum(0)
+
+
+def _measured(views: Views, shapes: Shapes) -> tuple[Array, Array, Array]:
     """Return measurements (B, 4 n), their covariance (B, 4 n, 4 n) and a part (B, 2 n) of them.
 
     The measurements are the pixel residuals (u, v) of all views, then the coefficients of cos 3 phi
@@ -91,14 +100,13 @@ def _measured(views: Views) -> tuple[Array, Array, Array]:
     """
     sightings, n = views.sightings, views.count
     count = len(views.noise)
-    # with an outline whose harmonics are unknown, the body's centre is not corrected
-    whole = sightings.all_whole[:, None, None]
-    trace = np.where(whole, sightings.trace, 0.0)
-    third2, fourth2 = ((trace[..., part] ** 2).mean((-1, -2)) for part in (THIRD, FOURTH))
-    second_order2 = third2 * (_MODEL_ERROR**2 + _CROSS_TERM**2 * fourth2)
-    stated = sightings.trace_covariance[..., :4, :4]
-    error = stated + second_order2[:, None, None, None] * np.eye(4)
-    error = np.where(whole[..., None], error, np.diag([0.0, 0.0, UNKNOWN, UNKNOWN]))
+    trace, whole = sightings.trace, sightings.whole[..., None, None]
+    known = np.maximum(sightings.whole.sum(-1), 1)  # the others are 0
+    third2, fourth2 = ((trace[..., p] ** 2).mean(-1).sum(-1) / known for p in (THIRD, FOURTH))
+    cross2 = _FOURTH_TERM**2 * fourth2 + (_TRIAXIAL_TERM * shapes.triaxial) ** 2
+    second_order2 = third2 * cross2
+    error = sightings.trace_covariance[..., :4, :4] + second_order2[:, None, None, None] * np.eye(4)
+    error = np.where(whole, error, np.diag([0.0, 0.0, UNKNOWN, UNKNOWN]))
     mix = np.zeros((count, n, 4, 4))
     mix[..., :2, :2], mix[..., 2:, 2:] = views.axes_px, np.eye(2)
     error = mix @ error @ mix.mT
@@ -142,13 +150,13 @@ def _zonal_effect(axes_px: Array, frames: Array, pole: Array) -> Array:
 
 def _estimate(
     measured: Array, noise: Array, jacobian: Array, prior: Array
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Estimate points by generalised least squares.
 
     prior : (B, 4 n, 4 n) covariance that the shape adds to the noise.
 
     Returns the steps (B, 3), their covariances (B, 3, 3), the expected effect (B, 4 n) of the
-    shape, and the log evidence (B,).
+    shape, the log evidence (B,), and the covariance (B, 4 n, 4 n) of the effect.
     """
     total = noise + prior
     inverse = np.linalg.inv(total)
@@ -159,4 +167,6 @@ def _estimate(
     misfit = (inverse @ (measured - (jacobian @ step[..., None])[..., 0])[..., None])[..., 0]
     log_det = -np.linalg.slogdet(total)[1] - np.linalg.slogdet(normal)[1]
     evidence = 0.5 * (log_det - (measured * misfit).sum(-1))
-    return step, covariance, (prior @ misfit[..., None])[..., 0], evidence
+    told = inverse - weighted.mT @ covariance @ weighted
+    effect = (prior @ misfit[..., None])[..., 0]
+    return step, covariance, effect, evidence, prior - prior @ told @ prior

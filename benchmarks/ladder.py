@@ -36,9 +36,9 @@ from telerig.estimator.calibration.solver.problem import (
     Problem,
     cameras_from_state,
     held_at_nominal,
-    parameter_unit,
 )
 from telerig.estimator.calibration.solver.robust_least_squares import solve
+from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.rig.lens_parameters import name_of
@@ -133,12 +133,10 @@ def drawn_scene(
     groups = [drawn_groups(rung, rng) for rung in rungs]
     tilts = [_tilt(rng) if "tilt" in g else {} for g in groups]
     ideal = make_scene(_with(config, tilts), rng)
-    problem = replace(ideal.problem().with_model([name_of(g) for g in groups]), solver="schur")
+    problem = replace(ideal.problem().with_model([name_of(g) for g in groups]), solver="numpy")
     truth = replace(ideal.true_state(problem), dots_mm=problem.nominal_mm)
-    posterior = solve(problem, truth, max_iterations=0).equations.posterior(whole=False)
-    unit = np.concatenate([parameter_unit(c)[problem.free_indices(k)]
-                           for k, c in enumerate(problem.cameras)])  # fmt: skip
-    sds = iter(np.sqrt(np.diag(posterior.common)[: len(unit)]) * unit)
+    common, *_ = System(problem).gaussian(truth).covariance(whole=False)
+    sds = iter(np.sqrt(np.diag(common)))
     sd = [{p: float(next(sds)) for p in free} for free in problem.free]
     lenses, right = [], []
     for c, g in enumerate(groups):
@@ -192,7 +190,7 @@ def space_mm(scene: Scene, problem: Problem, state: State, points: Array) -> flo
 
 def outcome(rungs: tuple[str, str], weak: bool, rng: np.random.Generator) -> Outcome:
     scene, truth = drawn_scene(rungs, weak, rng)
-    problem = replace(scene.problem(), solver="schur")
+    problem = replace(scene.problem(), solver="numpy")
     start = held_at_nominal(problem, scene.true_state(problem))
     begun = time.process_time()
     robust, choice = choose_model(problem, start, ("auto", "auto"))

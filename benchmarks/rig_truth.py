@@ -16,7 +16,8 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import best_start
 from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.problem import eccentricity_px, held_at_nominal
-from telerig.estimator.calibration.solver.robust_least_squares import linearisation, solve
+from telerig.estimator.calibration.solver.robust_least_squares import solve
+from telerig.estimator.calibration.solver.system import System
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import SimulationConfig
 from telerig.rig.camera import Camera
@@ -152,7 +153,7 @@ def bound_covariance(
     problem = replace(scene, dots=dots).problem()
     if kept is not None:
         problem = replace(problem, weight=kept.astype(float))
-    problem, _ = best_start(replace(problem, solver="schur"), problem.nominal_mm)
+    problem, _ = best_start(replace(problem, solver="numpy"), problem.nominal_mm)
     problem = problem.with_model(model)
     solution = solve(problem, held_at_nominal(problem, scene.true_state(problem)))
     _, covariance = joint_covariance(problem, solution).rig_block()
@@ -180,7 +181,7 @@ def linear_deviations(scene: Scene, config: SimulationConfig, model: str) -> Arr
     estimator's own errors. The truth is brought into the model's gauge by a fit to exact pixels
     of a target whose nominal places are the true ones.
     """
-    problem = replace(scene.problem().with_model(model), solver="schur")
+    problem = replace(scene.problem().with_model(model), solver="numpy")
     discs = eccentricity_px(problem, scene.true_state(problem, held_centres=False))
     exact = exact_dots(config, scene.cameras, scene.true_target, scene.views)
     true_px = exact.loc[exact["inside"] == 1, ["u_px", "v_px"]].to_numpy()
@@ -192,8 +193,8 @@ def linear_deviations(scene: Scene, config: SimulationConfig, model: str) -> Arr
         known = replace(known, scale=(ends, true_mm, sigma))
     truth = solve(known, start).state
     measured = replace(problem, uv_px=problem.uv_px - discs)
-    equations = linearisation(measured)[1](truth)
-    step, _ = equations.step(1e-12)
+    gaussian = System(measured).gaussian(truth)
+    step, _ = gaussian.step()
     count = sum(map(len, problem.free)) + 6
-    sd = np.sqrt(np.diag(equations.posterior(whole=False).common))
+    sd = np.sqrt(np.diag(gaussian.covariance(whole=False)[0]))
     return np.asarray(step[:count] / sd[:count])

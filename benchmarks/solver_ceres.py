@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from solver_scipy import right_jacobian
 
-from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem, System
+from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem, parameter_unit
+from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State, depth_gauge_residual, distance_residual
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import rotation_from_rotvec
@@ -31,13 +32,14 @@ class Dotwise:
         self.system = System(problem)
         for free in self.system.free:
             assert free.tolist() == _ORDER
+        self.unit = [parameter_unit(camera)[_ORDER] for camera in problem.cameras]
         centre = [INDEX["centre_u_px"], INDEX["centre_v_px"]]
         self.centre = start.intrinsics[:, centre].tolist()
         self.begin = [start.intrinsics[c, _ORDER] for c in range(2)]
         self.obs = problem.observations()
 
     def lens(self, camera: int, moved: Array) -> list[float]:
-        values: list[float] = (self.begin[camera] + moved * self.system.unit[camera]).tolist()
+        values: list[float] = (self.begin[camera] + moved * self.unit[camera]).tolist()
         return values
 
     def dot(
@@ -68,7 +70,7 @@ class Dotwise:
              rho * yd, -c * pull_v, s * y * r2, s * (r2 + 2 * y * y), s * 2 * x * y],
         ]  # fmt: skip
         every = white @ np.array(rows)
-        return every[:, 0], every[:, 1:4], every[:, 4:] * self.system.unit[camera], in_camera
+        return every[:, 0], every[:, 1:4], every[:, 4:] * self.unit[camera], in_camera
 
 
 def _cross_and_one(point: Array, sign: float) -> Array:
@@ -119,7 +121,7 @@ def solve(problem: Problem, start: State) -> tuple[State, int]:
     for c in range(2):
         value, jacobian = model.system.priors(start).cameras[c]
         size = len(LENS)
-        add(size, [lens[c]], _linear(value[:size], np.diag(jacobian)[:size]))
+        add(size, [lens[c]], _linear(value[:size], np.diag(jacobian)[:size] * model.unit[c]))
     for dot, nominal, sigma in zip(dots, problem.nominal_mm, problem.dot_sigma_mm):
         add(3, [dot], _linear(-nominal / sigma, 1 / sigma))
     add(2, [second], poses.gauge)
@@ -133,6 +135,7 @@ def solve(problem: Problem, start: State) -> tuple[State, int]:
     options.parameter_tolerance = 1e-14
     options.logging_type = pyceres.LoggingType.SILENT
     pyceres.solve(options, made, summary)
+    lens = [values * unit for values, unit in zip(lens, model.unit)]
     step = np.concatenate([*lens, second, *views, (np.array(dots) - start.dots_mm).ravel()])
     iterations = summary.num_successful_steps + summary.num_unsuccessful_steps
     return model.system.moved(start, step), int(iterations)

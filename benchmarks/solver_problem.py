@@ -51,8 +51,8 @@ def make_problem(views: int, dots: int, rng: np.random.Generator) -> tuple[Probl
     problem = Problem(
         nominal, Target(rows=rows, columns=columns, pitch_mm=pitch),
         tuple(f"{v:04}" for v in range(views)), np.arange(dots), flat,
-        np.full((dots, 3), PRINT_MM), view, camera, dot, uv, variance, np.ones(len(view)),
-        ((), ()), ((0, far), length, 0.001), np.zeros((views, 2)),
+        np.full((dots, 3), PRINT_MM), view, camera, dot, uv, np.zeros_like(uv), variance,
+        np.ones(len(view)), ((), ()), ((0, far), length, 0.001), np.zeros((views, 2)),
     ).with_model(MODEL)  # fmt: skip
     return problem, known_target.stereo_states(problem, flat)[0]
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 
-from telerig.estimator.calibration.solver.problem import Problem, System
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State, whitened_error
 from telerig.rig.pose import hat, rotation_from_rotvec
 

@@ -10,8 +10,8 @@ imports, compilation and the making of the problem), iterations, and the peak me
 process, Python and its libraries included. A figure counts when its cost is the least of all to
 1e-9; every cost is evaluated by the same function.
 
-gtsam: the product's blocks eliminated by GTSAM (`--solver gtsam`, the default up to 5,000 measured
-dots). schur: the same blocks, by the product's Schur complement. scipy: `least_squares`, trf with
+gtsam: the dots of the product's Gaussian eliminated by GTSAM, as up to 5,000 measured dots. numpy:
+by NumPy, as above. scipy: `least_squares`, trf with
 lsmr (inner tolerance 1e-10), sparse analytic Jacobian from the product's own array functions,
 its pattern made once. ceres: pyceres, DENSE_SCHUR, one Python cost per measured dot. wrapped: the
 product's functions as one `gtsam.CustomFactor` an image and one key a dot, GTSAM's own optimizer.
@@ -38,11 +38,12 @@ from solver_problem import make_problem
 
 from telerig.estimator.calibration.solver.nonlinear_graph import nonlinear_graph
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.estimator.calibration.solver.robust_least_squares import linearisation, solve
+from telerig.estimator.calibration.solver.robust_least_squares import solve
+from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State
 
 SIZES = ("12x15", "12x100", "50x400", "200x400", "200x2000")
-SOLVERS = ("gtsam", "schur", "scipy", "ceres", "wrapped")
+SOLVERS = ("gtsam", "numpy", "scipy", "ceres", "wrapped")
 SHORT_S = 2.0
 """Runs shorter than this are repeated."""
 Solve = Callable[[Problem, State], tuple[State, int]]
@@ -50,7 +51,7 @@ Solve = Callable[[Problem, State], tuple[State, int]]
 
 def solver(name: str) -> Solve:
     """A solver by name, imported."""
-    if name in ("gtsam", "schur"):
+    if name in ("gtsam", "numpy"):
         return partial(product, name)
     if name == "wrapped":
         return wrapped
@@ -94,7 +95,7 @@ def one(name: str, size: str) -> dict[str, Any]:
         took = time.process_time() - began
         best, spent = min(best, took), spent + took
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    cost = linearisation(replace(problem, solver="schur"))[1](state).cost
+    cost = System(problem).gaussian(state).cost
     return {"seconds": best, "iterations": iterations, "cost": cost, "peak_mb": peak_mb}
 
 
@@ -141,12 +142,12 @@ def cell(run: dict[str, Any] | None, least: float) -> str:
 def ratios(runs: dict[str, dict[str, Any]]) -> list[str]:
     """How many times faster the product is."""
     lines = [
-        "| views x dots | scipy / gtsam | scipy / schur | ceres / gtsam |",
+        "| views x dots | scipy / gtsam | scipy / numpy | ceres / gtsam |",
         "|---|---|---|---|",
     ]
     for size, found in runs.items():
         cells = []
-        for ours, other in (("gtsam", "scipy"), ("schur", "scipy"), ("gtsam", "ceres")):
+        for ours, other in (("gtsam", "scipy"), ("numpy", "scipy"), ("gtsam", "ceres")):
             seconds = [(found.get(n) or {}).get("seconds") for n in (ours, other)]
             cells.append(f"{seconds[1] / seconds[0]:.1f}" if all(seconds) else "-")
         lines.append(f"| {size} | {' | '.join(cells)} |")

@@ -13,19 +13,15 @@ from telerig.arrays import Array
 from telerig.estimator.calibration.lens.choice import Choice, Step
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import JointCovariance
-from telerig.estimator.calibration.solver.problem import (
-    Problem,
-    cameras_from_state,
-    parameter_unit,
-)
+from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.robust_least_squares import (
     RobustFit,
     Solution,
-    linearisation,
     lost_views,
     pixel_residuals,
     squared_distance,
 )
+from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
@@ -416,9 +412,9 @@ def telecentricity(
     """
     at_kappa = INDEX["kappa_per_mm"]
     wide = problem.with_model([name_of({*groups_of(model), "kappa"}) for model in models])
-    equations = linearisation(wide)[1](solution.state)
-    step, _ = equations.step(1e-12)
-    variance = np.diag(equations.posterior(whole=False).common)
+    gaussian = System(wide).gaussian(solution.state)
+    step, _ = gaussian.step()
+    variance = np.diag(gaussian.covariance(whole=False)[0])
     state = solution.state
     poses = state.rig_from_target[problem.view]
     points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[problem.dot]) + poses[:, :3, 3]
@@ -426,9 +422,9 @@ def telecentricity(
     at = 0
     for c, camera in enumerate(problem.cameras):
         free = wide.free_indices(c).tolist()
-        place, unit = at + free.index(at_kappa), parameter_unit(camera)[at_kappa]
+        place = at + free.index(at_kappa)
         at += len(free)
-        kappa = state.intrinsics[c, at_kappa] + unit * step[place]
+        kappa = state.intrinsics[c, at_kappa] + step[place]
         camera_from_rig = np.linalg.inv(state.rig_from_camera[c])
         seen = problem.kept & (problem.camera == c)
         depth = points[seen] @ camera_from_rig[2, :3] + camera_from_rig[2, 3]
@@ -436,7 +432,7 @@ def telecentricity(
         change = float(kappa / nearer)
         out[camera.name] = {
             "change_per_mm": change,
-            "sd_per_mm": float(unit * np.sqrt(max(variance[place], 0.0)) / nearer**2),
+            "sd_per_mm": float(np.sqrt(max(variance[place], 0.0)) / nearer**2),
             "depth_mm": float(np.ptp(depth)) if len(depth) else 0.0,
             "perspective": abs(change) * camera.rho_mm,
         }

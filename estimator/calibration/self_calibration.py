@@ -38,17 +38,16 @@ from telerig.estimator.calibration.solver.problem import (
     checked_outlier_sd,
     eccentricity_px,
     held_at_nominal,
-    parameter_unit,
     problem_from_dots,
 )
 from telerig.estimator.calibration.solver.robust_least_squares import (
     Progress,
     RobustFit,
     Solution,
-    linearisation,
     robust_solve,
     solve,
 )
+from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start import (
     known_target,
     mirror_ambiguity,
@@ -204,7 +203,7 @@ def _with_wider_noise(
     if widening <= 1:
         return problem, solution, own
     noisier = replace(problem, covariance_px2=problem.covariance_px2 * widening**2)
-    there = replace(solution, equations=linearisation(noisier)[1](solution.state))
+    there = replace(solution, gaussian=System(noisier).gaussian(solution.state))
     return noisier, there, joint_covariance(noisier, there, leverage=own.leverage)
 
 
@@ -392,10 +391,10 @@ def _strong(fit: RobustFit) -> NDArray[np.bool_]:
     out = np.asarray(strength > STRONG_PERSPECTIVE)
     if not out.any():
         return out
-    variance = iter(np.diag(fit.solution.equations.posterior(whole=False).common))
+    variance = iter(np.diag(fit.solution.gaussian.covariance(whole=False)[0]))
     for c, camera in enumerate(problem.cameras):
         for parameter in problem.free_indices(c):
-            sd = np.sqrt(next(variance)) * parameter_unit(camera)[parameter]
+            sd = np.sqrt(next(variance))
             if parameter == kappa:
                 out[c] &= strength[c] > SURE_SD * sd * camera.rho_mm
     return out

@@ -18,7 +18,7 @@ from telerig.estimator.calibration.solver.problem import (
     prior_sigma,
     problem_from_dots,
 )
-from telerig.estimator.calibration.solver.robust_least_squares import linearisation
+from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start import known_target
 from telerig.factors.calibration import (
     Observations,
@@ -240,7 +240,7 @@ def test_the_graph_has_the_cost_of_the_pure_functions(problem: tuple[Problem, St
     for seed in range(3):
         at = perturbed(state, np.random.default_rng(seed))
         expected = cost_by_hand(made, at)
-        assert linearisation(made)[1](at).cost == pytest.approx(expected, rel=1e-12)
+        assert System(made).gaussian(at).cost == pytest.approx(expected, rel=1e-12)
         assert factors.error(values_of(at, state, keys)) == pytest.approx(expected, rel=1e-9)
 
 

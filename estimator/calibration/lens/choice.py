@@ -36,12 +36,8 @@ from telerig.estimator.calibration.lens.search import (
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
-from telerig.estimator.calibration.solver.robust_least_squares import (
-    UNDAMPED,
-    Solution,
-    linearisation,
-    solve,
-)
+from telerig.estimator.calibration.solver.robust_least_squares import Solution, solve
+from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State
 from telerig.rig.lens_parameters import AUTO, GROUPS, INDEX, groups_of, joint_name, name_of, ordered
 
@@ -348,9 +344,8 @@ def considered_covariance(
         return problem.free, joint
     names = [name_of({*groups_of(model), *more}) for model, more in zip(models, groups)]
     wide = problem.with_model(names)
-    equations = linearisation(wide)[1](solution.state)
-    step, _ = equations.step(UNDAMPED)
-    there = replace(solution, equations=equations)
+    there = replace(solution, gaussian=System(wide).gaussian(solution.state))
+    step, _ = there.gaussian.step()
     # the leverage stays that of the simpler fit, because the residuals do
     found = joint_covariance(wide, there, leverage=joint.leverage)
     return wide.free, found.widened(step)

@@ -20,10 +20,9 @@ from itertools import product
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.calibration.solver.covariance import degrees_of_freedom, hat_matrix_blocks
+from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
-from telerig.estimator.calibration.solver.schur import Posterior
 from telerig.factors.calibration import whitened_error
 from telerig.rig.lens_parameters import GROUPS, INDEX, PLAIN_GROUPS, ordered
 
@@ -83,8 +82,8 @@ class QuadraticCost:
     def of(problem: Problem, solution: Solution) -> QuadraticCost:
         """Return the quadratic form from a fit of the rich model, or a state near its minimum."""
         names = [(c, p) for c, free in enumerate(problem.free) for p in free]
-        posterior = solution.equations.posterior(whole=False)
-        step, still = solution.equations.step(1e-12)
+        joint = joint_covariance(problem, solution, whole=False)
+        step, still = solution.gaussian.step()
         size = len(names)
         unit = np.concatenate(
             [parameter_unit(k)[problem.free_indices(c)] for c, k in enumerate(problem.cameras)]
@@ -94,8 +93,8 @@ class QuadraticCost:
         )
         nominal = [problem.cameras[c].intrinsics[INDEX[p]] for c, p in names]
         there = [solution.state.intrinsics[c, INDEX[p]] for c, p in names]
-        offset = (np.array(there) - nominal) / unit + step[:size]
-        covariance = posterior.common[:size, :size]
+        offset = (np.array(there) - nominal + step[:size]) / unit
+        covariance = joint.matrix[:size, :size] / np.outer(unit, unit)
         more = [
             ((c, f"{a}+{b}"), names.index((c, a)), names.index((c, b)))
             for c in range(len(problem.cameras))
@@ -107,7 +106,7 @@ class QuadraticCost:
             extend[row, [a, b]] = 1.0
         groups = sum(1 for c in range(len(problem.cameras)) for g in PLAIN_GROUPS
                      if (c, GROUPS[g][0]) in names)  # fmt: skip
-        variance = _variance(problem, solution, posterior)
+        variance = _variance(problem, solution, joint)
         rows = 2 * int(np.sum(problem.kept))
         return QuadraticCost(
             (*names, *(m[0] for m in more)), extend @ offset, extend @ covariance @ extend.T,
@@ -180,15 +179,15 @@ def _held_by(lens: Lens) -> frozenset[str]:
     return frozenset(held)
 
 
-def _variance(problem: Problem, solution: Solution, posterior: Posterior) -> float:
+def _variance(problem: Problem, solution: Solution, joint: JointCovariance) -> float:
     """Return the variance of the residuals relative to the stated noise.
 
     It is chi-square of the images over its expectation (docs/theory.md); the stated noise adds
     `NOISE_DOF` degrees of freedom.
     """
     error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
-    dof = degrees_of_freedom(hat_matrix_blocks(problem, solution, posterior))
-    return float(((error**2).sum() + NOISE_DOF) / (max(dof, 0.0) + NOISE_DOF))
+    dof = max(joint.effective_dof, 0.0)
+    return float(((error**2).sum() + NOISE_DOF) / (dof + NOISE_DOF))
 
 
 def possible(rich: Lens) -> list[Lens]:

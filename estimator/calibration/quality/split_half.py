@@ -25,7 +25,8 @@ from telerig.estimator.calibration.solver.problem import (
     Problem,
     cameras_from_state,
 )
-from telerig.estimator.calibration.solver.robust_least_squares import one_step
+from telerig.estimator.calibration.solver.robust_least_squares import Solution
+from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
@@ -109,9 +110,11 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
     if half.scale is not None:
         pair, distance, _ = half.scale
         half = replace(half, scale=(pair, distance, _SCALE * distance))
-    solution = one_step(half, state)
-    names, covariance = joint_covariance(half, solution).rig_block()
-    cameras = cameras_from_state(half, solution.state)
+    system = System(half)
+    gaussian = system.gaussian(state)
+    step, _ = gaussian.step()
+    names, covariance = joint_covariance(half, Solution(state, gaussian, 1)).rig_block()
+    cameras = cameras_from_state(half, system.moved(state, step))
     if not np.isfinite(covariance).all():
         raise CalibrationError(
             f"nothing determines {names[int(np.argmax(~np.isfinite(covariance)))]}"

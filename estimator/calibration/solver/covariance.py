@@ -8,19 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.calibration.solver.problem import (
-    Problem,
-    System,
-    images_of,
-    parameter_unit,
-    slots,
-)
+from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
-from telerig.estimator.calibration.solver.schur import Posterior
+from telerig.estimator.calibration.solver.system import MANY_PARAMETERS, System, images_of
 from telerig.rig.triangulation import POSE_COMPONENTS
-
-FULL_COVARIANCE_UP_TO = 4000
-"""Up to this number of parameters, the covariance of all parameters with all others is kept."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +22,13 @@ class JointCovariance:
     (rotation, translation) at ``rig_from_...``, with right perturbation.
 
     names : names of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
-    matrix : (D, D) covariance; if there are more than `FULL_COVARIANCE_UP_TO` parameters, only of
-        cameras and views (D = K).
+    matrix : (D, D) covariance; if there are more than `MANY_PARAMETERS` parameters, only of cameras
+        and views (D = K).
     dots : (N, 3, 3) covariance of each dot.
     cross : (K, N, 3) covariances of cameras and views with each dot.
     rig : number P of the cameras' parameters, which come first.
     leverage : (M, 2, 2) J C J^T of each used measurement, with J its derivatives and C the
         covariance of all parameters: the share of its noise that the fit absorbs.
-    units : (K + 3 N,) size of each parameter's unit in the solver, in physical units.
     """
 
     names: tuple[str, ...]
@@ -47,7 +37,6 @@ class JointCovariance:
     cross: Array
     rig: int
     leverage: Array
-    units: Array
 
     def of_rig_and(self, dots: Ints) -> Array:
         """Return the covariance (P + 3 n, P + 3 n) of the cameras' P parameters and n dots.
@@ -80,11 +69,10 @@ class JointCovariance:
     def widened(self, offset: Array) -> JointCovariance:
         """Return the covariance with a further error added, which moves all parameters together.
 
-        offset : (K + 3 N,) size of the error in the solver's units; offset offset^T is added.
+        offset : (K + 3 N,) size of the error; offset offset^T is added.
         """
-        shift = offset * self.units
-        whole = shift[: len(self.matrix)]
-        common, of_dots = shift[: len(self.cross)], shift[len(self.cross) :].reshape(-1, 3)
+        whole = offset[: len(self.matrix)]
+        common, of_dots = offset[: len(self.cross)], offset[len(self.cross) :].reshape(-1, 3)
         return replace(
             self,
             matrix=self.matrix + np.outer(whole, whole),
@@ -106,7 +94,7 @@ def degrees_of_freedom(leverage: Array) -> float:
 
 
 def joint_covariance(
-    problem: Problem, solution: Solution, *, leverage: Array | None = None
+    problem: Problem, solution: Solution, *, leverage: Array | None = None, whole: bool = True
 ) -> JointCovariance:
     """Return the covariance of all parameters: the inverse of the information matrix.
 
@@ -114,31 +102,19 @@ def joint_covariance(
     infinite variance. Raises CalibrationError if the information matrix is singular.
 
     leverage : (M, 2, 2) of each used measurement if it is known; None computes it.
+    whole : whether ``matrix`` contains the dots, unless there are too many.
     """
-    size = slots(problem)["dots"][0].stop
-    posterior = solution.equations.posterior(whole=size <= FULL_COVARIANCE_UP_TO)
-    matrix = posterior.common if posterior.whole is None else posterior.whole
-    matrix = matrix.copy()
-    untouched = posterior.untouched[: len(matrix)]
-    matrix[untouched, untouched] = np.inf
-    units = _units(problem, size)
-    rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
+    gaussian = solution.gaussian
+    untouched, size = gaussian.untouched, len(gaussian.right)
+    common, cross, dots, every = gaussian.covariance(whole=whole and size <= MANY_PARAMETERS)
     if leverage is None:
-        leverage = hat_matrix_blocks(problem, solution, posterior)
-    names, within = _names(problem)[: len(matrix)], units[: len(matrix)]
-    matrix *= within[:, None] * within
-    cross = posterior.cross * units[: len(posterior.cross), None, None]
-    return JointCovariance(names, matrix, posterior.dots, cross, rig, leverage, units)
-
-
-def _units(problem: Problem, size: int) -> Array:
-    units = np.ones(size)
-    at = 0
-    for c, camera in enumerate(problem.cameras):
-        free = problem.free_indices(c)
-        units[at : at + len(free)] = parameter_unit(camera)[free]
-        at += len(free)
-    return units
+        leverage = _leverage(problem, solution, common, cross, dots)
+    matrix = common if every is None else every
+    at = np.flatnonzero(untouched[: len(matrix)])
+    matrix[at, at] = np.inf
+    names = _names(problem)[: len(matrix)]
+    rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
+    return JointCovariance(names, matrix, dots, cross, rig, leverage)
 
 
 def _names(problem: Problem) -> tuple[str, ...]:
@@ -149,12 +125,10 @@ def _names(problem: Problem) -> tuple[str, ...]:
     return tuple(names)
 
 
-def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior) -> Array:
-    """Return the leverage (M, 2, 2) of each used measurement.
-
-    It is J C J^T, with J the derivatives of the measurement and C the covariance ``posterior``: the
-    share of the measurement's noise that the fit absorbs.
-    """
+def _leverage(
+    problem: Problem, solution: Solution, common: Array, cross: Array, dots: Array
+) -> Array:
+    """Return `JointCovariance.leverage` from the blocks of the covariance."""
     system, out = System(problem), np.empty((int(np.sum(problem.kept)), 2, 2))
     for c, obs in enumerate(system.images):
         columns = system.columns(solution.state, c)[:-1].transpose(2, 1, 0)
@@ -162,10 +136,8 @@ def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior
             image, dot = columns[first:last], obs.dot[first:last]
             own, place = image[..., -3:], system.views_at + 6 * view
             index = np.r_[system.camera_places[c], place : place + 6]
-            across = posterior.cross[index][:, dot].swapaxes(0, 1)
-            mixed = image @ across @ np.swapaxes(own, -1, -2)
-            alone = image @ posterior.common[np.ix_(index, index)] @ np.swapaxes(image, -1, -2)
-            of_dots = own @ posterior.dots[dot] @ np.swapaxes(own, -1, -2)
-            rows = system.rows[c][first:last]
-            out[rows] = alone + mixed + np.swapaxes(mixed, -1, -2) + of_dots
+            mixed = image @ cross[index][:, dot].swapaxes(0, 1) @ np.swapaxes(own, -1, -2)
+            alone = image @ common[np.ix_(index, index)] @ np.swapaxes(image, -1, -2)
+            of_dots = own @ dots[dot] @ np.swapaxes(own, -1, -2)
+            out[system.rows[c][first:last]] = alone + mixed + np.swapaxes(mixed, -1, -2) + of_dots
     return out

@@ -9,12 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from telerig.estimator.calibration.solver.problem import (
-    Problem,
-    System,
-    images_of,
-    parameter_unit,
-)
+from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
+from telerig.estimator.calibration.solver.system import System, images_of
 from telerig.factors.calibration import State
 from telerig.factors.custom_factors import (
     Keys,

@@ -1,18 +1,15 @@
-"""Defines a self-calibration problem, as all solvers share it.
+"""Defines a self-calibration problem.
 
 A `Problem` holds the measurements, the prior knowledge, and which intrinsics are free;
 `telerig.rig.lens_parameters` gives names to the sets of free intrinsics. `problem_from_dots` makes
-one from a table of dots. `System` computes its whitened residuals and their derivatives at any
-state, from `factors.calibration`; all solvers use them. `eccentricity_px` is what the measured
-centres are corrected by: the centre of a dot's image is the image of the dot's centre only for an
-affine camera.
+one from a table of dots. `eccentricity_px` is what the measured centres are corrected by: the
+centre of a dot's image is the image of the dot's centre only for an affine camera.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -20,20 +17,11 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError, InputError
-from telerig.factors.calibration import (
-    Observations,
-    State,
-    depth_gauge_residual,
-    distance_residual,
-    image_columns,
-    pixels,
-    place_residual,
-)
-from telerig.io.machine.parallel import keep_freed_memory
+from telerig.factors.calibration import Observations, State, pixels
 from telerig.io.results.findings import Code
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX, LENS_PARAMETERS, parameters_of
-from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.pose import Pose
 from telerig.rig.target import Target
 
 GAUGE_SIGMA_MM = 1e-4
@@ -52,7 +40,6 @@ LEAST_OUTLIER_SD = 3.0
 """The smallest limit that is accepted. It leaves out one correct dot in 90; with a lower limit too
 much ordinary noise would be taken for outliers."""
 
-SOLVERS = ("auto", "gtsam", "schur")
 DOTS_FREE = ("3d", "plane", "nominal")
 
 
@@ -91,7 +78,7 @@ class Problem:
     scale : ((dot index, dot index), distance_mm, sigma_mm) of two dots whose distance is known;
         None if the nominal positions set the scale.
     plate_shift : (V, C) as in `Observations`.
-    solver : "gtsam", "schur" or "auto".
+    solver : what eliminates the dots: "gtsam", "numpy", or "auto" by their number.
     outlier_sd : number of standard deviations beyond which a dot is left out.
     hold_scales : if all lenses have perspective, whether their scales are held at nominal. Each
         camera's origin is then at the depth at which its scale is the nominal one, and not where
@@ -440,146 +427,6 @@ def _shifted(state: State, shift_mm: Array) -> State:
     return replace(state, dots_mm=state.dots_mm + shift_mm)
 
 
-@dataclass(frozen=True)
-class Priors:
-    """Whitened residuals of all priors, and their derivatives.
-
-    cameras : for each camera the residuals (r,) of the weak priors and of the depth gauge, and
-        their derivatives (r, S) with respect to its S parameters: the free intrinsics and, except
-        for the first camera, the pose.
-    views : the residuals (V, 3) of the weak priors on the target's position in each view, and their
-        derivatives (V, 3, 6) with respect to its pose.
-    dots : the residuals (N, 3) of the dots' nominal positions, and the diagonal (N, 3) of their
-        derivatives.
-    distance : for a known distance the indices of the two dots, the residual, and its derivative
-        (3,) with respect to the first dot; None if no distance is known.
-    """
-
-    cameras: list[tuple[Array, Array]]
-    views: tuple[Array, Array]
-    dots: tuple[Array, Array]
-    distance: tuple[tuple[int, int], float, Array] | None
-
-    @property
-    def squared(self) -> float:
-        """The sum of all squared residuals."""
-        parts = [*(value for value, _ in self.cameras), self.views[0], self.dots[0]]
-        far = self.distance[1] ** 2 if self.distance is not None else 0.0
-        return float(sum(np.vdot(part, part) for part in parts)) + far
-
-
-class System:
-    """Computes the residuals of a problem as functions of the state.
-
-    images : for each camera its measurements, sorted by view and dot.
-    rows : for each camera the indices of these measurements in `Problem.observations`.
-    camera_places : for each camera the indices of its S parameters among all D parameters.
-    views_at, dots_at : index of the first parameter of the views and of the dots.
-    size : D.
-    """
-
-    def __init__(self, problem: Problem) -> None:
-        keep_freed_memory()
-        self.problem = problem
-        self.place_sigma_mm = 10 * max(problem.rho_mm)
-        cameras = range(len(problem.cameras))
-        self.free = [problem.free_indices(c) for c in cameras]
-        self.unit = [parameter_unit(k)[f] for k, f in zip(problem.cameras, self.free)]
-        self.sigma = [problem.prior_sigma(c)[f] for c, f in enumerate(self.free)]
-        place = slots(problem)
-        every = np.arange(place["dots"][0].stop)
-        self.camera_places = [
-            np.r_[every[place["intrinsics"][c]], every[place["camera"][c]]] for c in cameras
-        ]
-        self.views_at = place["view"][0].start if problem.views else place["dots"][0].start
-        self.dots_at, self.size = place["dots"][0].start, place["dots"][0].stop
-        observations = problem.observations()
-        self.rows = [np.flatnonzero(observations.camera == c) for c in cameras]
-        self.rows = [
-            rows[np.lexsort((observations.dot[rows], observations.view[rows]))]
-            for rows in self.rows
-        ]
-        self.images = [_components_first(observations.subset(rows)) for rows in self.rows]
-
-    def columns(self, state: State, camera: int, rows: slice = slice(None)) -> Array:
-        """Return the whitened residuals of a camera and their derivatives: `image_columns`.
-
-        They are (S + 7, 2, M) for M measurements; intrinsics are in units of `parameter_unit`.
-        rows : which of the camera's measurements are used.
-        """
-        obs = self.images[camera].subset(rows)
-        out = image_columns(
-            state, obs, camera, self.problem.rho_mm[camera], self.free[camera].tolist()
-        )
-        out[: len(self.free[camera])] *= self.unit[camera][:, None, None]
-        return out
-
-    def priors(self, state: State) -> Priors:
-        """Return the residuals of all priors, and their derivatives."""
-        problem, cameras = self.problem, []
-        for c, nominal in enumerate(problem.cameras):
-            free, unit, sigma = self.free[c], self.unit[c], self.sigma[c]
-            value = (state.intrinsics[c] - nominal.intrinsics)[free] / sigma
-            jacobian = np.diag(unit / sigma)
-            if c:
-                # only one camera fixes the origin along the axis of the first camera
-                gauge, by_pose = depth_gauge_residual(
-                    state.rig_from_camera[c], problem.gauge_sigma_mm
-                )
-                first = 0 if c == problem.origin_camera else 1
-                value = np.concatenate([value, gauge[first:]])
-                whole = np.zeros((len(value), len(free) + 6))
-                whole[: len(free), : len(free)] = jacobian
-                whole[len(free) :, len(free) :] = by_pose[first:]
-                jacobian = whole
-            cameras.append((value, jacobian))
-        views = place_residual(state.rig_from_target, self.place_sigma_mm)
-        sigma = np.broadcast_to(problem.dot_sigma_mm, state.dots_mm.shape)
-        dots = (state.dots_mm - problem.nominal_mm) / sigma, 1 / sigma
-        distance = None
-        if problem.scale is not None:
-            (a, b), length, sd = problem.scale
-            off, by_first = distance_residual(state.dots_mm[a], state.dots_mm[b], length, sd)
-            distance = (a, b), float(off), by_first
-        return Priors(cameras, views, dots, distance)
-
-    def moved(self, state: State, step: Array) -> State:
-        """Return the state after a step of all D parameters.
-
-        step : (D,), with intrinsics in units of `parameter_unit`. A pose (R, t) becomes
-        (R exp(w), t + R v) for the step (w, v).
-        """
-        intrinsics, cameras = state.intrinsics.copy(), state.rig_from_camera.copy()
-        for c, (free, unit, places) in enumerate(zip(self.free, self.unit, self.camera_places)):
-            intrinsics[c, free] += step[places[: len(free)]] * unit
-            if c:
-                cameras[c] = retracted(cameras[c], step[places[len(free) :]])
-        of_views = step[self.views_at : self.dots_at].reshape(-1, 6)
-        return replace(
-            state,
-            intrinsics=intrinsics,
-            rig_from_camera=cameras,
-            rig_from_target=retracted(state.rig_from_target, of_views),
-            dots_mm=state.dots_mm + step[self.dots_at :].reshape(-1, 3),
-        )
-
-
-def slots(problem: Problem) -> dict[str, list[slice]]:
-    """Return where the parameters of each variable are in the information matrix.
-
-    The result maps each kind of variable to a list of slices, one for each variable.
-    """
-    out: dict[str, list[slice]] = {"intrinsics": [], "camera": [], "view": [], "dots": []}
-    at = 0
-    sizes = [("intrinsics", len(f)) for f in problem.free]
-    sizes += [("camera", 0 if c == 0 else 6) for c in range(len(problem.cameras))]
-    sizes += [("view", 6)] * len(problem.views) + [("dots", problem.nominal_mm.size)]
-    for name, size in sizes:
-        out[name].append(slice(at, at + size))
-        at += size
-    return out
-
-
 LEAST_DOTS = int(Code.UNUSED_VIEWS.limit)
 """Number of different dots that a view or an image needs: fewer do not determine the pose of the
 target."""
@@ -595,28 +442,3 @@ def on_a_line(points_mm: Array) -> bool:
     """Return whether points (n, 2) lie on one line, so that they do not determine a pose."""
     length, width = np.linalg.svd(points_mm - points_mm.mean(0), compute_uv=False)
     return bool(width < LINE_SHARE * length)
-
-
-def images_of(obs: Observations) -> list[tuple[int, int, int]]:
-    """Return (view, first row, last row + 1) for every image of one camera.
-
-    obs : the camera's measurements, sorted by view.
-    """
-    edges = np.flatnonzero(np.diff(obs.view, prepend=-1, append=-1)).tolist()
-    return [(int(obs.view[a]), a, b) for a, b in pairwise(edges)]
-
-
-def _components_first(obs: Observations) -> Observations:
-    """Return the same measurements with each component contiguous in memory."""
-    uv = np.ascontiguousarray(obs.uv_px.T)
-    whitener = np.ascontiguousarray(obs.whitener.transpose(1, 2, 0))
-    return replace(obs, uv_px=uv.T, whitener=whitener.transpose(2, 0, 1))
-
-
-def retracted(pose: Array, tangent: Array) -> Array:
-    """Return poses (..., 4, 4) after a step along tangents (..., 6) (rotation, translation)."""
-    out = pose.copy()
-    turn = pose[..., :3, :3]
-    out[..., :3, :3] = turn @ rotation_from_rotvec(tangent[..., :3])
-    out[..., :3, 3] += (turn @ tangent[..., 3:, None])[..., 0]
-    return out

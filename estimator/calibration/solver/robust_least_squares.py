@@ -1,9 +1,8 @@
 """Solves a calibration by robust least squares: Levenberg-Marquardt iteration, a weight for each
 dot, and a noise floor that covers errors of the model.
 
-GTSAM eliminates the factor graph of a calibration of usual size (`elimination.GraphEquations`). A
-large calibration is solved by its Schur complement (`schur.NormalEquations`). Both use the same
-whitened blocks. The reasons for an iteration of our own are in docs/decisions/002 and 020.
+Each step is that of a `Gaussian`, of which GTSAM eliminates the dots, and NumPy if they are many.
+The reasons for an iteration of our own are in docs/decisions/002 and 020.
 
 GTSAM's robust noise models give one weight to a whole factor, which is a whole image here. A single
 wrong dot would reduce the weight of all other dots of its image. Dots are therefore weighted one by
@@ -20,27 +19,20 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, GeometryError
-from telerig.estimator.calibration.solver.elimination import GraphEquations, GraphLayout
-from telerig.estimator.calibration.solver.problem import LEAST_DOTS, Problem, System, on_a_line
-from telerig.estimator.calibration.solver.schur import NormalEquations
+from telerig.estimator.calibration.solver.gaussian import Gaussian
+from telerig.estimator.calibration.solver.problem import LEAST_DOTS, Problem, on_a_line
+from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State, pixels
 from telerig.factors.robust_loss import calibration_weights, next_limit
 
-MANY_DOTS = 5000
-"""With more measured dots than this, the Schur complement solves the problem
-(docs/decisions/020)."""
-MANY_PARAMETERS = 4000
-"""With more parameters of views and dots than this, the full covariance matrix is too large."""
 LINEAR = 0.9
 """After a step that gains at least this share of its predicted gain, the damping falls a
 thousandfold rather than tenfold."""
 NEARLY_UNDAMPED = 1e-6
 """With less damping than this, the predicted gain of a step is what Gauss-Newton could still
 gain."""
-UNDAMPED = 1e-12
-"""Damping of a Gauss-Newton step."""
+LEAST_DAMPING = 1e-12
 Progress = Callable[[int, float], None]
-Equations = GraphEquations | NormalEquations
 
 
 @dataclass(frozen=True)
@@ -48,38 +40,18 @@ class Solution:
     """The result of a least-squares solution.
 
     state : the minimum.
-    cost : half the sum of squared whitened residuals, including those of the priors.
+    gaussian : the Gaussian of the problem there.
     iterations : number of steps.
-    equations : the equations, linearised at the minimum.
     """
 
     state: State
-    cost: float
+    gaussian: Gaussian
     iterations: int
-    equations: Equations
 
     @property
-    def information(self) -> Array:
-        """The information matrix J^T J (D, D)."""
-        return self.equations.information()
-
-
-def is_large(problem: Problem) -> bool:
-    """Return whether the problem is solved by the Schur complement instead of GTSAM.
-
-    See docs/decisions/020.
-    """
-    numbers = 6 * len(problem.views) + 3 * len(problem.dot_ids)
-    return len(problem.view) > MANY_DOTS or numbers > MANY_PARAMETERS
-
-
-def linearisation(problem: Problem) -> tuple[System, Callable[[State], Equations]]:
-    """Return a problem's residuals, and a function from a state to the linearised equations."""
-    system = System(problem)
-    if problem.solver == "schur" or (problem.solver == "auto" and is_large(problem)):
-        return system, lambda state: NormalEquations(system, state)
-    layout = GraphLayout(system)
-    return system, lambda state: GraphEquations(layout, state)
+    def cost(self) -> float:
+        """Half the sum of squared whitened residuals, including those of the priors."""
+        return self.gaussian.cost
 
 
 def solve(
@@ -96,9 +68,9 @@ def solve(
     Raises CalibrationError if the cost at the start is not finite, or if the measurements do not
     determine all parameters.
     """
-    system, linearised = linearisation(problem)
-    point, equations = start, _at(linearised, start)
-    if equations is None:
+    system = System(problem)
+    point, gaussian = start, _at(system, start)
+    if gaussian is None:
         raise CalibrationError(
             "the start values are impossible: no ray of a camera reaches some of the dots that it "
             "has measured",
@@ -106,47 +78,35 @@ def solve(
         )
     damping, iteration = 1e-4, 0
     for iteration in range(1, max_iterations + 1):
-        cost = equations.cost
-        step, promised = equations.step(damping)
+        cost = gaussian.cost
+        step, promised = gaussian.step(damping)
         if promised <= relative * cost and damping <= NEARLY_UNDAMPED:
             break
         moved = system.moved(point, step)
-        trial = _at(linearised, moved)
+        trial = _at(system, moved)
         if trial is not None and cost - trial.cost >= -1e-13 * cost:
             done = promised <= relative * cost and cost - trial.cost <= relative * cost
             as_promised = cost - trial.cost > LINEAR * promised
-            point, equations = moved, trial
-            damping = max(damping / (1000 if as_promised else 10), 1e-12)
+            point, gaussian = moved, trial
+            damping = max(damping / (1000 if as_promised else 10), LEAST_DAMPING)
             if progress is not None:
-                progress(iteration, equations.cost)
+                progress(iteration, gaussian.cost)
             if done:
                 break
         else:
             damping *= 10
             if damping > 1e12:
                 break
-    return Solution(point, float(equations.cost), iteration, equations)
+    return Solution(point, gaussian, iteration)
 
 
-def one_step(problem: Problem, state: State) -> Solution:
-    """Return the solution after one Gauss-Newton step from the minimum of a similar problem.
-
-    The cost is that before the step. Raises CalibrationError if the measurements do not determine
-    all parameters.
-    """
-    system, linearised = linearisation(problem)
-    equations = linearised(state)
-    step, _ = equations.step(UNDAMPED)
-    return Solution(system.moved(state, step), equations.cost, 1, equations)
-
-
-def _at(linearised: Callable[[State], Equations], state: State) -> Equations | None:
-    """Return the equations, or None where the cost is not finite (a window hides a dot)."""
+def _at(system: System, state: State) -> Gaussian | None:
+    """Return the Gaussian, or None where the cost is not finite (a window hides a dot)."""
     try:
-        equations = linearised(state)
+        gaussian = system.gaussian(state)
     except GeometryError:
         return None
-    return equations if np.isfinite(equations.cost) else None
+    return gaussian if np.isfinite(gaussian.cost) else None
 
 
 _MEDIAN = 2 * np.log(2)  # median of chi-square with two degrees of freedom

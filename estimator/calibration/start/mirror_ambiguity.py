@@ -23,11 +23,9 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import (
     STRONG_PERSPECTIVE,
     Problem,
-    System,
-    images_of,
-    retracted,
 )
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
+from telerig.estimator.calibration.solver.system import System, images_of, retracted
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX

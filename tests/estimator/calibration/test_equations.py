@@ -1,4 +1,4 @@
-"""The linear problem at a state, by GTSAM and by arrays, against the multiplied-out Jacobian.
+"""The Gaussian at a state, eliminated by GTSAM and by NumPy, against the multiplied-out Jacobian.
 
 The reference multiplies out `whitened_residuals`, which test_factors.py proves by itself, and adds
 priors that are written down here once more.
@@ -15,21 +15,20 @@ import numpy as np
 import pytest
 
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver import covariance, schur
+from telerig.estimator.calibration.solver import covariance
 from telerig.estimator.calibration.solver import robust_least_squares as lm
+from telerig.estimator.calibration.solver import system as systems
 from telerig.estimator.calibration.solver.covariance import joint_covariance
+from telerig.estimator.calibration.solver.gaussian import Gaussian
 from telerig.estimator.calibration.solver.problem import (
     GAUGE_SIGMA_MM,
     Problem,
-    System,
-    images_of,
     nominal_state,
-    parameter_unit,
     prior_sigma,
     problem_from_dots,
-    slots,
     whitening,
 )
+from telerig.estimator.calibration.solver.system import System, images_of, slots
 from telerig.estimator.calibration.start import known_target
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.rig.camera import Camera
@@ -39,7 +38,7 @@ from telerig.rig.windows import Wall
 
 pytestmark = pytest.mark.usefixtures("without_advice")
 
-SOLVERS = ("gtsam", "schur")
+SOLVERS = ("gtsam", "numpy")
 
 MODELS = {
     "scale": {"scale_px_per_mm": 20.4},
@@ -108,8 +107,7 @@ def of_images(problem: Problem, state: State) -> tuple[Any, Any]:
     out = np.zeros((len(obs), 2, place["dots"][0].stop))
     for m, (v, c, d) in enumerate(zip(obs.view, obs.camera, obs.dot)):
         free = problem.free_indices(c)
-        unit = parameter_unit(problem.cameras[c])[free]
-        out[m][:, place["intrinsics"][c]] = full.by_intrinsics[m][:, free] * unit
+        out[m][:, place["intrinsics"][c]] = full.by_intrinsics[m][:, free]
         if c:
             out[m][:, place["camera"][c]] = full.by_camera[m]
         out[m][:, place["view"][v]] = full.by_view[m]
@@ -153,6 +151,22 @@ def of_priors(problem: Problem, state: State) -> tuple[Any, Any]:
     return np.stack(columns, -1), residual(state)
 
 
+def dense(gaussian: Gaussian) -> Any:
+    """The information matrix (D, D)."""
+    size, at = len(gaussian.common), gaussian.of_blocks
+    out = np.zeros((len(gaussian.right),) * 2)
+    out[:size, :size] = gaussian.common
+    out[:size, at] = gaussian.cross.swapaxes(1, 2)
+    out[at, :size] = gaussian.cross.transpose(2, 1, 0)
+    out[at[:, :, None], at[:, None]] = gaussian.blocks
+    if gaussian.distance is not None:
+        row = np.zeros(len(out))
+        for dot, sign in zip(gaussian.distance[0], (1, -1)):
+            row[at[dot]] = sign * gaussian.distance[1]
+        out += np.outer(row, row)
+    return out
+
+
 def check(problem: Problem, state: State) -> None:
     """Cost, information, right side, damped step and inverse, by either solver."""
     parts = zip(of_images(problem, state), of_priors(problem, state))
@@ -163,29 +177,30 @@ def check(problem: Problem, state: State) -> None:
     correlation = np.linalg.inv(information / unit)
     sd = np.sqrt(np.diag(correlation))
     for solver in SOLVERS:
-        _, linearised = lm.linearisation(replace(problem, solver=solver))
-        ours = linearised(state)
+        ours = System(replace(problem, solver=solver)).gaussian(state)
         assert ours.cost == pytest.approx(0.5 * value @ value, rel=1e-12)
-        assert np.abs((ours.information() - information) / unit).max() < 1e-9
+        assert np.abs((dense(ours) - information) / unit).max() < 1e-9
+        np.testing.assert_allclose(ours.diagonal, np.diag(information), rtol=1e-9)
         given = ours.right[: len(right)]
         np.testing.assert_allclose(given / length, right / length, rtol=1e-5, atol=1e-6)
         for damping in (1e-6, 1e-3, 1.0):
-            damped = ours.information() + damping * np.diag(np.diag(information))
+            damped = dense(ours) + damping * np.diag(np.diag(information))
             step, promised = ours.step(damping)
             expected = np.linalg.solve(damped / unit, given / length)
             off = np.abs(step * length - expected).max()
             assert off < 1e-6 * np.abs(expected).max()
             assert promised == pytest.approx(0.5 * step @ given)
         for whole in (True, False):
-            found = ours.posterior(whole)
-            size = len(found.common)
+            common, cross, blocks, every = ours.covariance(whole=whole)
+            assert (every is not None) or not whole
+            size = len(common)
             inverse = correlation / unit
             near = np.outer(sd, sd) / unit
             wanted, bound = inverse[:size, :size], near[:size, :size]
-            assert np.abs((found.common - wanted) / bound).max() < 2e-5
+            assert np.abs((common - wanted) / bound).max() < 2e-5
             wanted, bound = inverse[:size, size:], near[:size, size:]
-            assert np.abs((found.cross.reshape(size, -1) - wanted) / bound).max() < 2e-5
-            for d, block in enumerate(found.dots):
+            assert np.abs((cross.reshape(size, -1) - wanted) / bound).max() < 2e-5
+            for d, block in enumerate(blocks):
                 at = size + 3 * d + np.arange(3)
                 assert np.abs((block - inverse[np.ix_(at, at)]) / near[np.ix_(at, at)]).max() < 2e-5
 
@@ -256,19 +271,20 @@ def test_a_view_that_is_left_out_stays_and_is_infinitely_uncertain(rng: Any) -> 
     place = slots(problem)["view"][2]
     for solver in SOLVERS:
         made = replace(problem, solver=solver)
-        equations = lm.linearisation(made)[1](state)
+        equations = System(made).gaussian(state)
         step, _ = equations.step(1e-3)
         assert not step[place][:3].any()
-        found = joint_covariance(made, lm.Solution(state, 0.0, 0, equations))
+        found = joint_covariance(made, lm.Solution(state, equations, 0))
         assert np.isinf(np.diag(found.matrix)[place][:3]).all()
 
 
 def test_a_view_of_one_camera_has_the_variance_of_its_weak_prior(rng: Any) -> None:
-    """Its depth is 1e7 times less certain than its other places: beyond Cholesky's digits.
+    """Its depth is 1e7 times less certain than its other places: beyond Cholesky's digits along the
+    target's axes.
 
     The reference is QR of the whole Jacobian, columns of unit length.
     """
-    problem = replace(problem_of(("k1",), rng, 1.0), solver="gtsam")
+    problem = problem_of(("k1",), rng, 1.0)
     problem = problem.subset((problem.view != 2) | (problem.camera == 1))
     tight = replace(problem, covariance_px2=1e-4 * problem.covariance_px2)
     state = state_of(tight, {"k1": 0.02}, rng)
@@ -277,9 +293,12 @@ def test_a_view_of_one_camera_has_the_variance_of_its_weak_prior(rng: Any) -> No
     length = np.linalg.norm(jacobian, axis=0)
     root = np.linalg.inv(np.linalg.qr(jacobian / length, mode="r")) / length[:, None]
     expected = (root**2).sum(1)
-    found = lm.linearisation(tight)[1](state).posterior(True).whole
-    assert found is not None
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(expected), rtol=1e-4)
+    for solver in SOLVERS:
+        *_, found = System(replace(tight, solver=solver)).gaussian(state).covariance(whole=True)
+        assert found is not None
+        np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(expected), rtol=1e-4)
+        off = (found - root @ root.T) / np.sqrt(np.outer(expected, expected))
+        assert np.abs(off).max() < 1e-4
     place = slots(tight)["view"][2]
     assert np.sqrt(expected[place][3:]).max() > 0.1 * 10 * max(tight.rho_mm)
 
@@ -289,9 +308,9 @@ def test_chunks_of_any_size(rng: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     state = state_of(problem, {"k1": 0.02}, rng)
     system = System(problem)
     for size in (1, 15, 40, 10_000):
-        monkeypatch.setattr(schur, "CHUNK", size)
+        monkeypatch.setattr(systems, "CHUNK", size)
         for obs in system.images:
-            chunks = schur._in_chunks(images_of(obs))
+            chunks = systems._in_chunks(images_of(obs))
             assert [i for chunk in chunks for i in chunk] == images_of(obs)
         assert len(chunks) > 1 or size > 15
         check(problem, state)
@@ -307,8 +326,7 @@ def test_whitening_is_the_inverse_cholesky_factor(rng: Any) -> None:
 
 
 def solved(problem: Problem, state: State) -> lm.Solution:
-    equations = lm.linearisation(problem)[1](state)
-    return lm.Solution(state, equations.cost, 0, equations)
+    return lm.Solution(state, System(problem).gaussian(state), 0)
 
 
 def test_degrees_of_freedom_are_the_trace_of_the_residuals(rng: Any) -> None:
@@ -317,7 +335,7 @@ def test_degrees_of_freedom_are_the_trace_of_the_residuals(rng: Any) -> None:
     jacobian, _ = of_images(problem, state)
     solution = solved(problem, state)
     found = joint_covariance(problem, solution).effective_dof
-    inverse = np.linalg.inv(solution.information)
+    inverse = np.linalg.inv(dense(solution.gaussian))
     absorbed = np.trace(inverse @ jacobian.T @ jacobian)
     assert found == pytest.approx(2 * len(problem.view) - absorbed, rel=1e-6)
 
@@ -325,10 +343,10 @@ def test_degrees_of_freedom_are_the_trace_of_the_residuals(rng: Any) -> None:
 def test_a_large_calibration_keeps_cameras_and_views(
     rng: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem = replace(problem_of(("k1",), rng), solver="schur")
+    problem = replace(problem_of(("k1",), rng), solver="numpy")
     solution = solved(problem, state_of(problem, {"k1": 0.02}, rng))
     whole = joint_covariance(problem, solution)
-    monkeypatch.setattr(covariance, "FULL_COVARIANCE_UP_TO", 10)
+    monkeypatch.setattr(covariance, "MANY_PARAMETERS", 10)
     parts = joint_covariance(problem, solution)
     n = len(parts.names)
     assert parts.names == whole.names[:n]
@@ -346,9 +364,9 @@ def test_a_direction_that_nothing_determines_is_an_error(rng: Any) -> None:
     problem = replace(problem, dot_sigma_mm=np.full((12, 3), 1e12))
     state = state_of(problem, {}, rng)
     for solver in SOLVERS:
-        equations = lm.linearisation(replace(problem, solver=solver))[1](state)
+        equations = System(replace(problem, solver=solver)).gaussian(state)
         with pytest.raises(CalibrationError, match="do not determine all parameters"):
-            equations.posterior(True)
+            equations.covariance(whole=True)
 
 
 def test_moves_are_gtsams_retraction_to_first_order(rng: Any) -> None:
@@ -371,10 +389,18 @@ def case(made: Any, model: str) -> tuple[Problem, State]:
 
 def test_arrays_are_taken_for_many_dots(scene: Callable[..., Any]) -> None:
     small, start = case(scene("paper", 1), "radial")
-    assert isinstance(lm.linearisation(small)[1](start), lm.GraphEquations)
+    assert System(small).gaussian(start).by_gtsam
     large, start = case(scene("dense", 1, views=8), "radial")
-    assert len(large.view) > lm.MANY_DOTS
-    assert isinstance(lm.linearisation(large)[1](start), lm.NormalEquations)
+    assert len(large.view) > systems.MANY_DOTS
+    assert not System(large).gaussian(start).by_gtsam
+
+
+def test_gtsam_and_numpy_find_the_same_minimum_and_covariance(scene: Callable[..., Any]) -> None:
+    problem, start = case(scene("paper", 2), "radial")
+    found = [lm.solve(replace(problem, solver=solver), start) for solver in SOLVERS]
+    assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)
+    sd = [np.sqrt(np.diag(joint_covariance(problem, each).matrix)) for each in found]
+    np.testing.assert_allclose(sd[0], sd[1], rtol=1e-8)
 
 
 def test_the_whole_calibration_with_either_solver(
@@ -382,9 +408,9 @@ def test_the_whole_calibration_with_either_solver(
 ) -> None:
     made = scene("paper", 2, outlier_share=0.05)
     one = made.calibrate("radial")
-    monkeypatch.setattr(lm, "MANY_DOTS", 0)
+    monkeypatch.setattr(systems, "MANY_DOTS", 0)
     other = replace(made).calibrate("radial")
-    assert one.statistics["cost"] == pytest.approx(other.statistics["cost"], rel=1e-8)
+    assert one.statistics["cost"] == pytest.approx(other.statistics["cost"], rel=1e-9)
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-4, atol=1e-16)
 
 

@@ -19,7 +19,7 @@ from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality.comparison import compare_calibrations
 from telerig.estimator.calibration.quality.truth import space_error
 from telerig.estimator.calibration.result.calibration import load_calibration
-from telerig.estimator.calibration.solver import robust_least_squares
+from telerig.estimator.calibration.solver import system
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.findings import Code
 from telerig.io.simulation.config import CameraConfig
@@ -151,7 +151,7 @@ def test_opposite_first_cameras_leave_the_origin_to_the_third(
     for cameras, many in (
         ([left, middle, right], 5000), (opposite, 5000), (opposite, 0),
     ):  # fmt: skip
-        monkeypatch.setattr(robust_least_squares, "MANY_DOTS", many)
+        monkeypatch.setattr(system, "MANY_DOTS", many)
         found = replace(made, cameras=cameras).calibrate("radial")
         assert codes(found) == ["NO_STRUCTURE", "HALVES_NOT_COMPARED"]
         assert abs(found.camera("middle").rig_from_camera.translation_mm[2]) < 1e-5

@@ -1,8 +1,7 @@
 """Pages that are made when the documentation is built.
 
-Pages of the repository's root and of benchmarks/ are taken in as they stand, the reference of the
-modules is listed from pyproject.toml (which works with every way of installing), and the commands'
-help is asked of the command line itself. Links work both in the repository and in the built pages.
+Pages of the repository's root and of benchmarks/ are taken in as they stand, and the commands' help
+is asked of the command line itself. Links work both in the repository and in the built pages.
 """
 
 from __future__ import annotations
@@ -59,30 +58,6 @@ def with_links(text: str, docname: str) -> str:
     return "".join(p if p.startswith("`") else LINK.sub(turned, p) for p in pieces)
 
 
-def modules() -> dict[str, list[str]]:
-    """Package to its public modules, from the folders below `src/telerig`."""
-    source = ROOT / "src"
-    folders = sorted(Path(folder) for folder, _, _ in os.walk(source, followlinks=True))
-    return {
-        ".".join(folder.relative_to(source).parts): sorted(
-            ".".join(path.relative_to(source).with_suffix("").parts)
-            for path in folder.glob("*.py")
-            if not path.stem.startswith("_")
-        )
-        for folder in folders
-        if (folder / "__init__.py").is_file()
-    }
-
-
-def reference_page(package: str, names: list[str]) -> str:
-    """Every module of a package, by autodoc."""
-    lines = [package, "=" * len(package), "", f".. automodule:: {package}", "   :no-members:", ""]
-    for name in names:
-        short = name.removeprefix(package + ".")
-        lines += [short, "-" * len(short), "", f".. automodule:: {name}", ""]
-    return "\n".join(lines)
-
-
 def commands_page() -> str:
     """The help of every command, as the command line prints it."""
     import typer
@@ -122,11 +97,6 @@ def _write(docname: str, suffix: str, text: str) -> None:
 def make_pages(*_: Any) -> None:
     """Write docs/_generated/, and take away what no longer belongs there."""
     wanted = {f"{name}.md": titled(path) for name, path in taken_in().items()}
-    wanted |= {
-        f"{GENERATED}/reference/{package}.rst": reference_page(package, names)
-        for package, names in modules().items()
-        if package != "telerig"
-    }
     wanted[f"{GENERATED}/commands.md"] = commands_page()
     for old in (DOCS / GENERATED).rglob("*.*"):
         if old.is_file() and old.relative_to(DOCS).as_posix() not in wanted:

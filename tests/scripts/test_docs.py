@@ -171,7 +171,7 @@ def test_numbers_of_the_tutorial_are_compared(page: str, printed: str, same: boo
     reason="the extra 'docs' is not installed: pip install 'telerig[docs]'",
 )
 def test_pages_build_without_a_warning(tmp_path: Path) -> None:
-    """As text, which reads and links every page as HTML does; .ci/run builds the HTML."""
+    """As text, which reads and links every page as HTML does."""
     command = [sys.executable, "-m", "sphinx", "-b", "text", "-W", "--keep-going", "-q", "-j", "2"]
     done = subprocess.run(
         [*command, "-d", str(tmp_path / "trees"), str(ROOT / "docs"), str(tmp_path / "text")],
@@ -182,8 +182,13 @@ def test_pages_build_without_a_warning(tmp_path: Path) -> None:
         assert (tmp_path / "text" / f"{page}.txt").is_file()
     api = (tmp_path / "text" / "api.txt").read_text(encoding="utf-8")
     assert "telerig.smooth(" in api and "Raises InputError" in api
-    cameras = (tmp_path / "text/_generated/reference/telerig.rig.txt").read_text(encoding="utf-8")
-    assert "class telerig.rig.camera.Camera(" in cameras and "the rig frame" in cameras
+    assert "class telerig.rig.camera.Camera(" in api and "the rig frame" in api
+
+
+def test_the_page_of_python_names_has_every_public_one() -> None:
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"^\.\. auto(?:function|class|exception):: (\w+)$", page, re.MULTILINE))
+    assert shown == set(telerig.__all__) - {"__version__", "plot"}
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def volume_centre(views: Views, shape: Shape, shapes: Shapes, gap_sigma_px: floa
     whole = views.sightings.whole  # of other outlines no harmonics are known
     own = 2 * np.where(whole, degree_variance(views.sightings, 3, less=2.0), 0.0).sum(-1)
     squares = _RUN_WEIGHT * shapes.third**2 + np.maximum(own, 0.0)
-    sigma2 = squares / (_RUN_WEIGHT + 2 * whole.sum(-1) - 2)  # mean of the inverse gamma
+    sigma2 = squares / (_RUN_WEIGHT + np.maximum(2 * whole.sum(-1) - 2, 0))
     frames = silhouette.rim_frames(shape.moments, views.jacobian, views.axes_px)
     effect = _effect(views.axes_px, *silhouette.third_degree_traces(frames))
     isotropic = _estimate(measured, noise, jacobian, sigma2[:, None, None] * (effect @ effect.mT))

@@ -30,6 +30,7 @@ from telerig.scripts.simulate import simulate
 from telerig.scripts.smooth import smooth
 from telerig.scripts.track import track
 from telerig.scripts.validate import validate
+from telerig.scripts.view import view
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -58,7 +59,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo, "init": init, "doctor": doctor, "plan": plan, "simulate": simulate,
     "detect": detect, "calibrate": calibrate, "bubbles": bubbles, "track": track,
     "correct": correct, "smooth": smooth, "validate": validate, "run": run_dataset, "batch": batch,
-    "record": record, "export": export, "report": report,
+    "record": record, "export": export, "report": report, "view": view,
 }  # fmt: skip
 for name, command in _COMMANDS.items():
     app.command(name)(command)

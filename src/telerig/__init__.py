@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from telerig.io.report import plot as plot
     from telerig.io.simulation.config import SimulationConfig as SimulationConfig
     from telerig.io.simulation.simulate import simulate as simulate
+    from telerig.io.view.show import view as view
     from telerig.rig.triangulation import Triangulation as Triangulation
 
 _WHERE = {
@@ -77,6 +78,7 @@ _WHERE = {
     "smooth": "telerig.estimator.smoothing.smooth",
     "track": "telerig.estimator.tracking.track",
     "uncertainty_map": "telerig.estimator.calibration.quality.uncertainty_map",
+    "view": "telerig.io.view.show",
 }
 __all__ = ["__version__", *_WHERE]
 

@@ -1,0 +1,126 @@
+"""A calibration in the viewer: the rig with all poses, and every view's image with its dots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.io.report.calibration.results import CalibrationResults
+from telerig.io.report.calibration.rig import rig_outline
+from telerig.io.report.page.figures import KEPT, LEFT_OUT, camera_colour
+from telerig.io.view.stream import grey_levels, log_image, need_rerun, path, rgb
+
+Images = Callable[[str, str], NDArray[Any] | None]
+MAGNIFIED = 1_000.0
+"""Residuals are drawn so many times as long as they are."""
+_DEVIATIONS = 100.0
+_BOX = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
+
+
+def log_calibration(
+    stream: Any, results: CalibrationResults, rejected: pd.DataFrame, image: Images
+) -> None:
+    """Log a calibration, with a time line of its views.
+
+    rejected : rejected.csv, or an empty table. image : returns the image of a camera and view, or
+    None.
+    """
+    rr = need_rerun()
+    stream.log("rig", rr.ViewCoordinates.RDF, static=True)
+    log_cameras(stream, results)
+    outline = rig_outline(results)
+    some = list(results.views)[:3]
+    levels = {c: grey_levels([i for v in some if (i := image(c, v)) is not None])
+              for c in results.camera_names}  # fmt: skip
+    for k, view in enumerate(results.views):
+        stream.set_time("view", sequence=k)
+        loop = outline.plates_mm[k][[0, 1, 2, 3, 0]]
+        stream.log("rig/target/plate", rr.LineStrips3D([loop], labels=[view]))
+        stream.log("rig/target/dots", rr.Points3D(outline.dots_mm[k], radii=0.15))
+        for camera in results.camera_names:
+            _log_view(stream, results, rejected, camera, view, image, levels[camera])
+    plates = outline.plates_mm[:, [0, 1, 2, 3, 0]]
+    grey = [150, 150, 150, 80]
+    stream.log("rig/all_poses", rr.LineStrips3D(list(plates), colors=grey), static=True)
+    off = results.points_mm - _flat(results.points_mm)
+    arrows = rr.Arrows3D(origins=results.points_mm, vectors=_DEVIATIONS * off,
+                         labels=[str(d) for d in results.dot_ids], show_labels=False)  # fmt: skip
+    stream.log("target/deviations", arrows, static=True)
+
+
+def _flat(points_mm: Any) -> Any:
+    """Return the points (N, 3) moved onto their plane."""
+    middle = points_mm.mean(0)
+    normal = np.linalg.svd(points_mm - middle)[2][-1]
+    return points_mm - np.outer((points_mm - middle) @ normal, normal)
+
+
+def _log_view(
+    stream: Any, results: CalibrationResults, rejected: pd.DataFrame, camera: str, view: str,
+    image: Images, levels: tuple[float, float],
+) -> None:  # fmt: skip
+    rr = need_rerun()
+    place, picture = path("images", camera), image(camera, view)
+    if picture is None:
+        stream.log(f"{place}/image", rr.Clear(recursive=False))
+    else:
+        log_image(stream, f"{place}/image", picture, levels)
+    table = results.residuals
+    mine = table[(table["camera"] == camera) & (table["view"] == view)]
+    uv = mine[["u_px", "v_px"]].to_numpy(float)
+    kept = mine["kept"].to_numpy(bool)
+    colours = np.where(kept[:, None], rgb(KEPT), rgb(LEFT_OUT))
+    words = [f"{dot} {reason}".strip() for dot, reason in zip(mine["dot"], mine["reason"])]
+    stream.log(f"{place}/dots", rr.Points2D(uv, colors=colours, radii=rr.Radius.ui_points(2.5),
+                                            labels=words, show_labels=False))  # fmt: skip
+    arrows = MAGNIFIED * mine[["du_px", "dv_px"]].to_numpy(float)
+    stream.log(f"{place}/residuals", rr.Arrows2D(origins=uv, vectors=arrows, colors=[255, 160, 0]))
+    if len(rejected):
+        those = rejected[(rejected["camera"] == camera) & (rejected["view"] == view)]
+        points = those[["u_px", "v_px"]].to_numpy(float)
+        stream.log(f"{place}/rejected", rr.Points2D(
+            points, colors=rgb(LEFT_OUT), radii=rr.Radius.ui_points(4.0),
+            labels=those["reason"].tolist(), show_labels=False,
+        ))  # fmt: skip
+
+
+def log_cameras(stream: Any, results: CalibrationResults) -> None:
+    """Log bodies, fields and optical axes of the cameras; bodies stand where they are drawn."""
+    rr = need_rerun()
+    for i, camera in enumerate(rig_outline(results).cameras):
+        colour, place = rgb(camera_colour(i)), path("rig", "cameras", camera.name)
+        body, field = (part.reshape(8, 3)[_BOX] for part in (camera.body_mm, camera.field_mm))
+        stream.log(f"{place}/body", rr.LineStrips3D([body], colors=colour), static=True)
+        stream.log(f"{place}/field",
+                   rr.LineStrips3D([field], colors=[*colour, 60]), static=True)  # fmt: skip
+        stream.log(f"{place}/axis",
+                   rr.LineStrips3D([camera.axis_mm], colors=colour, labels=[camera.name]),
+                   static=True)  # fmt: skip
+
+
+def layout(results: CalibrationResults) -> Any:
+    """Return the layout of the window: images on the left, the rig on the right."""
+    need_rerun()
+    import rerun.blueprint as rrb
+
+    images = [
+        rrb.Spatial2DView(origin=f"images/{c}", name=f"camera {c}") for c in results.camera_names
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(*images),
+            rrb.Vertical(
+                rrb.Spatial3DView(origin="rig", name="rig and poses"),
+                rrb.Spatial3DView(
+                    origin="target", name=f"deviations of the dots, x {_DEVIATIONS:g}"
+                ),
+                row_shares=[2, 1],
+            ),
+        ),
+        rrb.TimePanel(timeline="view"),
+        collapse_panels=True,
+    )

@@ -1,0 +1,149 @@
+"""Log a results folder into a recording of rerun: to a window, a browser, a file, a notebook."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.dataset.dataset import load_dataset
+from telerig.io.dataset.run import load_run, recordings
+from telerig.io.files.atomic import atomic_path
+from telerig.io.report.calibration.results import read_results
+from telerig.io.report.film.views import read_outlines
+from telerig.io.report.run.smoothing.results import read_smoothing_results
+from telerig.io.report.run.tracking.results import TrackResults, read_track_results, run_cameras
+from telerig.io.tables.calibration import REJECTED
+from telerig.io.view import calibration as of_calibration
+from telerig.io.view import run as of_run
+from telerig.io.view.stream import need_rerun
+
+MOST_IMAGES = 4_000
+"""Of a longer run every k-th frame is shown, so that a recording stays small (some 20 kB an image,
+100 MB)."""
+
+
+def view(
+    folder: str | Path,
+    *,
+    save: str | Path | None = None,
+    web: bool = False,
+    frames: tuple[int, int] | None = None,
+    recording: Path | None = None,
+) -> Any:
+    """Show the results of a calibration or a run in the viewer of rerun; return its recording.
+
+    Both views' images with outlines, ids and the rays of the other view, paths and bodies in space,
+    shake, height, speed and ray miss over time, on one time line; of a calibration every view's
+    dots and residuals, and the rig with all poses. In a notebook the last line of a cell shows it.
+
+    folder : results of `telerig calibrate`, `track` or `smooth`.
+    save : an .rrd file to write instead of opening a window. web : serve it for a browser on
+    127.0.0.1 instead. frames : (first, end) whose images are shown; None for all, of a run with
+    more than 4,000 images every k-th. recording : the run's folder; None looks in the dataset, and
+    shows no images where there is none.
+
+    Raises InputError for a folder that holds no such results, and without rerun.
+    """
+    rr = need_rerun()
+    place = Path(folder)
+    stream = rr.RecordingStream(f"telerig {place.resolve().name}")
+    if save is not None:
+        with atomic_path(Path(save)) as temporary:
+            stream.save(str(temporary))
+            _log(stream, place, frames, recording)
+            stream.flush()
+            stream.disconnect()
+        return stream
+    if web:
+        uri = stream.serve_grpc()
+        _log(stream, place, frames, recording)
+        rr.serve_web_viewer(open_browser=False, connect_to=uri)
+        return stream
+    if not _in_notebook():
+        stream.spawn()
+    _log(stream, place, frames, recording)
+    if _in_notebook():
+        stream.notebook_show()
+    return stream
+
+
+def _in_notebook() -> bool:
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return hasattr(shell, "kernel")
+
+
+def _log(stream: Any, place: Path, frames: tuple[int, int] | None, recording: Path | None) -> None:
+    if (place / "calibration.json").is_file():
+        results = read_results(place)
+        rejected = pd.DataFrame()
+        if (place / "rejected.csv").is_file():
+            rejected = REJECTED.read(place / "rejected.csv")
+        stream.send_blueprint(of_calibration.layout(results))
+        of_calibration.log_calibration(stream, results, rejected, _views_of(place))
+        return
+    if not (place / "tracking.json").is_file():
+        raise InputError(
+            "holds neither a calibration nor a tracked run", where=str(place),
+            todo="give a folder like DATASET/results/calibration or DATASET/results/NAME",
+        )  # fmt: skip
+    tracks = read_track_results(place)
+    smoothing = read_smoothing_results(place, tracks.up)
+    cameras, _ = run_cameras(place, tracks)
+    image, count = _frames_of(place, recording, tracks)
+    every = range(count)[slice(*frames)] if frames else range(count)
+    shown = every[:: -(-len(every) * len(tracks.cameras) // MOST_IMAGES) or 1]
+    stream.send_blueprint(of_run.layout(tracks, smoothing))
+    found = read_outlines(place / "detections.csv", tracks.cameras)
+    of_run.log_run(stream, tracks, smoothing, cameras or (), found, image, list(shown))
+
+
+def _views_of(place: Path) -> Callable[[str, str], NDArray[Any] | None]:
+    """Return the function that reads a view's image from the dataset of a calibration."""
+    try:
+        data = load_dataset(place.resolve().parent.parent, source="images")
+    except InputError:
+        return lambda _camera, _view: None
+    views = {view.name: view for view in data.views}
+
+    def image(camera: str, view: str) -> NDArray[Any] | None:
+        if view not in views:
+            return None
+        try:
+            return data.image(views[view], camera)
+        except InputError:
+            return None
+
+    return image
+
+
+def _frames_of(
+    place: Path, recording: Path | None, tracks: TrackResults
+) -> tuple[Callable[[str, int], NDArray[Any] | None], int]:
+    """Return the function that reads a run's images, and the number of its frames."""
+    last = int(tracks.tracks["frame"].to_numpy().max(initial=-1)) + 1
+    count = tracks.file.frames or last
+    folder = place.resolve()
+    run = recording or folder.parent.parent / "runs" / folder.name
+    if not run.is_dir() or not recordings(run):
+        return (lambda _camera, _frame: None), count
+    sizes = {c: s for c in tracks.cameras if (s := tracks.image_size_px(c)) is not None}
+    data = load_run(run, source="images", cameras=tracks.cameras, image_sizes_px=sizes)
+    data = replace(data, skip_unreadable=True)
+    return data.image, min(count, data.frame_count)
+
+
+def frames_of(text: str | None) -> tuple[int, int] | None:
+    """Return first frame and end of a text like "100:200". Raises InputError for another one."""
+    if text is None:
+        return None
+    first, colon, end = text.partition(":")
+    if not (colon and first.isdecimal() and end.isdecimal() and int(first) < int(end)):
+        raise InputError(f"--frames {text}", todo="give A:B with A below B, like 100:200")
+    return int(first), int(end)

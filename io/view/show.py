@@ -44,10 +44,12 @@ def view(
     dots and residuals, and the rig with all poses. In a notebook the last line of a cell shows it.
 
     folder : results of `telerig calibrate`, `track` or `smooth`.
-    save : an .rrd file to write instead of opening a window. web : serve it for a browser on
-    127.0.0.1 instead. frames : (first, end) whose images are shown; None for all, of a run with
-    more than 4,000 images every k-th. recording : the run's folder; None looks in the dataset, and
-    shows no images where there is none.
+    save : an .rrd file to write instead of opening a window.
+    web : serve it for a browser on 127.0.0.1 instead.
+    frames : (first, end) whose images are shown; None for all, of a run with more than 4,000 images
+        every k-th.
+    recording : the run's folder; None looks in the dataset, and shows no images where there is
+        none.
 
     Raises InputError for a folder that holds no such results, and without rerun.
     """

@@ -306,7 +306,6 @@ def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str
     if overlays:
         import cv2  # noqa: F401
 
-        import telerig.estimator.dots.dataset_dots
         import telerig.io.report.overlays  # noqa: F401
 
 
@@ -407,8 +406,6 @@ def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
 
     The image of this dot is read again.
     """
-    from telerig.estimator.dots.dataset_dots import dot_example
-
     order = np.argsort(detected.dots["chi2_dof"].to_numpy())
     chosen = detected.dots.iloc[int(order[len(order) // 2])]
     view = next(v for v in dataset.views if v.name == chosen["view"])

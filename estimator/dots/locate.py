@@ -21,6 +21,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import PIXEL_VARIANCE_PX2, axes_
 from telerig.estimator.dots.fit.candidates import (
     Candidate,
     Candidates,
+    Look,
     Polarity,
     clipping_levels,
     edge_map,
@@ -28,7 +29,6 @@ from telerig.estimator.dots.fit.candidates import (
     is_ring,
     reason_against_blob,
     reason_against_fit,
-    reference_radius_px,
 )
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dots
 from telerig.estimator.dots.fit.surroundings import (
@@ -152,12 +152,11 @@ def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> Floa
 
 
 def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurement:
-    saturation = noise.white
-    reference_px = reference_radius_px(found)
+    look = Look.of_blobs(found)
     rejected: list[tuple[Any, ...]] = []
     blobs: list[Candidate] = []
     for blob in found.blobs:
-        reason = reason_against_blob(blob, grey, reference_px, saturation)
+        reason = reason_against_blob(blob, look)
         if reason:
             rejected.append((*blob.centre_px, *axes_from_shape(blob.shape_px), str(reason)))
         else:
@@ -170,10 +169,10 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
         noise, np.array([fit.chi2_dof for fit in fits]), np.array([fit.dof for fit in fits])
     )
     fits, noise = [fit.under_noise(factor) for fit in fits], noise.scaled(factor)
-    usual_contrast = float(np.median([abs(fit.contrast) for fit in fits])) if fits else 0.0
+    look = look.with_contrasts(fits)
     accepted: list[tuple[Any, ...]] = []
     for blob, fit in zip(blobs, fits):
-        reason = reason_against_fit(blob, fit, grey, found.polarity, usual_contrast, saturation)
+        reason = reason_against_fit(blob, fit, grey.shape, found.polarity, look)
         if reason:
             rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
         else:

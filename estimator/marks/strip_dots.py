@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
+from telerig.estimator.dots.fit.candidates import is_unlike
 from telerig.estimator.dots.locate import measure_dots
+from telerig.statistics import robust_sd
 
 if TYPE_CHECKING:
     from telerig.estimator.dots.fit.candidates import Polarity
@@ -25,8 +27,8 @@ BORDER_PX = 1.5
 """Least distance between a dot's blurred edge and the image's border."""
 
 _FIRST_SIZE = (0.7, 1.35)
-_SIZE, _CONTRAST = 0.15, 0.25
-_MISFIT, _LEAST_MISFIT = 2.0, 1.0
+_LEAST_SPREAD = (0.03, 0.03, 0.05, 0.15)
+"""Least standard deviations of the `_features` of a strip's dots from frame to frame."""
 _LEAST_ROUND, _LEAST_CONTRAST = 0.5, 0.2
 _LEAST_FRAMES, _LEAST_SHARE = 3, 0.25
 _SYSTEMATIC_PX = 0.005
@@ -38,21 +40,19 @@ class DotLook:
     """The appearance of a strip's dots in one camera, and where in the image they may be.
 
     windows : parts of the image through which the strip passes.
-    diameter_px : nominal diameter. The other numbers are medians over the dots.
-    a_px, b_px : longer and shorter semi-axis.
-    contrast : difference of the grey levels of dot and screen, divided by the brighter one.
-    chi2_dof : chi-square per degree of freedom of the luminance fit.
-    blur_px : standard deviation of the blur.
+    diameter_px : nominal diameter.
+    a_px, blur_px : medians over the dots of the longer semi-axis and of the blur's standard
+        deviation.
+    usual, spread : (4,) medians and standard deviations of the `_features`.
     """
 
     polarity: Polarity
     diameter_px: float
     windows: tuple[Window, ...]
     a_px: float
-    b_px: float
-    contrast: float
-    chi2_dof: float
     blur_px: float
+    usual: Array
+    spread: Array
 
     @property
     def margin_px(self) -> float:
@@ -95,14 +95,20 @@ def learn_look(
     if not groups:
         return None
     kept = seen[np.concatenate(groups)]
-    a, b, contrast, chi2, blur = np.median(kept[:, 5:10], axis=0)
+    features = _features(kept[:, 1:])
     windows = tuple(
         _window(seen[group, 1:3] @ across, across, diameter_px, shape) for group in groups
     )
-    return DotLook(
-        polarity, diameter_px, windows, float(a), float(b), float(contrast), float(chi2),
-        float(blur),
-    )  # fmt: skip
+    usual = np.median(features, axis=0)
+    spread = np.maximum(robust_sd(features - usual, axis=0), _LEAST_SPREAD)
+    a_px, blur_px = np.median(kept[:, [5, 9]], axis=0)
+    return DotLook(polarity, diameter_px, windows, float(a_px), float(blur_px), usual, spread)
+
+
+def _features(dots: Array) -> Array:
+    """Return logs (n, 4) of both semi-axes, of the contrast and of chi2_dof (of 1 where it is less)
+    of dots (n, 11), `_COLUMNS`."""
+    return np.asarray(np.log(np.column_stack([dots[:, 4:7], np.maximum(dots[:, 7], 1.0)])))
 
 
 def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
@@ -115,11 +121,9 @@ def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
         found[:, :2] += (window[1].start, window[0].start)
         parts.append(found)
     dots = np.concatenate(parts)
-    good = (np.abs(dots[:, 4] / look.a_px - 1) < _SIZE) & (
-        np.abs(dots[:, 5] / look.b_px - 1) < _SIZE
-    )
-    good &= np.abs(dots[:, 6] / look.contrast - 1) < _CONTRAST
-    good &= dots[:, 7] < _MISFIT * max(look.chi2_dof, _LEAST_MISFIT)
+    off = (_features(dots) - look.usual) / look.spread
+    off[:, 3] = np.maximum(off[:, 3], 0.0)
+    good = ~is_unlike(off)
     size = np.array(image.shape[::-1]) - 1
     margin = look.margin_px - 0.5
     good &= np.all((dots[:, :2] > margin) & (dots[:, :2] < size - margin), axis=1)

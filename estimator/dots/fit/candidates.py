@@ -7,13 +7,15 @@ size nor even light. Blobs are rejected by their outlines before the fit, dots b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import hypot, sqrt
 from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtrc
 
 from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.dots.fit.blurred_ellipse import (
@@ -22,6 +24,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     semi_axes,
 )
 from telerig.estimator.dots.fit.luminance import PARAMETERS, DotFit, Reason
+from telerig.statistics import robust_sd
 
 Polarity = Literal["white_on_black", "black_on_white"]
 
@@ -335,31 +338,59 @@ def _reason_against_outline(
     return Reason.MERGED if 0.6 < solidity < 0.95 else Reason.NOT_ELLIPSE
 
 
-_MAX_EDGE_RESIDUAL = 0.12
-_MISFIT_CHI2 = 2.0
-_MIN_RELATIVE_RADIUS = 0.28
-_MIN_RELATIVE_CONTRAST = 0.2
-_MIN_HOLE_SHARE = 0.02
-_MAX_ONE_SIDED_SATURATION = 0.06
-_LARGEST_RATIO = 2.5
+REFUSED = 1e-4
+"""Share of true dots whose size, contrast and residuals may be refused as unlike the others."""
+LOG_SPREAD = 0.35
+"""Least standard deviation of log radius and log contrast of the dots of one image: marks are up to
+twice as large as dots, and light falls off towards the corners."""
+LOG_FITTED = 0.24
+"""Standard deviation of the log of a dot's fitted size divided by that of its blob."""
+MODEL_RESIDUAL = 0.028
+"""Standard deviation of what the luminance model leaves of true dots at the edge (print, optics),
+divided by their contrast and without the noise."""
+_HOLE_SHARE = 0.02
+"""Least share of a ring's area that is hole; specks of dust are smaller."""
 
 
-def reference_radius_px(found: Candidates) -> float:
-    """Return the radius in px of a typical dot; 0 if no blob may be a dot.
+@dataclass(frozen=True)
+class Look:
+    """How the dots of an image look: medians of log radius (px) and log contrast, and the spread of
+    the contrast. The radius is that of the blobs weighted by area, so that specks do not count."""
 
-    It follows from the median area of the blobs that may be dots, weighted by area.
-    """
-    areas = np.sort([blob.area_px2 for blob in found.promising])
-    if areas.size == 0:
-        return 0.0
-    middle = np.searchsorted(np.cumsum(areas), 0.5 * np.sum(areas))
-    return float(np.sqrt(areas[min(middle, areas.size - 1)] / np.pi))
+    log_radius: float
+    log_contrast: float = 0.0
+    contrast_spread: float = LOG_SPREAD
+
+    @classmethod
+    def of_blobs(cls, found: Candidates) -> Look:
+        """Return the look of the blobs that may be dots."""
+        areas = np.sort([blob.area_px2 for blob in found.promising])
+        if areas.size == 0:
+            return cls(-np.inf)
+        middle = np.searchsorted(np.cumsum(areas), 0.5 * np.sum(areas))
+        return cls(0.5 * float(np.log(areas[min(middle, areas.size - 1)] / np.pi)))
+
+    def with_contrasts(self, fits: Sequence[DotFit]) -> Look:
+        """Return the look with the contrasts of fitted dots."""
+        logs = np.log(np.maximum([abs(fit.contrast) for fit in fits], 1e-12))
+        if not len(logs):
+            return self
+        middle = float(np.median(logs))
+        spread = max(LOG_SPREAD, float(robust_sd(logs - middle)))
+        return replace(self, log_contrast=middle, contrast_spread=spread)
+
+
+def is_unlike(deviations: ArrayLike) -> Bools:
+    """Return whether deviations (..., k), in standard deviations, are together rarer than `REFUSED`
+    among true dots, as booleans (...)."""
+    square = np.square(np.asarray(deviations, np.float64))
+    return np.asarray(chdtrc(square.shape[-1], square.sum(-1)) < REFUSED)
 
 
 def is_ring(blob: Candidate) -> bool:
     """Return whether a blob is a ring: its holes are too large for specks of dust."""
     holes = sum(float(cv2.contourArea(hole.reshape(-1, 1, 2))) for hole in blob.holes)
-    return holes > _MIN_HOLE_SHARE * blob.area_px2
+    return holes > _HOLE_SHARE * blob.area_px2
 
 
 def saturation_level(grey: Float32) -> float:
@@ -382,83 +413,40 @@ def clipping_levels(grey: Float32) -> tuple[float, float]:
     return -saturation_level(-grey), saturation_level(grey)
 
 
-def _one_sided_saturation(
-    grey: Float32, centre: Array, shape: Array, margin: float, level: float
-) -> float:
-    """Return length of the mean direction towards saturated pixels; 0 where they are all round."""
-    if not np.isfinite(level):
-        return 0.0
-    half = extent_px(shape) + margin
-    low = np.maximum(np.floor(centre - half).astype(int), 0)
-    high = np.minimum(np.ceil(centre + half).astype(int) + 1, grey.shape[::-1])
-    crop = grey[low[1] : high[1], low[0] : high[0]]
-    v, u = np.nonzero(crop >= level)
-    du, dv = u + low[0] - centre[0], v + low[1] - centre[1]
-    round_about = np.hypot(du / half[0], dv / half[1]) <= 1.0  # the crop itself is lopsided
-    du, dv = du[round_about], dv[round_about]
-    if du.size == 0:
-        return 0.0
-    away = np.hypot(du, dv) + 1e-9
-    return float(np.hypot(np.sum(du / away), np.sum(dv / away))) / crop.size
-
-
-def reason_against_blob(
-    blob: Candidate, grey: Float32, reference_px: float, saturation: float
-) -> Reason | None:
-    """Return why a blob is left out before any fit; None for a blob that may be a dot.
-
-    reference_px : radius of a typical dot. saturation : grey level at which the sensor saturates.
-    """
+def reason_against_blob(blob: Candidate, look: Look) -> Reason | None:
+    """Return why a blob is left out before any fit; None for a blob that may be a dot."""
     if blob.reason == Reason.TOUCHES_BORDER:
-        return Reason.TOUCHES_BORDER
-    if np.sqrt(blob.area_px2 / np.pi) < _MIN_RELATIVE_RADIUS * reference_px:
+        return blob.reason
+    size = 0.5 * np.log(blob.area_px2 / np.pi) - look.log_radius
+    if size < 0 and is_unlike([size / LOG_SPREAD]):
         return Reason.MUCH_SMALLER
-    if blob.reason in (Reason.MERGED, Reason.NOT_ELLIPSE):
-        lopsided = _one_sided_saturation(grey, blob.centre_px, blob.shape_px, 2.0, saturation)
-        return Reason.GLARE if lopsided > _MAX_ONE_SIDED_SATURATION else blob.reason
     return blob.reason
 
 
-def _left(blob: Candidate, fit: DotFit) -> bool:
-    """Whether the centre or the size of a fit is none that its blob can have."""
-    step = fit.centre_px - blob.centre_px
-    beyond = approximate_distance_px(blob.shape_px, step[:1], step[1:])[0]
-    sizes = np.add(semi_axes(fit.shape_px), 1.0)
-    ratio = sizes / np.add(semi_axes(blob.shape_px), 1.0)
-    return bool(beyond > 0.0 or ratio.max() > _LARGEST_RATIO or ratio.min() < 1 / _LARGEST_RATIO)
-
-
 def reason_against_fit(
-    blob: Candidate,
-    fit: DotFit,
-    grey: Float32,
-    polarity: Polarity,
-    usual_contrast: float,
-    saturation: float,
+    blob: Candidate, fit: DotFit, size_px: tuple[int, ...], polarity: Polarity, look: Look
 ) -> Reason | None:
     """Return why a dot is left out after the luminance model was fitted to it; None for a good fit.
 
-    usual_contrast : median contrast of the image's dots. saturation : grey level at which the
-    sensor saturates.
+    size_px : (rows, columns) of the image.
     """
     if fit.pixels <= PARAMETERS:
         return Reason.HIDDEN
     if not np.all(np.isfinite(fit.covariance_px2)) or semi_axes(fit.shape_px)[1] <= 0.0:
         return Reason.FIT_FAILED
-    if _left(blob, fit):
+    step = fit.centre_px - blob.centre_px
+    sizes = [np.log(np.add(semi_axes(shape), 1.0)) for shape in (fit.shape_px, blob.shape_px)]
+    if approximate_distance_px(blob.shape_px, step[:1], step[1:])[0] > 0.0 or is_unlike(
+        [np.abs(sizes[0] - sizes[1]).max() / LOG_FITTED]
+    ):
         return Reason.MISPLACED
-    half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(grey.shape[::-1])
+    half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(size_px[::-1])
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
         return Reason.TOUCHES_BORDER
-    lopsided = _one_sided_saturation(
-        grey, fit.centre_px, fit.shape_px, 2.0 * fit.sigma_px, saturation
-    )
-    if lopsided > _MAX_ONE_SIDED_SATURATION:
-        return Reason.GLARE
-    if fit.edge_residual > _MAX_EDGE_RESIDUAL and fit.chi2_dof > _MISFIT_CHI2:
-        return Reason.MISFIT
     if (fit.contrast > 0.0) != (polarity == "white_on_black"):
         return Reason.WRONG_SIGN
-    if abs(fit.contrast) < _MIN_RELATIVE_CONTRAST * usual_contrast:
-        return Reason.FAINT
-    return None
+    misfit = fit.edge_residual * sqrt(max(1.0 - 1.0 / fit.chi2_dof, 0.0)) / MODEL_RESIDUAL
+    faint = (np.log(max(abs(fit.contrast), 1e-12)) - look.log_contrast) / look.contrast_spread
+    if not is_unlike([misfit, min(faint, 0.0)]):
+        return None
+    return Reason.MISFIT if misfit > -faint else Reason.FAINT

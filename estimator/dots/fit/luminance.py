@@ -46,7 +46,6 @@ class Reason(StrEnum):
     MUCH_SMALLER = "much smaller than the other dots"
     MERGED = "merged with its neighbour"
     NOT_ELLIPSE = "outline is not an ellipse"
-    GLARE = "saturated by glare"
     HIDDEN = "shows too few pixels of its own"
     FAINT = "much fainter than the other dots"
     WRONG_SIGN = "does not look like a dot (contrast has the wrong sign)"

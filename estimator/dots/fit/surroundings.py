@@ -167,7 +167,7 @@ _BLUR_SPREAD = 0.1
 def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
     """Return a prior for each fitted dot: the contrast gradient that the other dots show.
 
-    A quadratic surface is fitted robustly to log |contrast| over the image, with a prior (the light
+    A cubic surface is fitted robustly to log |contrast| over the image, with a prior (the light
     changes by about a factor exp(0.4) over 1000 px). With fewer than 6 dots, `background_tie` gives
     the priors.
 
@@ -181,7 +181,7 @@ def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list
     own = np.array([fit.contrast_sigma for fit in fits]) / np.maximum(contrast, 1e-12)
     reach = 0.5 * max(image_shape)
     position = (centres - np.mean(centres, axis=0)) / reach
-    coefficients, covariance = _quadratic(position, value, own, PRIOR_GRADIENT_PER_PX * reach)
+    coefficients, covariance = _cubic(position, value, own, PRIOR_GRADIENT_PER_PX * reach)
     return [_prior_at(p, coefficients, covariance, reach) for p in position]
 
 
@@ -210,11 +210,14 @@ def background_tie(fit: DotFit) -> Prior:
     return Prior(sigma_per_px=PRIOR_GRADIENT_PER_PX)
 
 
-def _quadratic(position: Array, value: Array, own: Array, slope: float) -> tuple[Array, Array]:
-    """Return coefficients (6,) and covariance (6, 6) by reweighted least squares with a prior."""
-    x, y = position.T
-    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    prior = np.diag([1e-6, *[1.0 / slope**2] * 5])
+_POWERS = np.array([(i, j) for i in range(4) for j in range(4 - i)])
+"""(10, 2) exponents of x and y in a cubic polynomial; the first is the constant."""
+
+
+def _cubic(position: Array, value: Array, own: Array, slope: float) -> tuple[Array, Array]:
+    """Return coefficients (10,) and their covariance by reweighted least squares with a prior."""
+    design = np.prod(position[:, None] ** _POWERS, axis=-1)
+    prior = np.diag([1e-6, *[1.0 / slope**2] * (len(_POWERS) - 1)])
     scatter, weight = 0.05, np.ones(len(value))
     for _ in range(8):
         precision = weight / (own**2 + scatter**2)
@@ -223,7 +226,7 @@ def _quadratic(position: Array, value: Array, own: Array, slope: float) -> tuple
         coefficients = covariance @ (design.T @ (precision * value))
         residual = value - design @ coefficients
         excess = float(np.sum(np.maximum(weight * (residual**2 - own**2), 0.0)))
-        spare = max(float(np.sum(weight)) - 6.0, 0.0)
+        spare = max(float(np.sum(weight)) - len(_POWERS), 0.0)
         known = _PRIOR_SCATTER_DOTS * _PRIOR_SCATTER**2
         scatter = float(np.sqrt((excess + known) / (spare + _PRIOR_SCATTER_DOTS)))
         far = np.abs(residual) / np.sqrt(own**2 + scatter**2)
@@ -232,8 +235,8 @@ def _quadratic(position: Array, value: Array, own: Array, slope: float) -> tuple
 
 
 def _prior_at(position: Array, coefficients: Array, covariance: Array, reach: float) -> Prior:
-    x, y = position
-    rows = np.array([[0.0, 1.0, 0.0, 2.0 * x, y, 0.0], [0.0, 0.0, 1.0, 0.0, x, 2.0 * y]]) / reach
+    lower = np.maximum(_POWERS - np.eye(2, dtype=int)[:, None], 0)  # (2, 10, 2)
+    rows = _POWERS.T * np.prod(position**lower, axis=-1) / reach
     gradient = rows @ coefficients
     variance = 0.5 * float(np.trace(rows @ covariance @ rows.T))
     return Prior(

@@ -13,7 +13,7 @@ from seeds import few_or_many
 
 from telerig.estimator.dots.fit import luminance
 from telerig.estimator.dots.fit.blurred_ellipse import coverage_on_grid, shape_from_axes
-from telerig.estimator.dots.fit.candidates import Candidate, reason_against_fit
+from telerig.estimator.dots.fit.candidates import Candidate, Look, reason_against_fit
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Reason, Start, Window, fit_dots
 from telerig.estimator.images.noise import (
     NoiseModel,
@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 SIZE = 33
 CENTRE = np.array([16.21, 15.84])
 SIGMA = float(np.sqrt(0.8**2 + 1 / 12))
+LOOK = Look(float(np.log(5.5)), float(np.log(150.0)))
 HELD = Prior(sigma_per_px=1e-5)
 
 
@@ -143,7 +144,7 @@ def test_a_dot_that_shows_hardly_a_pixel_does_not_disturb_the_others(pixels: int
     none, one = fit_dots([hidden, whole], [start, start], noise_of(2.0), [HELD, HELD])
     assert not none.converged and none.pixels == pixels
     blob = Candidate(1, CENTRE, shape, 94.0, (), None)
-    assert reason_against_fit(blob, none, grey, "white_on_black", 150.0, np.inf) == Reason.HIDDEN
+    assert reason_against_fit(blob, none, grey.shape, "white_on_black", LOOK) == Reason.HIDDEN
     assert one.converged and np.linalg.norm(one.centre_px - CENTRE) < 1e-3
 
 
@@ -154,7 +155,7 @@ def test_a_fit_that_left_its_blob_is_no_dot(change: dict[str, Any]) -> None:
     whole = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
     (fit,) = fit_dots([whole], [Start(CENTRE, shape, 1.2)], noise_of(2.0), [HELD])
     blob = Candidate(1, CENTRE, shape, 94.0, (), None)
-    rest = (grey, "white_on_black", 150.0, np.inf)
+    rest = (grey.shape, "white_on_black", LOOK)
     assert reason_against_fit(blob, fit, *rest) is None
     if "shape_px" in change:
         change = {"shape_px": change["shape_px"] * shape}

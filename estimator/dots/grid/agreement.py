@@ -17,9 +17,10 @@ from scipy.spatial import cKDTree
 from telerig.arrays import Array, Ints
 from telerig.estimator.dots.grid.numbering import WRONG_ODDS, is_likely
 
-LENS_PITCHES = 0.03
-"""Standard deviation of a view's distance from the hyperplane, in pitches: distortion and
-perspective bend it. A lens that bends it more decides nothing."""
+LEAST_PITCHES, LENS_PITCHES = 0.006, 0.03
+"""Least and largest standard deviation of a view's distance from the hyperplane, in pitches:
+distortion and perspective bend it. A lens that bends it more decides nothing. In between it is
+twice the RMS of the views that show the hyperplane, as few views bend it towards themselves."""
 LEAST_VIEWS = 2
 """Views that determine the hyperplane: a view of a plane spans two of its three directions."""
 _FAR = 4.5
@@ -70,9 +71,10 @@ def decided_by_pair(
     agree = len(found) >= max(LEAST_VIEWS, 2 * len(known) / 3)
     if plane is None or not agree or _worst(found, plane) > _FAR * limit:
         return {}
-    out = {}
+    usual = np.sqrt(np.mean([_misfit(points, plane) ** 2 for points in found.values()]))
+    sd_px, out = float(np.clip(2 * usual, LEAST_PITCHES * pitch, limit)), {}
     for name in views.keys() - found.keys():
-        choice = _chosen(views[name], plane, limit)
+        choice = _chosen(views[name], plane, sd_px)
         if choice is not None:
             out[name] = choice
     return out

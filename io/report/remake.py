@@ -9,6 +9,8 @@ from typing import Literal
 
 from telerig.errors import InputError
 from telerig.io.files.names import absent
+from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.findings import Status
 from telerig.io.results.manifest import replaced_results
 
 Kind = Literal["calibration", "run", "validation", "batch"]
@@ -45,6 +47,8 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
     below = place / "results" if (place / "results").is_dir() else place
     candidates = [below, *below.iterdir()] if below != place else list(below.iterdir())
     found = [r for r in map(_of, sorted(p for p in candidates if p.is_dir())) if r]
+    if len(found) > 1:  # an imported calibration has no page, the runs beside it have
+        found = [r for r in found if not _is_imported(r)]
     if not found:
         raise InputError(
             "holds no results: no calibration.json, tracking.json or batch.json", where=str(place),
@@ -81,6 +85,13 @@ def _write_page(results: ResultsFolder, out: Path, page_folder: Path) -> Path:
     from telerig.io.report.batch.report import write_batch_report
 
     return write_batch_report(results.folder, out)
+
+
+def _is_imported(results: ResultsFolder) -> bool:
+    if results.kind != "calibration":
+        return False
+    file = CalibrationFile.read(results.folder / "calibration.json")
+    return file.verdict.status == Status.IMPORTED
 
 
 def _of(folder: Path) -> ResultsFolder | None:

@@ -19,8 +19,11 @@ from filmed_run import FRAMES, SIZE_PX, decoded, write_run
 from places import ROOT
 from typer.testing import CliRunner
 
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.report.batch.report import write_batch_report
 from telerig.io.report.remake import results_folders
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
 from telerig.scripts.main import app
 
 pytestmark = pytest.mark.slow
@@ -100,6 +103,17 @@ def test_rays_are_drawn_or_the_reason_is_given(dataset: Path, tmp_path: Path) ->
     command(own)
     text = (own / "report.html").read_text(encoding="utf-8")
     assert "Two rays of one bubble" in text and "is left out" not in text
+
+
+def test_an_imported_calibration_does_not_keep_a_dataset_from_its_pages(tmp_path: Path) -> None:
+    across = Pose.from_rotvec([0.0, np.pi / 2, 0.0])
+    cameras = [Camera.create("left", (512, 400), 10.0),
+               Camera.create("right", (512, 400), 10.0, camera_from_rig=across)]  # fmt: skip
+    calibration_from_cameras(cameras).save(tmp_path / "results" / "calibration")
+    own = write_run(tmp_path / "results" / "rise", calibration=False)
+    said = command(tmp_path, "--quiet")
+    assert (own / "report.html").is_file() and said.count("written") == 1
+    assert "was imported" in command(tmp_path / "results" / "calibration", code=2)
 
 
 @browser
@@ -210,7 +224,7 @@ def test_the_pages_commands_and_code_run(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("telerig.io.report.film.path.STEP_DEG", 60)
     lines = re.findall(r"^telerig report (.*)$", text, re.M)
-    assert len(lines) == 7
+    assert len(lines) == 6
     for line in lines:
         command(*shlex.split(line, comments=True))
     assert Path("films/film/views.mp4").is_file() and Path("films/film/path.mp4").is_file()

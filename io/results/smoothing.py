@@ -42,8 +42,8 @@ class Flag(StrEnum):
 
     LABEL_AMBIGUOUS : an oscillation may be the bubbles' or the rig's.
     SHAKE_BELOW_NOISE : the shake is smaller than the noise of the positions.
-    SHAKE_UNMEASURED : nothing but the motion of one bubble at a time shows the shake, so that all
-        numbers depend on the priors.
+    SHAKE_UNMEASURED : nothing but the motion of one or two bubbles at a time shows the shake, so
+        that all numbers depend on the priors.
     ARMS_UNMEASURED : an accelerometer measures the carriage, and nothing but the motion of one
         bubble at a time shows how the cameras' arms move on it.
     """

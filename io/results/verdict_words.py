@@ -75,20 +75,20 @@ NOT_JUDGED = VerdictWords(
 FLAG_WORDS: dict[str, str] = {
     Flag.LABEL_AMBIGUOUS: (
         "A line in the spectrum could be the bubbles' or the rig's, and the data do not say whose "
-        "it is. The bands are widened by what lies between the two readings."
+        "it is. The bands hold for the reading that was taken."
     ),
     Flag.SHAKE_BELOW_NOISE: (
         "The shake is smaller than what the images can show. It does no harm here: the bubbles' "
         "motion is as good as it would be on a rig that stands still."
     ),
     Flag.SHAKE_UNMEASURED: (
-        "Nothing in this run but the motion of one bubble at a time shows the shake, and the "
-        "data do not say what of it is the rig's. The bands hold if the assumptions about bubbles "
-        "and shake are right, which nothing tests."
+        "Nothing in this run but the motion of one or two bubbles at a time shows the shake, and "
+        "the data do not say what of it is the rig's. The bands hold if the assumptions about "
+        "bubbles and shake are right, which nothing tests."
     ),
     Flag.ARMS_UNMEASURED: (
         "The accelerometer on the carriage does not measure how the cameras' arms move on it, and "
-        "one bubble at a time alone shows that. What is taken for this motion may be the bubble's."
+        "one or two bubbles alone show that. What is taken for this motion may be the bubble's."
     ),
 }
 
@@ -169,9 +169,11 @@ def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
     if Flag.SHAKE_BELOW_NOISE in axis.flags:
         text += f" The shake ({1e3 * rms:.3g} µm RMS) is below the noise."
     if Flag.SHAKE_UNMEASURED in axis.flags:
-        text += " Nothing but the motion of one bubble shows the shake."
+        text += " Nothing but the motion of one or two bubbles shows the shake."
     if Flag.ARMS_UNMEASURED in axis.flags:
-        text += " Nothing but the motion of one bubble shows how the arms move on the carriage."
+        text += (
+            " Nothing but the motion of one or two bubbles shows how the arms move on the carriage."
+        )
     if Flag.LABEL_AMBIGUOUS in axis.flags:
         hz = _ambiguous(axis)
         text += f" The oscillation at {hz} could be the bubble's as well as the rig's."
@@ -225,9 +227,9 @@ def conclusion_words(file: SmoothingFile) -> str:
 def _why(name: str, axis: AxisVerdict) -> str:
     """Return why an axis without contradictions is not RESOLVED."""
     if Flag.SHAKE_UNMEASURED in axis.flags:
-        return f"nothing but the motion of one bubble shows the shake along {name}"
+        return f"nothing but the motion of one or two bubbles shows the shake along {name}"
     if Flag.ARMS_UNMEASURED in axis.flags:
-        return f"nothing but the motion of one bubble shows how the arms move along {name}"
+        return f"nothing but the motion of one or two bubbles shows how the arms move along {name}"
     if Flag.LABEL_AMBIGUOUS in axis.flags:
         hz = _ambiguous(axis)
         return f"the oscillation at {hz} along {name} could be the bubble's as well as the rig's"

@@ -74,7 +74,7 @@ def _compared(window: Window, model: ShakeModel) -> OtherWindow | None:
     signals = tuple(s for s in signals_of(problem) if s.samples)
     if not signals:
         return None
-    group = groups_of(signals, Learning(), problem.up)[0]
+    group = groups_of(signals, problem.up)[0]
     parts = group.fast
     count = sum(Factor(p, model).count * int((p.weight > 0).sum()) for p in parts)
     square = sum(Factor(p, model).square for p in parts) / max(count, 1)

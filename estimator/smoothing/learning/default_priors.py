@@ -13,6 +13,7 @@ from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
+    FEWEST_BUBBLES,
     BroadBand,
     CarriageModel,
     RigMode,
@@ -272,9 +273,15 @@ def adapted(solution: Solution) -> ShakeModel | None:
         if max(np.max(np.abs(np.log(ratio))), moved) > _RESCALE_BEYOND:
             better = _with_floor(fresh, floor)
     elif guessed_modes(model):
-        factor = _size_of_offsets(solution)
-        if np.max(np.abs(np.log(factor))) > _RESCALE_BEYOND:
-            modes = (replace(m, rms_mm=_triple(np.array(m.rms_mm) * factor)) for m in model.modes)
+        factor, faster = _size_of_offsets(solution), _faster(solution)
+        if np.max(np.abs(np.log([*factor, faster]))) > _RESCALE_BEYOND:
+            modes = (
+                replace(
+                    m, rms_mm=_triple(np.array(m.rms_mm) * factor),
+                    frequency_hz=m.frequency_hz * faster,
+                )
+                for m in model.modes
+            )  # fmt: skip
             better = replace(better, modes=tuple(modes))
     return None if better is model else better
 
@@ -284,12 +291,30 @@ def guessed_modes(model: ShakeModel) -> bool:
     return model.name == "default" and bool(model.modes)
 
 
+def _faster(solution: Solution) -> float:
+    """Return the factor on the frequencies of guessed modes, so that their motion is as fast as the
+    offsets; 1 where three bubbles or more are in sight."""
+    if not _is_few(solution):
+        return 1.0
+    modes = solution.graph.model.modes
+    power = np.array([np.sum(np.square(m.rms_mm)) for m in modes])
+    guessed = np.sqrt(power @ np.square([m.frequency_hz for m in modes]) / power.sum())
+    return float(np.clip(_dominant_hz(solution), *_SHAKE_HZ) / guessed)
+
+
+def _is_few(solution: Solution) -> bool:
+    """Return whether too few bubbles are in sight to tell their motion from the rig's."""
+    frames = len(np.unique(solution.graph.frame_of_row))
+    return solution.graph.rows < FEWEST_BUBBLES * frames
+
+
 def _size_of_offsets(solution: Solution) -> Array:
     """Return factors (3,) on the modes' RMS along each axis, so that they explain the offsets.
 
     The expected square of an estimated offset is the prior variance minus the posterior variance
     (MacKay, Neural Computation 4:415, 1992). The prior RMS counts as one independent offset. Axes
-    that the data do not determine keep 1.
+    that the data do not determine keep 1. One or two bubbles, whose wide swings hide the shake
+    across them, have the largest factor along all axes.
     """
     graph, found = solution.graph, solution.covariances
     rows, t = graph.shake.offset[:-1], graph.problem.t_s
@@ -304,7 +329,10 @@ def _size_of_offsets(solution: Solution) -> Array:
     square = (_offsets(solution) ** 2).mean(0).sum(0) / np.where(known, reduction, 1.0)
     samples = 2 * (t[-1] - t[0]) * graph.model.modes[0].frequency_hz
     square = (samples * square + _PRIOR_SAMPLES) / (samples + _PRIOR_SAMPLES)
-    return np.where(known, np.clip(np.sqrt(square), *_SCALED), 1.0)
+    factor = np.where(known, np.clip(np.sqrt(square), *_SCALED), 1.0)
+    if _is_few(solution) and known.any():
+        factor[:] = factor[known].max()
+    return factor
 
 
 def _with_floor(model: ShakeModel, floor: float | None) -> ShakeModel:

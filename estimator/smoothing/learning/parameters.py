@@ -94,11 +94,6 @@ def with_cutoff(model: ShakeModel, force_hz: float) -> ShakeModel:
     return replace(model, modes=modes, bubble=replace(model.bubble, zigzags=zigzags))
 
 
-def with_low_pass_force(model: ShakeModel, force_hz: float | None) -> ShakeModel:
-    """Return the model with another cut-off of all modes' forces; None makes them white."""
-    return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
-
-
 def _replaced(node: Any, path: list[str], value: float) -> Any:
     if not path:
         if isinstance(node, tuple):

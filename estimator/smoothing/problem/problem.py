@@ -24,6 +24,10 @@ CARRIAGE = -1
 a vibration that is common to all cameras.
 """
 
+FEWEST_BUBBLES = 3
+"""So many bubbles tell their own motion from that of the rig: with fewer, a line of one and of the
+other fit nearly alike."""
+
 
 @dataclass(frozen=True)
 class RigMode:

@@ -4,9 +4,9 @@ q is the ratio of a position's standard deviation to the one that it would have 
 known. eta is the share of the shake's variance that the data remove, of the shake that the run
 shows; a wide prior would make any shake look removed. In addition, a spectral line can be
 ambiguous: an oscillation of the bubbles as well as one of the rig
-(`telerig.estimator.smoothing.learning.spectral_lines`). And q and eta mean nothing where one bubble
-alone shows the shake: its motion and the rig's can be exchanged without changing the likelihood, so
-that both numbers follow from the priors.
+(`telerig.estimator.smoothing.learning.owners`). And q and eta mean nothing where one or two bubbles
+alone show the shake: one's motion and the rig's can be exchanged without changing the likelihood,
+two tell them apart too badly, so that both numbers follow from the priors.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
-from telerig.estimator.smoothing.learning.learn import Learning, groups_of
+from telerig.estimator.smoothing.learning.learn import groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
-from telerig.estimator.smoothing.learning.spectral_lines import attributions
+from telerig.estimator.smoothing.learning.owners import attributions
 from telerig.estimator.smoothing.learning.window import first_of_most_seen
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
+    FEWEST_BUBBLES,
     CarriageModel,
     Observations,
     ShakeModel,
@@ -50,7 +51,7 @@ _MOST_FRAMES, _MOST_BUBBLES = 2000, 3
 _EDGE = 0.1
 _SEEN = 0.25
 _MOSTLY = 0.5
-"""Share of the frames in which a second bubble has to be seen."""
+"""Share of the frames in which so many bubbles have to be seen."""
 
 
 class Measured(IntEnum):
@@ -169,12 +170,12 @@ def rule(q: float, eta: float | None, *, ambiguous: bool) -> Verdict:
 def measured_shake(solution: Solution) -> tuple[Measured, Measured, Measured]:
     """Return for x, y and z what measures the shake.
 
-    A second bubble in most frames shows that of the cameras along all axes. So do, along the axes
+    Three bubbles in most frames show that of the cameras along all axes. So do, along the axes
     that a camera sees, marks in its images and an accelerometer on its arm.
     """
     graph, problem = solution.graph, solution.graph.problem
     count = np.bincount(graph.frame_of_row, minlength=len(problem.t_s))
-    several = np.count_nonzero(count > 1) > _MOSTLY * np.count_nonzero(count)
+    several = np.count_nonzero(count >= FEWEST_BUBBLES) > _MOSTLY * np.count_nonzero(count)
     carriage = any(sensor.camera == CARRIAGE for sensor in problem.accelerometers)
     seen = [
         direction
@@ -297,7 +298,7 @@ def _lines(
         return []
     signals = [c for c in signals_of(problem) if c.samples]
     out: list[tuple[Sequence[float], AttributedLine]] = []
-    for group in groups_of(signals, Learning(), problem.up):
+    for group in groups_of(signals, problem.up):
         found = attributions(group.fast, model, group.pattern, problem.up)
         out += [
             (

@@ -226,12 +226,13 @@ def test_what_measures_the_shake_along_which_axis() -> None:
     """The left camera sees x and y, the right one y and z."""
     alone, _, _ = run(np.random.default_rng(2), seconds=0.2)
     marked, _, _ = run(np.random.default_rng(2), seconds=0.2, marks=2)
-    several, _, _ = run(np.random.default_rng(2), seconds=0.2, bubbles=2)
-    second, seen = several.bubbles[1], several.observations
+    pair, _, _ = run(np.random.default_rng(2), seconds=0.2, bubbles=2)
+    several, _, _ = run(np.random.default_rng(2), seconds=0.2, bubbles=3)
+    third, seen = several.bubbles[2], several.observations
     seldom = replace(
         several,
-        bubbles=(several.bubbles[0], replace(second, last=15, guess_mm=second.guess_mm[:16])),
-        observations=seen.of((seen.item == 0) | (seen.frame <= 15)),
+        bubbles=(*several.bubbles[:2], replace(third, last=15, guess_mm=third.guess_mm[:16])),
+        observations=seen.of((seen.item < 2) | (seen.frame <= 15)),
     )
 
     def sensor(camera: int) -> Accelerometer:
@@ -240,6 +241,7 @@ def test_what_measures_the_shake_along_which_axis() -> None:
 
     for problem, measured in (
         (alone, (0, 0, 0)),
+        (pair, (0, 0, 0)),
         (several, (2, 2, 2)),
         (seldom, (0, 0, 0)),
         (replace(marked, references=marked.references.of(marked.references.camera == 0)),
@@ -253,7 +255,7 @@ def test_what_measures_the_shake_along_which_axis() -> None:
 
 
 def test_one_bubble_alone_is_unresolved_with_default_priors() -> None:
-    """They let the bubble own the shake across the vertical: q is near 1 beside 70 µm of shake."""
+    """Across the vertical, where the bubble's swing hides it, the shake is expected as along it."""
     problem, _, _ = run(np.random.default_rng(0), across_mm=0.07, seconds=0.75)
     model, solution = default_model(problem), None
     for _ in range(5):
@@ -261,7 +263,7 @@ def test_one_bubble_alone_is_unresolved_with_default_priors() -> None:
         model = adapted(solution) or model
     assert solution is not None
     axes = verdict_of(solution)
-    assert max(axes["x"].q or 9, axes["z"].q or 9) < 1.25
+    assert min(axes["x"].q or 0, axes["z"].q or 0) > 2
     assert {axis.verdict for axis in axes.values()} == {"UNRESOLVED"}
     assert all("SHAKE_UNMEASURED" in axis.flags for axis in axes.values())
     assert not any("SHAKE_BELOW_NOISE" in axis.flags for axis in axes.values())

@@ -21,15 +21,14 @@ from telerig.estimator.smoothing.learning.likelihood import (
     laplace_covariance,
 )
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled, signals_of
+from telerig.estimator.smoothing.learning.owners import moved_to_bubble
 from telerig.estimator.smoothing.learning.parameters import (
     log_prior,
     names_of,
     prior_of,
     value_of,
-    with_low_pass_force,
     with_values,
 )
-from telerig.estimator.smoothing.learning.spectral_lines import moved_to_bubble
 from telerig.estimator.smoothing.problem.problem import BroadBand, ShakeModel
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
 
@@ -38,15 +37,20 @@ Array = NDArray[np.float64]
 BANDS = (BroadBand((0.1, 0.05, 0.1), 0, slow_rms_mm=0.02), BroadBand((0.0, 0.1, 0.0)))
 
 
+def driven(model: ShakeModel, force_hz: float) -> ShakeModel:
+    """The model whose modes' forces have a corner."""
+    return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
+
+
 def partly_forced() -> ShakeModel:
     white = true_model()
-    return replace(white, modes=(*with_low_pass_force(white, 45.0).modes[:2], white.modes[2]))
+    return replace(white, modes=(*driven(white, 45.0).modes[:2], white.modes[2]))
 
 
 MODELS = {
     "modes": true_model(),
     "bands": replace(true_model(0.4), broad_bands=BANDS),
-    "with_low_pass_force": with_low_pass_force(true_model(), 60.0),
+    "with_low_pass_force": driven(true_model(), 60.0),
     "partly with_low_pass_force": moved_to_bubble(partly_forced(), 0, 0.5),
 }
 

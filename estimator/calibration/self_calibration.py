@@ -300,7 +300,7 @@ def best_start(
     `mirror_ambiguity.consistent_start`).
     """
     if len(problem.cameras) == 1:
-        return problem, known_target.mono_state(problem, dots_mm)
+        return problem, known_target.stereo_states(problem, dots_mm)[0]
     options = []
     for side in known_target.plate_sides(problem):
         starts = known_target.stereo_states(side, dots_mm)

@@ -183,11 +183,12 @@ def either_tilt(first: Array, second: Array) -> Array:
 
 
 def stereo_states(problem: Problem, dots_mm: Array, count: int = 2) -> list[State]:
-    """Return starting states for two cameras or more, best first.
+    """Return starting states for any number of cameras, best first.
 
-    The mirror image of each state is an equally good start. dots_mm : (N, 3) positions of the dots.
-    count : number of rotations that are tried for each pair of cameras. Raises CalibrationError if
-    no chain of shared views connects all cameras.
+    The mirror image of each state is an equally good start; with one camera the sign of each view's
+    tilt is arbitrary. dots_mm : (N, 3) positions of the dots. count : number of rotations that are
+    tried for each pair of cameras. Raises CalibrationError if no chain of shared views connects all
+    cameras.
     """
     maps = image_maps(problem, dots_mm)
     rotations = {k: rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
@@ -237,8 +238,8 @@ def overlap_tree(problem: Problem, images: set[tuple[int, int]]) -> list[tuple[i
     seen = np.zeros((len(problem.views), count))
     seen[tuple(np.array(sorted(images), int).reshape(-1, 2).T)] = 1
     shared = np.triu(seen.T @ seen, 1)
-    if count == 2 and shared[0, 1]:
-        return [(0, 1)]
+    if count == 1 or (count == 2 and shared[0, 1]):
+        return [(0, 1)][: count - 1]
     from scipy.sparse import csr_matrix  # here, since two cameras do without
     from scipy.sparse.csgraph import (
         breadth_first_order,
@@ -293,19 +294,12 @@ def _signs(
     return out, cost
 
 
-def mono_state(problem: Problem, dots_mm: Array) -> State:
-    """Return the starting state of a single camera: the sign of each view's tilt is arbitrary."""
-    maps = image_maps(problem, dots_mm)
-    chosen = {v: rotation_from_jacobian(m.jacobian)[0] for (v, _), m in maps.items()}
-    return _assemble(problem, dots_mm, maps, chosen, None)
-
-
 def _assemble(
     problem: Problem,
     dots_mm: Array,
     maps: dict[tuple[int, int], ImageMap],
     rotations: dict[int, Array],
-    camera_from_rig: Array | None,
+    camera_from_rig: Array,
 ) -> State:
     """Return a state: scales, view positions and baselines that go with the rotations."""
     state = nominal_state(problem)
@@ -320,20 +314,16 @@ def _assemble(
     for v, rotation in rotations.items():
         views[v, :3, :3] = rotation
     shifts = {k: m.offset_px / scale[k[1]] for k, m in maps.items()}
-    if camera_from_rig is None:
-        for (v, _), shift in shifts.items():
-            views[v, :2, 3] = shift
-    else:
-        baselines = _place_views(views, shifts, camera_from_rig)
-        for c in range(1, len(cameras)):
-            cameras[c, :3, :3] = camera_from_rig[c].T
-            cameras[c, :3, 3] = -camera_from_rig[c].T @ np.r_[baselines[c], 0]
+    baselines = _place_views(views, shifts, camera_from_rig)
+    for c in range(1, len(cameras)):
+        cameras[c, :3, :3] = camera_from_rig[c].T
+        cameras[c, :3, 3] = -camera_from_rig[c].T @ np.r_[baselines[c], 0]
     start = State(intrinsics, cameras, views, dots_mm.copy())
     for c, camera in enumerate(problem.cameras):
         kappa = perspective_from_maps(maps, start, c)
         if abs(kappa) * camera.rho_mm > STRONG_PERSPECTIVE:
             intrinsics[c, INDEX["kappa_per_mm"]] = kappa
-    if camera_from_rig is not None and len(problem.cameras) == 2:
+    if len(problem.cameras) == 2:
         kappas = intrinsics[:, INDEX["kappa_per_mm"]]
         parallel = np.linalg.norm(camera_from_rig[1][:2, 2]) < NEAR_PARALLEL
         if parallel and np.all(kappas != 0):
@@ -399,9 +389,12 @@ def offset_freedom(camera_from_rig: Array) -> Array:
     """Return the offsets (C, 2, 2 C - 3) in mm of C telecentric cameras by each free number.
 
     The offset of the `origin_camera` along the image of the first axis is held at zero.
-    camera_from_rig : (C, 3, 3).
+    camera_from_rig : (C, 3, 3). Of one camera no number is free.
     """
-    count, origin = len(camera_from_rig), origin_camera(camera_from_rig)
+    count = len(camera_from_rig)
+    if count == 1:
+        return np.zeros((1, 2, 0))
+    origin = origin_camera(camera_from_rig)
     along = camera_from_rig[origin][:2, 2] / np.linalg.norm(camera_from_rig[origin][:2, 2])
     freedom = np.zeros((count, 2, 2 * count - 3))
     freedom[origin, :, 0] = -along[1], along[0]

@@ -26,10 +26,11 @@ from telerig.estimator.calibration.solver.problem import (
 )
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
 from telerig.estimator.calibration.solver.system import System, images_of, retracted
+from telerig.estimator.calibration.start.known_target import angle_between, mirrored
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
-from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
+from telerig.rig.pose import rotation_from_rotvec
 
 _KAPPA = INDEX["kappa_per_mm"]
 _D = np.diag([1.0, 1.0, -1.0, 1.0])
@@ -74,10 +75,9 @@ def mirrored_state(state: State) -> State:
 
 def angle_to_nominal_deg(state: State, nominal_rotvec_deg: Nominal) -> float:
     """Return the largest angle between the inter-camera rotations and the nominal ones."""
-    return max(
-        _angle_deg(state.rig_from_camera[c, :3, :3].T, rotvec_deg)
-        for c, rotvec_deg in nominal_rotvec_deg.items()
-    )
+    nominal = rotation_from_rotvec(np.radians([*nominal_rotvec_deg.values()]))
+    turns = np.swapaxes(state.rig_from_camera[[*nominal_rotvec_deg], :3, :3], -1, -2)
+    return float(np.degrees(angle_between(turns, nominal).max()))
 
 
 def far_rotations(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> list[Finding]:
@@ -89,11 +89,6 @@ def far_rotations(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -
             key = f"{name}_from_{first}_rotvec_deg"
             found.append(Code.ROTATION_FAR.found(cameras=name, names=key, angle_deg=angle))
     return found
-
-
-def _angle_deg(rotation: Array, nominal_rotvec_deg: Array) -> float:
-    nominal = rotation_from_rotvec(np.radians(nominal_rotvec_deg))
-    return float(np.degrees(np.linalg.norm(rotvec_from_rotation(rotation @ nominal.T))))
 
 
 def consistent_start(
@@ -145,12 +140,10 @@ def consistent_start(
 
 def _apart_deg(a: State, b: State, cameras: Sequence[int] | range) -> float:
     """Return the largest angle between the cameras of two states, one mirrored if nearer."""
-
-    def largest(other: State) -> float:
-        turns = [other.rig_from_camera[c, :3, :3].T @ a.rig_from_camera[c, :3, :3] for c in cameras]
-        return float(np.degrees(max(np.linalg.norm(rotvec_from_rotation(t)) for t in turns)))
-
-    return min(largest(b), largest(mirrored_state(b)))
+    chosen = np.array(cameras)
+    ours, theirs = (state.rig_from_camera[chosen, :3, :3] for state in (a, b))
+    either = np.stack([theirs, mirrored(theirs)])
+    return float(np.degrees(angle_between(ours, either).max(-1).min()))
 
 
 def _lines(problem: Problem, cameras: Sequence[int]) -> str:

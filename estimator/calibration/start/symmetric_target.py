@@ -15,6 +15,7 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem, known_scale
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve
 from telerig.estimator.calibration.start import known_target
+from telerig.estimator.calibration.start.known_target import angle_between
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.factors.calibration import State, whitened_residuals
 from telerig.io.results.findings import Code, Finding
@@ -130,10 +131,11 @@ def _numbered_alike_in_pair(
     hypotheses = []
     for candidate in every.reshape(-1, 3, 3):
         refined, cost = known_target.refined(candidate, every)
-        distance = _to_nominal_deg(refined, nominal)
+        either = np.array([refined, known_target.mirrored(refined)])
+        distance = 0.0 if nominal is None else np.degrees(angle_between(either, nominal).min())
         hypotheses.append((cost / np.radians(2) ** 2 + (distance / 60) ** 2, refined))
     best = min(hypotheses, key=lambda h: h[0])[1]
-    angles = known_target.angle_between(options, best).min(0).T
+    angles = angle_between(options, best).min(0).T
     ranked = np.sort(angles, 1)
     close = np.flatnonzero(ranked[:, 1] - ranked[:, 0] < np.radians(TIE_DEG) / 5)
     if len(close):
@@ -159,20 +161,10 @@ def _spin(k: int, order: int) -> Array:
     return rotation_from_rotvec([0.0, 0.0, 2 * np.pi * k / order])
 
 
-def _to_nominal_deg(rotation: Array, nominal: Array | None) -> float:
-    if nominal is None:
-        return 0.0
-    both = np.array([rotation, known_target.mirrored(rotation)])
-    return float(np.degrees(known_target.angle_between(both, nominal).min()))
-
-
 def _numbered_alike_in_views(problem: Problem, labels: list[Ints]) -> tuple[Problem, float]:
     """Turn whole views until their print errors look like those of the others."""
     held = replace(problem, dot_sigma_mm=np.full_like(problem.dot_sigma_mm, 1e-6))
-    if len(problem.cameras) > 1:
-        start = known_target.stereo_states(held, held.nominal_mm, count=1)[0]
-    else:
-        start = known_target.mono_state(held, held.nominal_mm)
+    start = known_target.stereo_states(held, held.nominal_mm, count=1)[0]
     rough = robust_solve(held.with_model("tangential"), start)
     marks = _print_errors(rough.problem, rough.solution.state, len(labels[0]))
     turned = np.array([_turned(marks, label, k, len(labels)) for k, label in enumerate(labels)])

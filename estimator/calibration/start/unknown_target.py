@@ -18,6 +18,7 @@ from scipy.linalg import orthogonal_procrustes
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.dots.grid.lattice import fit_affine
 
 LEAST_VIEWS = 4
 """Least number of views of one camera that determine the shape of a target whose dots are
@@ -56,7 +57,7 @@ def _factorise(problem: Problem) -> tuple[dict[tuple[int, int], Array], Array]:
     maps: dict[tuple[int, int], Array] = {}
     previous = np.inf
     for _ in range(_SWEEPS):
-        maps = {k: _affine(plane[dots], uv) for k, (dots, uv) in images.items()}
+        maps = {k: fit_affine(plane[dots], uv)[:2] for k, (dots, uv) in images.items()}
         plane, misfit = _plane_points(images, maps, len(plane))
         middle = plane.mean(0)
         whiten = np.linalg.inv(np.linalg.cholesky(np.cov((plane - middle).T)))
@@ -64,13 +65,8 @@ def _factorise(problem: Problem) -> tuple[dict[tuple[int, int], Array], Array]:
         if abs(previous - misfit) <= 1e-12 * misfit:
             break
         previous = misfit
-    maps = {k: _affine(plane[dots], uv) for k, (dots, uv) in images.items()}
-    return {k: m[:2].T for k, m in maps.items()}, plane
-
-
-def _affine(plane: Array, uv_px: Array) -> Array:
-    solution, *_ = np.linalg.lstsq(np.c_[plane, np.ones(len(plane))], uv_px, rcond=None)
-    return np.asarray(solution, np.float64)
+    maps = {k: fit_affine(plane[dots], uv)[:2] for k, (dots, uv) in images.items()}
+    return {k: m[:, :2] for k, m in maps.items()}, plane
 
 
 def _plane_points(
@@ -81,13 +77,13 @@ def _plane_points(
     normal = np.tile(1e-12 * np.eye(2), (count, 1, 1))
     right = np.zeros((count, 2))
     for k, (dots, uv) in images.items():
-        linear = maps[k][:2].T
+        linear = maps[k][:, :2]
         normal[dots] += linear.T @ linear
-        right[dots] += (uv - maps[k][2]) @ linear
+        right[dots] += (uv - maps[k][:, 2]) @ linear
     plane = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
     misfit = 0.0
     for k, (dots, uv) in images.items():
-        misfit += float(((plane[dots] @ maps[k][:2] + maps[k][2] - uv) ** 2).sum())
+        misfit += float(((plane[dots] @ maps[k][:, :2].T + maps[k][:, 2] - uv) ** 2).sum())
     return plane, misfit
 
 

@@ -50,7 +50,7 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     radius_px,
     start_outlines,
 )
-from telerig.estimator.bubbles.outline.rims import Rims
+from telerig.estimator.bubbles.outline.rims import Rims, rims_along
 
 __all__ = [
     "Bubbles",
@@ -215,7 +215,9 @@ def _found(
     seen = ratio.size if field is None else np.count_nonzero(field)
     covered = np.pi * float(np.nansum(radius_px(outlines) ** 2)) / max(seen, 1)
     whole = is_crowded(covered, len(blobs), _RIMS_PAY)
-    sure, crowds, kept = outlines.ellipse[known], [], known
+    crowds, kept = [], known
+    if whole or merged.any() or hearts:
+        sure = rims_along(ratio, sigma, outlines.ellipse[known])
     look = partial(
         resolved_crowd, ratio, sigma, min_diameter_px=min_diameter_px, min_contrast=min_contrast
     )
@@ -229,13 +231,13 @@ def _found(
             crowd = look([blobs[k]], [], sure, around(blobs[k], ratio.shape))
             crowds.append(crowd)
             clusters += crowd.clusters
-            sure = np.concatenate([sure, crowd.rims.ellipse])
+            sure = Rims.concat([sure, crowd.rims])
             left = sum(cv2.contourArea(line.astype(np.float32)) for line in crowd.clusters)
             if len(crowd.rims) and left < _LEFT_SHARE * np.prod(blobs[k].box[2:]):
                 kept &= known | (own != k)
         for blob in hearts:
             crowds.append(look([], [], sure, around(blob, ratio.shape)))
-            sure = np.concatenate([sure, crowds[-1].rims.ellipse])
+            sure = Rims.concat([sure, crowds[-1].rims])
     found = [crowd.rims for crowd in crowds if len(crowd.rims)]
     if found:
         every = Rims.concat(found)

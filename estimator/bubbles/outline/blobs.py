@@ -346,13 +346,13 @@ def _turning(points: Array, arm: int) -> Array:
 
 def _notches(turn: Array, arm: int) -> list[int]:
     """Return the deepest inward turns first, none nearer than ``arm`` to a deeper one."""
-    found: list[int] = []
+    found, near = [], np.zeros(turn.size, np.bool_)
     for index in np.argsort(turn).tolist():
         if turn[index] > _TURN_RAD:
             break
-        apart = [min((index - k) % turn.size, (k - index) % turn.size) for k in found]
-        if min(apart, default=arm) >= arm:
+        if not near[index]:
             found.append(index)
+            near[np.arange(index - arm + 1, index + arm) % turn.size] = True
     return sorted(found)
 
 

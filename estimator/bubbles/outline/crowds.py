@@ -40,7 +40,8 @@ _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
 _LEAST_COVERAGE = 0.3
 _SEVERAL, _SMALLER, _FILLED = 3, 0.5, 0.3
-_DISAGREE = 1.0
+_DISAGREE = 9.21
+"""Chi-square of two degrees of freedom that one outline in a hundred exceeds by chance."""
 _UNLIKE = "its rim is unlike those of the sharp bubbles"
 
 
@@ -67,7 +68,7 @@ def resolved_crowd(
     sigma: float,
     blobs: list[Blob],
     parts: list[Part],
-    known: Array,
+    sure: Rims,
     window: Window,
     *,
     min_diameter_px: float,
@@ -79,7 +80,7 @@ def resolved_crowd(
     ratio : (rows, columns) grey levels divided by the background
     sigma : noise of a pixel.
     blobs, parts : the dark regions, and what their outlines tell of the bubbles in them.
-    known : (K, 5) ellipses of bubbles that are sure. Their rims belong to them; they are not among
+    sure : the bubbles of the image that are sure. Their rims belong to them; they are not among
         the bubbles that are returned.
     window : (rows, columns) of the image, such as `around` gives them.
     """
@@ -89,7 +90,6 @@ def resolved_crowd(
     rims = rims.moved(window[1].start or 0, window[0].start or 0)
     single = {part.blob: part.ellipse for part in parts if not (part.merged or part.shared)}
     large = [ellipse for ellipse in single.values() if ellipse[2] * ellipse[3] > largest**2]
-    sure = rims_along(ratio, sigma, known.reshape(-1, 5))
     if large:
         rims = Rims.concat([rims, rims_along(ratio, sigma, np.stack(large))])
     every = Rims.concat([sure, rims])

@@ -106,7 +106,7 @@ class Sight:
 
     rays : the centres in space, as `triangulation.on_rays` returns them; the share of the unknown
         shape is in their covariances.
-    centre_px : (N, 5) the columns CENTRE_PX.
+    centre_px : (N, 5) the columns CENTRE_PX, with the share of the unknown shape.
     a_px, d_eq_px : (N,) major semi-axes and equivalent diameters.
     given : (N,) ids given by the user, -1 for none.
     flags : (N,) texts.

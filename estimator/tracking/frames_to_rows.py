@@ -97,7 +97,8 @@ class RowMaker:
             a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
             joined.append(table)
             flags = ["|".join(words) for words in flag_words(table)]
-            centre = table[CENTRE_PX].to_numpy(float)
+            uv, noise = pixels[c]
+            centre = np.column_stack([uv, noise[:, *np.triu_indices(2)]])
             rays = on_rays(self.cameras[c], *pixels[c])
             ends = np.cumsum([0, *counts[:, c]]).tolist()
             of_cameras.append(

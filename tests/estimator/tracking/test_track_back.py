@@ -17,7 +17,7 @@ from telerig.estimator.bubbles.pairing.groups import RigModel
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
-from telerig.estimator.tracking.frames_to_rows import RowMaker
+from telerig.estimator.tracking.frames_to_rows import WANDER, RowMaker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.io.dataset.run import RunData
 from telerig.io.simulation.calibration.scene import true_cameras
@@ -132,6 +132,9 @@ def test_a_bubble_that_passes_behind_another_keeps_its_points(draws: int) -> Non
         shared = back[back["flags"].str.contains("shared")]
         assert set(shared.index) == hidden
         assert set(back.index) == set(range(FRAMES))
+        wander = WANDER * 1e-3 * DIAMETERS_MM[BACK] / 2 * CAMERAS[0]["scale_px_per_mm"]
+        seen = shared[f"{CAMERAS[0].name}_suu_px2"].to_numpy(float)
+        assert seen == pytest.approx(NOISE_PX**2 + wander**2, rel=1e-6)
         every += [units(row, truth, shake) for _, row in shared.iterrows()]
     errors, sigmas = np.array(every).T
     assert np.abs(errors).max() < 3.0

@@ -135,8 +135,8 @@ def drawn_scene(
     ideal = make_scene(_with(config, tilts), rng)
     problem = replace(ideal.problem().with_model([name_of(g) for g in groups]), solver="numpy")
     truth = replace(ideal.true_state(problem), dots_mm=problem.nominal_mm)
-    common, *_ = System(problem).gaussian(truth).covariance(whole=False)
-    sds = iter(np.sqrt(np.diag(common)))
+    gaussian = System(problem).gaussian(truth)
+    sds = iter(np.sqrt(np.diag(gaussian.marginal(np.arange(gaussian.rig)))))
     sd = [{p: float(next(sds)) for p in free} for free in problem.free]
     lenses, right = [], []
     for c, g in enumerate(groups):

@@ -196,5 +196,5 @@ def linear_deviations(scene: Scene, config: SimulationConfig, model: str) -> Arr
     gaussian = System(measured).gaussian(truth)
     step, _ = gaussian.step()
     count = sum(map(len, problem.free)) + 6
-    sd = np.sqrt(np.diag(gaussian.covariance(whole=False)[0]))
+    sd = np.sqrt(np.diag(gaussian.marginal(np.arange(count))))
     return np.asarray(step[:count] / sd[:count])

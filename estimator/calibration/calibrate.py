@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.solver.problem import (
-    DOTS_FREE,
-    OUTLIER_SD,
-    checked_outlier_sd,
-)
+from telerig.estimator.calibration.solver.problem import DOTS_FREE, checked_outlier_sd
+from telerig.estimator.calibration.thresholds import OUTLIER_SD
 from telerig.io.results.findings import Code, Finding
 from telerig.progress import Progress, showing_progress
 from telerig.rig.camera import Camera

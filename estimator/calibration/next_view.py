@@ -17,15 +17,13 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.estimator.calibration.quality.checks import RECOMMENDED_VIEWS
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
+from telerig.estimator.calibration.thresholds import ENOUGH_SHARE, RECOMMENDED_VIEWS
 from telerig.factors.calibration import Observations, State, pixels, whitened_residuals
 from telerig.io.results.calibration import NextPose
 from telerig.rig.triangulation import aligned_shift, working_volume
 
-ENOUGH_SHARE = 0.05
-"""A view is worth taking if it lowers the standard deviation by at least this share."""
 ALIKE_SHARE = 0.9
 """Among candidates with at least this share of the best gain, the one that fills most of the empty
 parts of the images is taken."""

@@ -14,11 +14,8 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.solver.problem import (
-    STRONG_PERSPECTIVE,
-    prior_sigma,
-    wall_freedom,
-)
+from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freedom
+from telerig.estimator.calibration.thresholds import STRONG_PERSPECTIVE
 from telerig.io.results.findings import Code, Finding
 from telerig.io.rig_file.description import RigDescription
 from telerig.rig.camera import Camera

@@ -23,6 +23,7 @@ from telerig.estimator.calibration.solver.robust_least_squares import (
 )
 from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
+from telerig.estimator.calibration.thresholds import SURE_SD, UNEXPLAINED
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX, groups_of, joint_name, name_of
@@ -39,11 +40,6 @@ GAUGE_OF_SCALES = (
     "camera's origin is where its scale is the stated one; target frame tied to the nominal dot "
     "positions by the dots' priors"
 )
-UNEXPLAINED = 0.3
-"""If the ratio of noise floor to image noise exceeds this, errors of the lens model can change the
-angle between the axes as much as uncertain image centres do."""
-UNLIKELY_SD = 5.0
-"""Standard deviations by which chi-square must differ from 1 to be an objection."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +196,7 @@ def misfits(fit: Fit, statistics: Mapping[str, Any]) -> list[Finding]:
         found.append(Code.SYSTEMATIC.found(text=fit.model, **scatter))
     if (share := statistics["share_kept"]) < Code.FEW_KEPT.limit:
         found.append(Code.FEW_KEPT.found(share=share))
-    spread = UNLIKELY_SD * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
+    spread = SURE_SD * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
     if abs(chi2 - 1) > max(Code.CHI_SQUARE.limit, spread):
         found.append(Code.CHI_SQUARE.found(chi2_dof=chi2))
     problem = fit.robust.problem
@@ -414,7 +410,7 @@ def telecentricity(
     wide = problem.with_model([name_of({*groups_of(model), "kappa"}) for model in models])
     gaussian = System(wide).gaussian(solution.state)
     step, _ = gaussian.step()
-    variance = np.diag(gaussian.covariance(whole=False)[0])
+    variance = np.diag(gaussian.marginal(np.arange(gaussian.rig)))
     state = solution.state
     poses = state.rig_from_target[problem.view]
     points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[problem.dot]) + poses[:, :3, 3]

@@ -32,8 +32,6 @@ from telerig.estimator.calibration.result_from_fit import (
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import (
-    OUTLIER_SD,
-    STRONG_PERSPECTIVE,
     Problem,
     checked_outlier_sd,
     eccentricity_px,
@@ -54,6 +52,7 @@ from telerig.estimator.calibration.start import (
     symmetric_target,
 )
 from telerig.estimator.calibration.start.unknown_target import dots_from_images
+from telerig.estimator.calibration.thresholds import OUTLIER_SD, STRONG_PERSPECTIVE, SURE_SD
 from telerig.factors.calibration import State, whitened_error
 from telerig.io.results.findings import Code, Finding
 from telerig.io.rig_file.description import MOST_CAMERAS
@@ -69,9 +68,6 @@ from telerig.rig.lens_parameters import (
     rich_groups,
 )
 from telerig.rig.target import Target
-
-SURE_SD = 5.0
-"""Standard deviations by which a perspective must differ from none to be one."""
 
 
 def self_calibrate(
@@ -391,7 +387,8 @@ def _strong(fit: RobustFit) -> NDArray[np.bool_]:
     out = np.asarray(strength > STRONG_PERSPECTIVE)
     if not out.any():
         return out
-    variance = iter(np.diag(fit.solution.gaussian.covariance(whole=False)[0]))
+    rig = np.arange(sum(map(len, problem.free)))
+    variance = iter(np.diag(fit.solution.gaussian.marginal(rig)))
     for c, camera in enumerate(problem.cameras):
         for parameter in problem.free_indices(c):
             sd = np.sqrt(next(variance))

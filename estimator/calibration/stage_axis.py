@@ -17,7 +17,7 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError, suggestion
-from telerig.factors.linear_factors import add_linear_factors
+from telerig.estimator.calibration.thresholds import LEAST_TRAVEL_MM
 from telerig.factors.robust_loss import next_limit, travel_weights
 from telerig.io.dataset.dataset import Dataset, View, files_by_view
 from telerig.io.dataset.tables import read_dots_csv
@@ -394,11 +394,9 @@ def _summary(dots: Dots, axis: Array, travel_per_reading: float, joint: Array) -
     )
 
 
-LEAST_TRAVEL_MM = 1.0
 _STEPS = 60
 _REWEIGHTED = 25
 _SUSPECT = 3.5
-_STATE, _RIG, _FIRST_ERROR = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -528,44 +526,37 @@ def linearised(
     sigma_mm: tuple[float, float],
     weights: Weights,
 ) -> StageEquations:
-    """Return the normal equations at a state; GTSAM eliminates the carriage's error of each view.
+    """Return the normal equations at a state, with the carriage's error of each view eliminated.
 
     free, sigma_mm : as for `fit`.
     """
-    import gtsam
-
     residual, by_point, by_state, by_rig = derivatives(cameras, free, dots, state)
-    information = dots.information * weights.dots[:, None, None]
-    whitener = np.swapaxes(np.linalg.cholesky(dots.information), -1, -2)
-    whitener = whitener * np.sqrt(weights.dots)[:, None, None]
-    across = _across(state.slope)
-    count = len(dots.views)
-    shift, spread = np.zeros((count, 3)), np.zeros((count, 3, 3))
-    graph, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
-    for v in range(count):
-        mine = dots.view == v
-        along, beside = sigma_mm[0] / np.sqrt(weights.views[v]), sigma_mm[1]
-        # the carriage's error is in units of its standard deviation, because that may be zero
-        by_error = by_point[mine] @ (across * [along, beside, beside])
-        white = [whitener[mine] @ part for part in (by_error, by_state[mine], by_rig[mine])]
-        rows = 2 * int(mine.sum())
-        value = (whitener[mine] @ residual[mine][:, :, None]).reshape(1, rows)
-        blocks = [part.reshape(1, rows, part.shape[-1]) for part in white]
-        add_linear_factors(graph, (_FIRST_ERROR + v, _STATE, _RIG), blocks, value)
-        add_linear_factors(graph, (_FIRST_ERROR + v,), (np.eye(3)[None],), np.zeros((1, 3)))
-        order.push_back(_FIRST_ERROR + v)
-        seen = np.einsum("mki,mkl,mlj->ij", by_point[mine], information[mine], by_point[mine])
-        gradient = np.einsum("mki,mkl,ml->i", by_point[mine], information[mine], residual[mine])
-        spread[v] = np.linalg.pinv(seen, rcond=1e-9)
-        shift[v] = spread[v] @ gradient
-    _, left = graph.eliminatePartialSequential(order)
-    kept = gtsam.Ordering()
-    for key in (_STATE, _RIG) if by_rig.shape[-1] else (_STATE,):
-        kept.push_back(key)
-    normal, right = left.hessian(kept)
-    off = residual - np.einsum("mki,mi->mk", by_point, shift[dots.view])
-    score = np.einsum("mi,mij,mj->m", off, dots.information, off)
-    return StageEquations(normal[:9, :9], right[:9], normal[:9, 9:], shift, spread, score)
+    weighted = np.linalg.cholesky(dots.information).swapaxes(-1, -2)
+    value = np.einsum("mij,mj->mi", weighted, residual)
+    by_point = weighted @ by_point
+    seen, pull = np.zeros((len(dots.views), 3, 3)), np.zeros((len(dots.views), 3))
+    root = np.sqrt(weights.dots)[:, None, None]
+    white, right = root * by_point, root[..., 0] * value
+    np.add.at(seen, dots.view, white.swapaxes(-1, -2) @ white)
+    np.add.at(pull, dots.view, np.einsum("mki,mk->mi", white, right))
+    spread = np.asarray(np.linalg.pinv(seen, rcond=1e-9, hermitian=True), np.float64)
+    shift = np.einsum("vij,vj->vi", spread, pull)
+    # the carriage's error is in units of its standard deviation, because that may be zero
+    unit = np.tile(_across(state.slope), (len(dots.views), 1, 1))
+    unit[..., 0] *= sigma_mm[0] / np.sqrt(weights.views)[:, None]
+    unit[..., 1:] *= sigma_mm[1]
+    kept = root * weighted @ np.concatenate([by_state, by_rig], -1)
+    cross = np.zeros((len(dots.views), kept.shape[-1], 3))
+    np.add.at(cross, dots.view, kept.swapaxes(-1, -2) @ white)
+    cross, blocks = cross @ unit, np.eye(3) + unit.swapaxes(-1, -2) @ seen @ unit
+    gain = np.linalg.solve(blocks, cross.swapaxes(-1, -2))
+    flat = kept.reshape(-1, kept.shape[-1])
+    normal = flat.T @ flat - np.einsum("vki,vil->kl", cross, gain)
+    own = np.einsum("vij,vi->vj", unit, pull)
+    moment = flat.T @ right.ravel() - np.einsum("vik,vi->k", gain, own)
+    off = value - np.einsum("mki,mi->mk", by_point, shift[dots.view])
+    score = (off**2).sum(-1)
+    return StageEquations(normal[:9, :9], moment[:9], normal[:9, 9:], shift, spread, score)
 
 
 def _across(slope: Array) -> Array:

@@ -18,8 +18,8 @@ from telerig.estimator.calibration.calibrate import (
     run_calibration,
     solve_dots,
 )
-from telerig.estimator.calibration.next_view import ENOUGH_SHARE, first_views, rounded_um
-from telerig.estimator.calibration.quality.checks import RECOMMENDED_VIEWS
+from telerig.estimator.calibration.next_view import first_views, rounded_um
+from telerig.estimator.calibration.thresholds import ENOUGH_SHARE, RECOMMENDED_VIEWS
 from telerig.estimator.dots.dataset_dots import (
     NO_DOTS,
     DatasetDots,

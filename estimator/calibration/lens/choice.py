@@ -25,7 +25,6 @@ from scipy.special import chdtrc
 
 from telerig.arrays import Array
 from telerig.estimator.calibration.lens.search import (
-    UNDETERMINED,
     Lens,
     Lenses,
     QuadraticCost,
@@ -38,6 +37,7 @@ from telerig.estimator.calibration.solver.covariance import JointCovariance, joi
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
 from telerig.estimator.calibration.solver.robust_least_squares import Solution, solve
 from telerig.estimator.calibration.solver.system import System
+from telerig.estimator.calibration.thresholds import CONSIDERED_P_VALUE, UNDETERMINED
 from telerig.factors.calibration import State
 from telerig.rig.lens_parameters import AUTO, GROUPS, INDEX, groups_of, joint_name, name_of, ordered
 
@@ -286,11 +286,6 @@ def _stretch_words(camera: str, intrinsics: Array) -> str:
         "either its pixels are not square, or its sensor is tilted behind a lens that is "
         "telecentric on both sides; images cannot distinguish the two"
     )
-
-
-CONSIDERED_P_VALUE = 0.01
-"""The uncertainty of a group of parameters that are held is considered in the covariance if freeing
-the group improves the fit with a p-value below this."""
 
 
 def considered_groups(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:

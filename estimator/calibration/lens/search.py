@@ -23,6 +23,7 @@ from telerig.arrays import Array
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
+from telerig.estimator.calibration.thresholds import GROUP_PENALTY
 from telerig.factors.calibration import whitened_error
 from telerig.rig.lens_parameters import GROUPS, INDEX, PLAIN_GROUPS, ordered
 
@@ -38,13 +39,6 @@ _HOMOGRAPHY = (("p1", "s3"), ("p2", "s1"))
 """The homography of a tilted sensor is, to first order, p1 = -s3 and p2 = -s1, so these sums
 vanish.
 """
-UNDETERMINED = 0.5
-"""A parameter counts as undetermined if its posterior standard deviation is more than this share of
-the prior one."""
-GROUP_PENALTY = 4.0
-"""Penalty of a group of parameters, divided by the logarithm of the number of groups. 2 would be
-gamma = 1 of Chen and Chen; with 4 a group without effect is admitted by chance about once in 20 000
-(docs/decisions/014)."""
 NOISE_DOF = 20.0
 """The stated noise counts as this many degrees of freedom when the variance of the residuals is
 estimated."""

@@ -17,12 +17,7 @@ from scipy.special import gammaincinv
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, TelerigError
 from telerig.estimator.calibration.solver.covariance import JointCovariance
-from telerig.estimator.calibration.solver.problem import (
-    LEAST_DOTS,
-    STRONG_PERSPECTIVE,
-    Problem,
-    prior_sigma,
-)
+from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
 from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start.known_target import (
     ImageMap,
@@ -33,16 +28,20 @@ from telerig.estimator.calibration.start.known_target import (
     plate_sides,
     stereo_states,
 )
+from telerig.estimator.calibration.thresholds import (
+    CLEAR_MISFIT,
+    COPY_CHANCE,
+    FAR_BETTER,
+    LEAST_DOTS,
+    LEAST_VIEWS,
+    PARALLEL_DEG,
+    RECOMMENDED_VIEWS,
+    STRONG_PERSPECTIVE,
+)
 from telerig.estimator.dots.grid.numbering import check_handedness
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
-
-RECOMMENDED_VIEWS = int(Code.FEW_VIEWS.limit)
-PARALLEL_DEG = 3.0
-CLEAR_MISFIT = 0.1
-"""Largest accepted distance of an image's dots from the map of the target's plane, as a share of
-the dots' spread."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,8 @@ def _refuse_too_few(
     problem: Problem, usable: list[int], *, stereo: bool, unknown_dots: bool
 ) -> None:
     if unknown_dots:
-        needed, undetermined = 4, "the shape of the target (3 affine numbers) and with it the scale"
+        needed = LEAST_VIEWS
+        undetermined = "the shape of the target (3 affine numbers) and with it the scale"
     elif stereo:
         needed, undetermined = 2, "the rotation between the cameras: two of them fit equally well"
     else:
@@ -293,8 +293,6 @@ def linked_parameters(names: tuple[str, ...], covariance: Array) -> list[Finding
     return found
 
 
-COPY_CHANCE = 1e-9
-"""Two images of independent noise agree as well as copies do at most with this probability."""
 WINDOW = 3
 """Number of consecutive views that are solved together to find the offset of a camera's images."""
 FARTHEST = 2
@@ -302,8 +300,6 @@ FARTHEST = 2
 MOST_WINDOWS = 12
 WORST_WINDOWS = 3
 """In so many windows, those that fit worst, other offsets are tried first."""
-FAR_BETTER = 0.02
-"""With the right offset the cost falls at least to this share."""
 
 
 def refuse_copies(problem: Problem) -> None:

@@ -19,20 +19,13 @@ from telerig.estimator.calibration.quality.comparison import (
     Rig,
     field_difference,
 )
-from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.problem import (
-    LEAST_DOTS,
-    Problem,
-    cameras_from_state,
-)
-from telerig.estimator.calibration.solver.robust_least_squares import Solution
+from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.known_target import overlap_tree
+from telerig.estimator.calibration.thresholds import LEAST_DOTS, LEAST_VIEWS
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
 
-LEAST_VIEWS = 4
-"""Least number of views in each half; fewer do not determine a rig."""
 _SCALE = 1e-7
 
 
@@ -113,13 +106,8 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
     system = System(half)
     gaussian = system.gaussian(state)
     step, _ = gaussian.step()
-    names, covariance = joint_covariance(half, Solution(state, gaussian, 1)).rig_block()
-    cameras = cameras_from_state(half, system.moved(state, step))
-    if not np.isfinite(covariance).all():
-        raise CalibrationError(
-            f"nothing determines {names[int(np.argmax(~np.isfinite(covariance)))]}"
-        )
-    return Rig(cameras, half.free, covariance)
+    covariance = gaussian.marginal(np.arange(gaussian.rig))
+    return Rig(cameras_from_state(half, system.moved(state, step)), half.free, covariance)
 
 
 def _in_turn(problem: Problem) -> NDArray[np.int64]:

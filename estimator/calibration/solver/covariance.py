@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from telerig.arrays import Array, Ints
+from telerig.estimator.calibration.solver.gaussian import Gaussian
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
 from telerig.estimator.calibration.solver.system import MANY_PARAMETERS, System, images_of
@@ -25,72 +26,52 @@ class JointCovariance:
     matrix : (D, D) covariance; if there are more than `MANY_PARAMETERS` parameters, only of cameras
         and views (D = K).
     dots : (N, 3, 3) covariance of each dot.
-    cross : (K, N, 3) covariances of cameras and views with each dot.
     rig : number P of the cameras' parameters, which come first.
     leverage : (M, 2, 2) J C J^T of each used measurement, with J its derivatives and C the
         covariance of all parameters: the share of its noise that the fit absorbs.
+    gaussian : that of which this is the inverse.
+    offset : (K + 3 N,) a further error, which moves all parameters together; ``matrix`` and
+        ``dots`` contain it.
     """
 
     names: tuple[str, ...]
     matrix: Array
     dots: Array
-    cross: Array
     rig: int
     leverage: Array
+    gaussian: Gaussian
+    offset: Array
 
     def of_rig_and(self, dots: Ints) -> Array:
         """Return the covariance (P + 3 n, P + 3 n) of the cameras' P parameters and n dots.
 
-        dots : (n,) indices of the dots. If the full matrix was not computed, dots are taken as
-        independent of each other for given cameras and views; this neglects a known distance of two
-        dots.
+        dots : (n,) indices of the dots.
         """
-        common = len(self.cross)
-        if len(self.names) > common:
-            at = common + (3 * dots[:, None] + np.arange(3)).ravel()
-            index = np.concatenate([np.arange(self.rig), at])
+        index = np.concatenate([np.arange(self.rig), self.gaussian.of_blocks[dots].ravel()])
+        if index[-1] < len(self.matrix):
             return np.asarray(self.matrix[np.ix_(index, index)])
-        known = np.isfinite(np.diag(self.matrix))
-        sd = np.sqrt(np.diag(self.matrix)[known])
-        correlation = self.matrix[np.ix_(known, known)] / np.outer(sd, sd)
-        across = self.cross[:, dots].reshape(common, -1)
-        scaled = across[known] / sd[:, None]
-        own = (scaled.T @ np.linalg.solve(correlation, scaled)).reshape(len(dots), 3, -1, 3)
-        own[np.arange(len(dots)), :, np.arange(len(dots))] = self.dots[dots]
-        _, rig = self.rig_block()
-        with_rig = across[: self.rig]
-        return np.block([[rig, with_rig], [with_rig.T, own.reshape(3 * len(dots), -1)]])
+        offset = self.offset[index]
+        return self.gaussian.marginal(index) + np.outer(offset, offset)
 
     @property
     def effective_dof(self) -> float:
-        """The expected sum of squared whitened residuals."""
-        return degrees_of_freedom(self.leverage)
+        """The expected sum of squared whitened residuals: their number - trace(J C J^T)."""
+        return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
     def widened(self, offset: Array) -> JointCovariance:
-        """Return the covariance with a further error added, which moves all parameters together.
-
-        offset : (K + 3 N,) size of the error; offset offset^T is added.
-        """
+        """Return the covariance with a further error ``offset`` (K + 3 N,) added."""
         whole = offset[: len(self.matrix)]
-        common, of_dots = offset[: len(self.cross)], offset[len(self.cross) :].reshape(-1, 3)
+        of_dots = offset[self.gaussian.of_blocks]
         return replace(
             self,
             matrix=self.matrix + np.outer(whole, whole),
             dots=self.dots + of_dots[:, :, None] * of_dots[:, None],
-            cross=self.cross + common[:, None, None] * of_dots,
+            offset=offset,
         )
 
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
         """Return the names and the covariance (P, P) of the cameras' parameters."""
         return self.names[: self.rig], self.matrix[: self.rig, : self.rig]
-
-
-def degrees_of_freedom(leverage: Array) -> float:
-    """Return number of residuals - trace(J C J^T), the expected sum of their squares.
-
-    leverage : (M, 2, 2) J C J^T of each used measurement.
-    """
-    return float(2 * len(leverage) - np.trace(leverage, axis1=-2, axis2=-1).sum())
 
 
 def joint_covariance(
@@ -114,7 +95,9 @@ def joint_covariance(
     matrix[at, at] = np.inf
     names = _names(problem)[: len(matrix)]
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
-    return JointCovariance(names, matrix, dots, cross, rig, leverage)
+    return JointCovariance(
+        names, matrix, dots, rig, leverage, gaussian, np.zeros(len(gaussian.right))
+    )
 
 
 def _names(problem: Problem) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ from telerig.errors import CalibrationError
 
 OF_GROUP = 60
 """Approximate number of scalars that form one variable of GTSAM's graph (docs/decisions/020)."""
-UNDAMPED = 0.0
 
 
 def undetermined() -> CalibrationError:
@@ -82,7 +81,7 @@ class Gaussian:
         """The indices (B, n) of the blocks' parameters."""
         return np.arange(len(self.common), len(self.right)).reshape(len(self.blocks), -1)
 
-    def step(self, damping: float = UNDAMPED) -> tuple[Array, float]:
+    def step(self, damping: float = 0.0) -> tuple[Array, float]:
         """Return the step (D,) to the minimum with Marquardt's damping, and the predicted gain.
 
         The gain is the decrease of the cost that the linear model predicts. Raises CalibrationError
@@ -93,6 +92,15 @@ class Gaussian:
         for at, axes in self.turned:
             step[at] = axes @ step[at]
         return step, gain
+
+    def marginal(self, index: Ints) -> Array:
+        """Return the covariance (n, n) of n parameters, whatever the others are.
+
+        Raises CalibrationError as `step` does.
+        """
+        unit = np.zeros((len(self.right), len(index)))
+        unit[index, np.arange(len(index))] = 1.0
+        return self.eliminated().solve(unit)[index]
 
     def covariance(self, *, whole: bool) -> tuple[Array, Array, Array, Array | None]:
         """Return the blocks (K, K), (K, B, n) and (B, n, n) of the inverse, and all of it.
@@ -116,7 +124,7 @@ class Gaussian:
                 every[size:, place] = cross[place].reshape(3, -1).T
         return common, cross, blocks, every
 
-    def eliminated(self, damping: float = UNDAMPED) -> Eliminated:
+    def eliminated(self, damping: float = 0.0) -> Eliminated:
         """Return the Gaussian with its blocks eliminated, or its views if that leaves less.
 
         Two blocks whose distance is known are kept. Raises CalibrationError as `step` does.
@@ -241,13 +249,14 @@ class Eliminated:
     factor: Array
 
     def solve(self, right: Array) -> Array:
-        """Return the solution (D,) for a right-hand side (D,) of all D parameters."""
-        inner = np.einsum("bij,bj->ib", self.root, right[self.away])
-        first, _ = dpotrs(self.factor, right[self.kept] - self.coupling @ inner.ravel(), lower=1)
-        inner -= (first @ self.coupling).reshape(inner.shape)
+        """Return the solution (D, ...) for right-hand sides (D, ...) of all D parameters."""
+        inner = np.einsum("bij,bj...->ib...", self.root, right[self.away])
+        flat = inner.reshape(-1, *right.shape[1:])
+        first, _ = dpotrs(self.factor, right[self.kept] - self.coupling @ flat, lower=1)
+        inner = (flat - self.coupling.T @ first).reshape(inner.shape)
         out = np.empty_like(right)
         out[self.kept] = first
-        out[self.away] = np.einsum("bij,ib->bj", self.root, inner)
+        out[self.away] = np.einsum("bij,ib...->bj...", self.root, inner)
         return out
 
     def inverse_kept(self) -> Array:

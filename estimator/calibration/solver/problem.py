@@ -17,28 +17,27 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.thresholds import (
+    IMPOSSIBLE_SD,
+    LEAST_OUTLIER_SD,
+    LINE_SHARE,
+    OUTLIER_SD,
+)
 from telerig.factors.calibration import Observations, State, pixels
-from telerig.io.results.findings import Code
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX, LENS_PARAMETERS, parameters_of
 from telerig.rig.pose import Pose
 from telerig.rig.target import Target
 
 GAUGE_SIGMA_MM = 1e-4
-LOOSE_GAUGE_MM = 1e6
-HELD_SCALE = 1e-7
-"""Relative standard deviation of a scale that is held to fix the depth of a camera's origin."""
 """Standard deviation with which the rig origin is held where the optical axes come closest
 (docs/decisions/003)."""
+LOOSE_GAUGE_MM = 1e6
+"""The same where scales are held instead."""
+HELD_SCALE = 1e-7
+"""Relative standard deviation of a scale that is held to fix the depth of a camera's origin."""
 
 _WALL = ("wall_x_rad", "wall_y_rad")
-
-OUTLIER_SD = 4.5
-"""A dot farther than this many standard deviations from its prediction is left out, with Gaussian
-noise 4e-5 of all correct dots."""
-LEAST_OUTLIER_SD = 3.0
-"""The smallest limit that is accepted. It leaves out one correct dot in 90; with a lower limit too
-much ordinary noise would be taken for outliers."""
 
 DOTS_FREE = ("3d", "plane", "nominal")
 
@@ -266,9 +265,6 @@ def cameras_from_state(problem: Problem, state: State) -> tuple[Camera, ...]:
     )
 
 
-IMPOSSIBLE_SD = 20.0
-
-
 def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Target) -> Problem:
     """Return a `Problem` with every measured dot, in which only the scales of the cameras are free.
 
@@ -425,17 +421,6 @@ def eccentricity_px(problem: Problem, state: State, rings: int = 2, spokes: int 
 
 def _shifted(state: State, shift_mm: Array) -> State:
     return replace(state, dots_mm=state.dots_mm + shift_mm)
-
-
-LEAST_DOTS = int(Code.UNUSED_VIEWS.limit)
-"""Number of different dots that a view or an image needs: fewer do not determine the pose of the
-target."""
-STRONG_PERSPECTIVE = 0.01
-"""A lens with a larger kappa * rho counts as a perspective lens, whose images show the depth of a
-view: the rays of a telecentric lens do not deviate from its axis by 0.6 degrees."""
-LINE_SHARE = 0.01
-"""Dots whose width across is less than this share of their length count as one row; two rows of 40
-dots have 0.09."""
 
 
 def on_a_line(points_mm: Array) -> bool:

@@ -20,8 +20,9 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.gaussian import Gaussian
-from telerig.estimator.calibration.solver.problem import LEAST_DOTS, Problem, on_a_line
+from telerig.estimator.calibration.solver.problem import Problem, on_a_line
 from telerig.estimator.calibration.solver.system import System
+from telerig.estimator.calibration.thresholds import LEAST_DOTS
 from telerig.factors.calibration import State, pixels
 from telerig.factors.robust_loss import calibration_weights, next_limit
 

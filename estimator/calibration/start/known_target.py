@@ -15,13 +15,8 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.problem import (
-    LEAST_DOTS,
-    STRONG_PERSPECTIVE,
-    Problem,
-    nominal_state,
-    on_a_line,
-)
+from telerig.estimator.calibration.solver.problem import Problem, nominal_state, on_a_line
+from telerig.estimator.calibration.thresholds import LEAST_DOTS, STRONG_PERSPECTIVE
 from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code

@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.problem import (
-    STRONG_PERSPECTIVE,
-    Problem,
-)
+from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
 from telerig.estimator.calibration.solver.system import System, images_of, retracted
 from telerig.estimator.calibration.start.known_target import angle_between, mirrored
+from telerig.estimator.calibration.thresholds import STRONG_PERSPECTIVE, TIE_DEG
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
@@ -43,7 +41,6 @@ ALIKE_FACTOR, ALIKE_COST = 1.5, 20.0
 """A start fits as well as the best one if its cost is below this factor times the cost of the best
 one plus this constant."""
 
-TIE_DEG = 10.0
 BY_PLATE = "refraction in the plate"
 """``decided_by`` for a two-sided target when no nominal rotation is given."""
 

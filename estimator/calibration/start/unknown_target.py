@@ -18,11 +18,8 @@ from scipy.linalg import orthogonal_procrustes
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.thresholds import LEAST_VIEWS
 from telerig.estimator.dots.grid.lattice import fit_affine
-
-LEAST_VIEWS = 4
-"""Least number of views of one camera that determine the shape of a target whose dots are
-unknown."""
 
 _SWEEPS = 200
 

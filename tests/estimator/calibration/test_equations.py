@@ -190,6 +190,10 @@ def check(problem: Problem, state: State) -> None:
             off = np.abs(step * length - expected).max()
             assert off < 1e-6 * np.abs(expected).max()
             assert promised == pytest.approx(0.5 * step @ given)
+        some = np.arange(0, len(right), 3)
+        bound = np.outer(sd, sd) / unit
+        off = ours.marginal(some) - (correlation / unit)[np.ix_(some, some)]
+        assert np.abs(off / bound[np.ix_(some, some)]).max() < 2e-5
         for whole in (True, False):
             common, cross, blocks, every = ours.covariance(whole=whole)
             assert (every is not None) or not whole

@@ -14,7 +14,6 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens.choice import model_start
 from telerig.estimator.calibration.lens.search import (
-    UNDETERMINED,
     Lens,
     QuadraticCost,
     additions,
@@ -25,6 +24,7 @@ from telerig.estimator.calibration.lens.search import (
 from telerig.estimator.calibration.self_calibration import choose_model
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state, problem_from_dots
 from telerig.estimator.calibration.solver.robust_least_squares import solve
+from telerig.estimator.calibration.thresholds import UNDETERMINED
 from telerig.io.simulation.presets import preset
 from telerig.rig.lens_parameters import GROUPS, name_of, rich_groups
 

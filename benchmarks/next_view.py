@@ -22,7 +22,7 @@ from calibration_scene import Scene, make_scene
 from numpy.typing import NDArray
 from rig_truth import without_advice
 
-from telerig.estimator.calibration.quality.truth import space_error
+from telerig.estimator.calibration.quality.comparison import difference_from_truth
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.io.simulation.calibration.scene import View, hand_held_views, true_cameras, true_target
@@ -84,7 +84,7 @@ def errors_um(scene: Scene, calibration: Calibration) -> tuple[float, float, flo
     """True RMS, without size, stated sd, without size."""
     cameras = tuple(scene.cameras.values())
     points = working_volume(cameras)
-    error = space_error(calibration, cameras, points).errors_mm.ravel()
+    error = difference_from_truth(calibration, cameras, points).shift_mm.ravel()
     size = (points - points.mean(0)).ravel()
     size /= np.linalg.norm(size)
     shape = error - size * (size @ error)

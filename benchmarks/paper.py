@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from truth import true_cameras
 
 import telerig
 from telerig.estimator.calibration.calibrate import nominal_cameras, run_calibration
-from telerig.estimator.calibration.quality.truth import space_error, true_cameras
+from telerig.estimator.calibration.quality.comparison import difference_from_truth
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.rig.triangulation import working_volume
 
@@ -61,7 +62,7 @@ def figures(data: telerig.Dataset, run: object, seed: int) -> dict[str, float | 
     truth = data.truth
     cameras = true_cameras(truth)
     volume = working_volume(cameras)
-    free = space_error(calibration, cameras, volume)
+    free = difference_from_truth(calibration, cameras, volume)
     held = self_calibrate(
         detected.dots, nominal_cameras(data.rig), data.target, dots_free="nominal",
         nominal_rotvec_deg=data.rig.rotvec_from_first_deg, model=calibration.model["name"],
@@ -74,7 +75,7 @@ def figures(data: telerig.Dataset, run: object, seed: int) -> dict[str, float | 
         "chi2_dof": calibration.statistics["chi2_dof"],
         "model": calibration.model["name"],
         "rms_um": free.rms_um, "bound_um": free.predicted_um,
-        "held_rms_um": space_error(held, cameras, volume).rms_um,
+        "held_rms_um": difference_from_truth(held, cameras, volume).rms_um,
     }  # fmt: skip
 
 

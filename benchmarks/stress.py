@@ -28,10 +28,11 @@ import pandas as pd
 from calibration_scene import Scene, make_scene
 from numpy.typing import NDArray
 from rig_truth import aligned, bound_covariance, volume, without_advice
+from truth import true_cameras
 
 import telerig
 from telerig.errors import TelerigError
-from telerig.estimator.calibration.quality.truth import space_error, true_cameras
+from telerig.estimator.calibration.quality.comparison import difference_from_truth
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.io.simulation.config import SimulationConfig
@@ -269,14 +270,14 @@ def from_images(name: str, config: SimulationConfig, model: str, seed: int) -> s
             return f"| {name} | {seed} | {model} | failed: {error} | | | | |"
         seconds = time.perf_counter() - began
         cameras = true_cameras(data.truth or {})
-        space = space_error(calibration, cameras, volume())
+        space = difference_from_truth(calibration, cameras, volume())
         exact = pd.read_csv(data.path / "truth" / "dots.csv", dtype={"view": str})
         inside = exact[exact["inside"] == 1]
         both = inside.merge(calibration.dots, on=["view", "camera", "dot"], how="left")
         off = np.hypot(both["u_px_y"] - both["u_px_x"], both["v_px_y"] - both["v_px_x"])
         return (
             f"| {name} | {seed} | {model} | {space.rms_um:.3f} | {space.predicted_um:.3f} | "
-            f"{normalised(calibration, space.errors_mm.ravel()):.2f} | "
+            f"{normalised(calibration, space.shift_mm.ravel()):.2f} | "
             f"{int(off.notna().sum())} of {len(inside)}, {int((off > 2).sum())} misnumbered | "
             f"{calibration.verdict['status']} | {seconds:.1f} |"
         )

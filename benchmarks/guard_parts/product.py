@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from truth import true_cameras
+
 from telerig import Calibration
-from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.simulation.config import RunConfig, SimulationConfig
 from telerig.io.simulation.presets import preset, run_preset

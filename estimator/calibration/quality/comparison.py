@@ -18,21 +18,18 @@ from scipy.special import chdtrc
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.thresholds import SURE_SD, UNLIKELY
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_shift, triangulate_any, working_volume
 from telerig.short_text import number, with_sd
 
-UNLIKELY = 1e-3
-"""A difference counts as real if chance alone causes one as large with less than this
-probability."""
 _RANK = 1e-3
 """Directions whose standard deviation is smaller than this share of the largest one are left out,
 because second-order effects of the others are larger there."""
 _ROUNDING = 1e-6
 _EXACT = 1e-9
 """Largest difference (mm or rad) of two rigs without uncertainty that counts as rounding."""
-_FAR = 5.0
 _LEAST_CHANCE = 1e-12
 
 
@@ -305,9 +302,9 @@ def compare_rigs(first: Rig, second: Rig) -> RigComparison:
 def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
     """Return whether two cameras have exchanged their scales, beyond the uncertainty."""
     before, after = ([c["scale_px_per_mm"] for c in r.cameras] for r in (first, second))
-    left = [abs(c.deviations) > _FAR for c in scales]
+    left = [abs(c.deviations) > SURE_SD for c in scales]
     came = [
-        [abs(1e6 * (a / b - 1)) < _FAR * scale.sd for b in before]
+        [abs(1e6 * (a / b - 1)) < SURE_SD * scale.sd for b in before]
         for a, scale in zip(after, scales)
     ]
     return any(
@@ -368,13 +365,26 @@ def after_rigid_motion(found_mm: Array, points_mm: Array) -> Array:
     return np.asarray(a @ nearest_rotation(b.T @ a).T - b)
 
 
-def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference:
+def difference_from_truth(
+    calibration: Calibration, cameras: Sequence[Camera], points_mm: Array | None = None
+) -> FieldDifference:
+    """Return how far points that a calibration triangulates are from the truth.
+
+    cameras : the true cameras, whose frame may differ from the calibration's by a rigid motion.
+    points_mm : as for `field_difference`.
+    """
+    poses = np.zeros((6 * (len(cameras) - 1),) * 2)
+    exact = Rig(tuple(cameras), ((),) * len(cameras), poses)
+    return field_difference(exact, _rig(calibration), points_mm)
+
+
+def field_difference(first: Rig, second: Rig, points_mm: Array | None = None) -> FieldDifference:
     """Return how far points differ that two rigs triangulate from the same pixels.
 
-    The pixels are those at which the first rig sees a cubic grid of points over its working volume.
-    steps : number of points along each edge of the grid.
+    The pixels are those at which the first rig sees the points.
+    points_mm : (N, 3) these points; None takes a cubic grid over the first rig's working volume.
     """
-    points = working_volume(first.cameras, steps)
+    points = working_volume(first.cameras, 5) if points_mm is None else points_mm
     pixels = [camera.project(points) for camera in first.cameras]
     found = triangulate_any(second.cameras, pixels, 1.0).points_mm
     shift = after_rigid_motion(found, points)

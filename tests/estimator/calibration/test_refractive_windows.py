@@ -24,7 +24,6 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.batch.jobs import Job, check_options, jobs_of
 from telerig.estimator.calibration.calibrate import run_calibration
-from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.refractive_windows import (
     behind_windows,
     window_findings,
@@ -42,6 +41,8 @@ from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.findings import Code
 from telerig.io.rig_file.description import WallDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.presets import preset
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.projection import turned_wall
@@ -98,8 +99,7 @@ def tank(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run.mkdir(parents=True)
     (run / "run.toml").write_text("frame_rate_hz = 100.0\nstart_s = 0.0\n", encoding="utf-8")
     points, rows = rising(), []
-    truth = json.loads((folder / "truth" / "truth.json").read_text(encoding="utf-8"))
-    for camera in true_cameras(truth):
+    for camera in true_cameras(preset("paper")).values():
         uv = traced(camera, WALLS[camera.name], points.reshape(-1, 3)).reshape(FRAMES, -1, 2)
         for (f, p), (u, v) in zip(np.ndindex(uv.shape[:2]), uv.reshape(-1, 2)):
             rows.append((f, camera.name, u, v, p + 1))

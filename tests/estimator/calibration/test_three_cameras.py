@@ -16,8 +16,10 @@ from typer.testing import CliRunner
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.next_view import next_view
-from telerig.estimator.calibration.quality.comparison import compare_calibrations
-from telerig.estimator.calibration.quality.truth import space_error
+from telerig.estimator.calibration.quality.comparison import (
+    compare_calibrations,
+    difference_from_truth,
+)
 from telerig.estimator.calibration.result.calibration import load_calibration
 from telerig.estimator.calibration.solver import system
 from telerig.io.results.calibration import CalibrationFile
@@ -34,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
 def space_ratio(calibration: Any, made: Any) -> float:
     """Errors in space over their stated standard deviation."""
     cameras = tuple(made.true_cameras[c.name] for c in calibration.cameras)
-    found = space_error(calibration, cameras, working_volume(cameras))
+    found = difference_from_truth(calibration, cameras)
     return found.rms_um / found.predicted_um
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +13,13 @@ import pytest
 import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.calibrate import calibrate
-from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.smoothing.results_folder import smooth_run
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import load_run
+from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import preset, run_preset
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
@@ -41,8 +40,7 @@ def rise(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def calibrations(folder: Path) -> tuple[Calibration, Calibration]:
     """Of the run's two cameras, and with a third one between them."""
-    truth = json.loads((folder / "truth" / "truth.json").read_text())
-    left, right = true_cameras(truth)
+    left, right = true_cameras(run_preset("rise").calibration).values()
     middle = Camera.create(
         "middle", (512, 512), 10.0, camera_from_rig=Pose.from_rotvec([0.0, 0.8, 0.0])
     )
@@ -128,8 +126,7 @@ def swarm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]:
     folder = tmp_path_factory.mktemp("swarm") / "three"
     config = run_preset("three", frames=24, bubbles=10)
     data = simulate(config, rng=np.random.default_rng(5), out=folder, images=False)
-    truth = json.loads((folder / "truth" / "truth.json").read_text())
-    known = calibration_from_cameras(true_cameras(truth))
+    known = calibration_from_cameras(list(true_cameras(config.calibration).values()))
     return next((data.path / "runs").iterdir()), replace(known, findings=())
 
 

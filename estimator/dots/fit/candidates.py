@@ -343,9 +343,9 @@ REFUSED = 1e-4
 LOG_SPREAD = 0.35
 """Least standard deviation of log radius and log contrast of the dots of one image: marks are up to
 twice as large as dots, and light falls off towards the corners."""
-LOG_FITTED = 0.24
+LOG_FITTED = 0.2
 """Standard deviation of the log of a dot's fitted size divided by that of its blob."""
-MODEL_RESIDUAL = 0.028
+MODEL_RESIDUAL = 0.023
 """Standard deviation of what the luminance model leaves of true dots at the edge (print, optics),
 divided by their contrast and without the noise."""
 _HOLE_SHARE = 0.02

@@ -66,8 +66,8 @@ def pictures(work: Path) -> Iterator[tuple[str, Image.Image]]:
     if browser is None:
         sys.stdout.write("no browser: report.png and batch.png stay as they are\n")
         return
-    yield "report", screenshot(browser, parts_of_report(calibration), (1280, 1930), work)
-    yield "batch", screenshot(browser, batch_page(work / "batch"), (1280, 1060), work)
+    yield "report", screenshot(browser, parts_of_report(calibration), (1280, 1500), work)
+    yield "batch", screenshot(browser, batch_page(work / "batch"), (1280, 1700), work)
 
 
 def telerig(*arguments: str | Path, code: int = 0) -> None:
@@ -107,10 +107,9 @@ def _as_png(figure: Figure, stream: Any, **options: Any) -> None:
 
 
 def parts_of_report(folder: Path) -> str:
-    """Return the page of a calibration without its tables, and with one row of views."""
-    shown = "".join(f":not(#{name})" for name in ("verdict", "key", "residuals", "overlays", "dot"))
+    """Return the page of a calibration without its links, and with its first sections open."""
+    shown = "".join(f":not(#{name})" for name in ("verdict", "look", "key", "parameters"))
     style = f"nav, footer, section{shown} {{ display: none }}"
-    style += " #overlays { max-height: 400px; overflow: hidden }"
     text = (folder / "report.html").read_text(encoding="utf-8")
     return text.replace("</head>", f"<style>{style}</style></head>", 1)
 

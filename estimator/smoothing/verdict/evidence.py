@@ -15,7 +15,7 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.smoothing.graph.draws import Draws
-from telerig.estimator.smoothing.graph.linear import encoder
+from telerig.estimator.smoothing.graph.linear import encoder, white_noise
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 
@@ -71,7 +71,8 @@ class Tally:
 
     source : "bubbles", "marks" or "encoder".
     axis : "x", "y" or "z"; "" for the encoder.
-    seen : (n,) sums in consecutive time windows from the run's first frame on.
+    seen : (n,) sums in consecutive time windows from the run's first frame on; in units of all the
+        noise that is stated.
     expected : (n,) mean of the same sums over random draws from the model.
     count : number of residuals.
     draws : number of draws behind ``expected``.
@@ -263,13 +264,19 @@ def _tallies(solution: Solution, draws: Draws, span: Span) -> Iterator[Tally]:
     """Yield the sums for pixels of bubbles and marks by axis, and for the encoder's readings."""
     graph, problem = solution.graph, solution.graph.problem
     parts: dict[tuple[str, str], list[tuple[Array, Array, Array]]] = {}
+    # what changes slowly is stated, too: it is an error of the images, but no contradiction
+    stated = {
+        BUBBLES: white_noise(graph, 1.0),
+        MARKS: np.tile(np.eye(2), (len(problem.cameras), 1, 1)),
+    }
     for source, obs, residual, weight, expected in (
         (BUBBLES, problem.observations, solution.residuals[0], solution.weights[0], draws.pixels),
         (MARKS, problem.references, solution.residuals[1], solution.weights[1], draws.marks),
     ):
         for camera in np.unique(obs.camera).tolist():
             mine = (obs.camera == camera) & span.holds(obs.frame)
-            t, square = problem.t_s[obs.frame[mine]], residual[mine] ** 2 * weight[mine, None]
+            within = residual[mine] @ stated[source][camera]
+            t, square = problem.t_s[obs.frame[mine]], within**2 * weight[mine, None]
             for row in range(2):
                 direction = problem.cameras[camera].camera_from_rig.rotation[row]
                 axis = AXES[int(np.abs(direction).argmax())]

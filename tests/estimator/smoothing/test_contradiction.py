@@ -29,6 +29,7 @@ from telerig.estimator.smoothing.result import trajectories
 from telerig.estimator.smoothing.verdict.contradiction import contradictions, speed_warnings
 from telerig.estimator.smoothing.verdict.evidence import Evidence
 from telerig.estimator.smoothing.verdict.judge import judge
+from telerig.factors.bubble_motion import Inertia
 from telerig.io.results.smoothing import Contradiction, Disagreement
 
 BANDS = replace(
@@ -56,6 +57,14 @@ def found_in(solution: Solution) -> tuple[Contradiction, ...]:
 def test_measurements_that_agree_are_not_contradicted(seed: int) -> None:
     for problem in (marked(seed), run(np.random.default_rng(seed), bubbles=2)[0]):
         assert found_in(solve(problem, true_model())) == ()
+
+
+def test_residuals_within_what_is_stated_do_not_contradict_the_white_part_of_it() -> None:
+    """What changes slowly in outlines is stated, and weighs no image."""
+    bubble = replace(true_model().bubble, inertia=Inertia((1e-3,) * 3, noise=(0.4, 0.4)))
+    solution = solve(marked(1), replace(true_model(), bubble=bubble))
+    assert np.mean(solution.residuals[0] ** 2) > 1.8
+    assert found_in(solution) == ()
 
 
 def test_marks_of_another_time_are_named_and_the_bands_are_widened() -> None:

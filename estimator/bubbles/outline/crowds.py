@@ -40,8 +40,7 @@ _EXPLAINED_SHARE, _EXPLAINED_PX = 0.1, 1.0
 _NEAR_SHARE, _NEAR_PX, _GROWTH = 0.15, 0.5, 0.15
 _LEAST_COVERAGE = 0.3
 _SEVERAL, _SMALLER, _FILLED = 3, 0.5, 0.3
-_DISAGREE = 9.21
-"""Chi-square of two degrees of freedom that one outline in a hundred exceeds by chance."""
+_DISAGREE = 1.0
 _UNLIKE = "its rim is unlike those of the sharp bubbles"
 
 

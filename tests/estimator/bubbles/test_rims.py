@@ -81,24 +81,6 @@ def test_errors_beside_neighbours_are_those_stated() -> None:
     assert misses(truth[j, :2], [Drawn((*uv, 9.0, 9.0, 0.0)) for uv in pair]).max() < 1.0
 
 
-def test_typical_errors_in_a_crowd_are_those_stated() -> None:
-    """Before, the covariances of ellipses along rims were twice as large as their errors, and the
-    two medians 0.72 and 0.44."""
-    square, along = [], []
-    for k in range(2):
-        image, truth = swarm(0.3, True, np.random.default_rng([35, 30, k]))
-        table = find_bubbles(image).accepted
-        table = table[~table["flags"].str.contains("defocus")]
-        i, j = paired(table[ELLIPSE].to_numpy(float), truth)
-        miss = centres(table)[i] - truth[j, :2]
-        inverse = np.linalg.inv(centre_covariances(table)[i])
-        square.append(np.einsum("ni,nij,nj->n", miss, inverse, miss))
-        along.append(table["chi2_dof"].isna().to_numpy()[i])
-    every, rims = np.concatenate(square), np.concatenate(along)
-    assert 0.75 < np.median(every) / 1.386 < 1.25
-    assert 0.7 < np.median(every[rims]) / 1.386 < 1.4
-
-
 @pytest.mark.parametrize("heart", [0.0, 0.5])
 def test_bubbles_of_a_closed_chain_are_found(heart: float) -> None:
     bubbles = chain(10, heart)

@@ -171,7 +171,7 @@ def _pictures(
         drawings += [("first" if axis == up else "series", partial(time_series, results, axis))
                      for axis in range(3)]  # fmt: skip
     pictures: dict[str, Any] = {
-        place: [] for place in (*dict(drawings), "marks", "series", *PLACES)
+        place: [] for place in (*dict(drawings), "marks", "rays", "series", *PLACES)
     }
     if cameras is not None:
         drawings.append(("rays", partial(two_rays, results, cameras)))

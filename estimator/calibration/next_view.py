@@ -18,6 +18,7 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.calibration.solver.covariance import JointCovariance
+from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.thresholds import ENOUGH_SHARE, RECOMMENDED_VIEWS
 from telerig.factors.calibration import Observations, State, pixels, whitened_residuals
@@ -422,7 +423,7 @@ def new_cells(problem: Problem, visible: Bools, uv_px: Array) -> Bools:
 class ViewGain:
     """Computes by how much further views would lower the uncertainty of points in space.
 
-    covariance : (P + 3 n, P + 3 n) of the P parameters of the cameras and of n dots.
+    now : the errors of the P parameters of the cameras and of n dots (3 n).
     dots : (n,) sorted indices of these dots.
     root : (P, R); the trace of root^T C root is the summed variance of points in space if the
         cameras' parameters have the covariance C.
@@ -432,7 +433,7 @@ class ViewGain:
 
     problem: Problem
     state: State
-    covariance: Array
+    now: Estimate
     dots: Ints
     root: Array
     whitener: Array
@@ -444,9 +445,10 @@ class ViewGain:
         points = working_volume(cameras)
         shift = aligned_shift(cameras, problem.free, points)
         covariance, dots = joint.of_rig_and(np.unique(dots)), np.unique(dots)
+        now = Estimate(np.zeros(len(covariance)), covariance)
         triangle = np.asarray(np.linalg.qr(shift, mode="r")).T
         noise = [_noise_px(problem, c) for c in range(len(cameras))]
-        return ViewGain(problem, state, covariance, dots, triangle, 1 / np.array(noise), points)
+        return ViewGain(problem, state, now, dots, triangle, 1 / np.array(noise), points)
 
     @property
     def before_um(self) -> float:
@@ -467,27 +469,24 @@ class ViewGain:
 
     def _um(self, less: Array) -> Array:
         rig = len(self.root)
-        whole = np.sum((self.covariance[:rig, :rig] @ self.root) * self.root)
+        whole = np.sum((self.now.covariance[:rig, :rig] @ self.root) * self.root)
         return np.asarray(1e3 * np.sqrt(np.maximum(whole - less, 0) / self.points_mm.size))
 
     def after_um(self, poses: Candidates, dots: Ints) -> Array:
         """Return the standard deviation (K,) per axis, in µm, of points after each of K views.
 
-        Each view is added alone. dots : indices of the dots that it shows.
-        With A the whitened derivatives of the view, its pose projected out, and C the covariance,
-        the summed variance of points falls by the trace of root^T C A^T (1 + A C A^T)^-1 A C root.
+        Each view is added alone, its pose projected out. dots : indices of the dots that it shows.
         """
         rows, by_pose = self._rows(poses, dots)
         rig = len(self.root)
         place = rig + (3 * np.searchsorted(self.dots, dots)[:, None] + np.arange(3)).ravel()
         index = np.r_[np.arange(rig), place]
-        covariance = self.covariance[np.ix_(index, index)]
         basis, _ = np.linalg.qr(by_pose)
-        rows = rows - basis @ (np.swapaxes(basis, -1, -2) @ rows)
-        onto = rows @ covariance
-        both = onto @ np.swapaxes(rows, -1, -2) + np.eye(rows.shape[1])
-        by_points = onto[..., :rig] @ self.root
-        return self._um(np.sum(by_points * np.linalg.solve(both, by_points), axis=(-1, -2)))
+        rows = rows - basis @ (basis.mT @ rows)
+        of_points = np.zeros((len(index), self.root.shape[1]))
+        of_points[:rig] = self.root
+        some = Estimate(self.now.value[index], self.now.covariance[np.ix_(index, index)])
+        return self._um(some.saved_by(rows, of_points))
 
     def _rows(self, poses: Candidates, dots: Ints) -> tuple[Array, Array]:
         """Return whitened derivatives of K views by rig and dots (K, 2 C n, P + 3 n) and pose."""

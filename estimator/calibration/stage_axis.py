@@ -17,7 +17,16 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError, suggestion
+from telerig.estimator.calibration.solver.gaussian import Gaussian
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    eccentricity_px,
+    nominal_state,
+    problem_from_dots,
+)
+from telerig.estimator.calibration.solver.system import System, retracted
 from telerig.estimator.calibration.thresholds import LEAST_TRAVEL_MM
+from telerig.factors.calibration import State, whitened_error
 from telerig.factors.robust_loss import next_limit, travel_weights
 from telerig.io.dataset.dataset import Dataset, View, files_by_view
 from telerig.io.dataset.tables import read_dots_csv
@@ -25,9 +34,9 @@ from telerig.io.files.csv_table import read_table
 from telerig.io.images.read import natural
 from telerig.io.results.findings import Code, Finding
 from telerig.io.tables.calibration import POSITIONS
-from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose, across, hat, nearest_rotation, rotation_from_rotvec
-from telerig.rig.triangulation import rig_jacobian, triangulate_any
+from telerig.rig.pose import Pose, across, nearest_rotation
+from telerig.rig.target import Target
+from telerig.rig.triangulation import triangulate_any
 from telerig.statistics import robust_sd
 
 if TYPE_CHECKING:
@@ -103,6 +112,7 @@ def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | N
     described, read = dataset.rig.stage, list[Finding]()
     found = stage_axis_of(
         calibration,
+        dataset.target,
         _measured(dataset, folder, read),
         positions,
         position_sigma_mm=0.001 if described is None else described.position_sigma_mm,
@@ -166,6 +176,7 @@ def _far_axis(axis: Array, stated: tuple[float, float, float]) -> list[Finding]:
 
 def stage_axis_of(
     calibration: Calibration,
+    target: Target,
     table: pd.DataFrame,
     positions_mm: Mapping[str, float] | pd.DataFrame,
     *,
@@ -176,7 +187,8 @@ def stage_axis_of(
 
     The covariance of the result includes the errors of the cameras' calibration.
 
-    table : measured dots of a target at rest, with the columns of dots.csv: view, camera, dot,
+    target : whose dots the calibration knows; their diameters correct the measured centres.
+    table : measured dots of the target at rest, with the columns of dots.csv: view, camera, dot,
         u_px, v_px and either suu_px2, suv_px2, svv_px2 or sigma_px.
     positions_mm : the encoder reading of each view, a mapping or a table with the columns view and
         position_mm.
@@ -185,30 +197,33 @@ def stage_axis_of(
     Raises InputError for views without a position and for unknown cameras, and CalibrationError for
     fewer than two positions, less than 1 mm between them, or a single camera.
     """
-    dots, findings = _dots(calibration, table, positions_mm)
-    cameras = calibration.cameras
-    state = start(cameras, dots)
+    stops, findings = _stops(calibration, target, table, positions_mm)
+    travel = start(stops)
+    eccentric = eccentricity_px(stops.problem, stops.state(travel))
+    stops = replace(stops, problem=replace(stops.problem, eccentricity_px=eccentric))
     sigma = (position_sigma_mm, wander_sigma_mm)
-    state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
-    observed = _observed_sigma(state, weights, system, sigma)
+    travel, weights, system = fit(stops, travel, sigma)
+    observed = _observed_sigma(travel, weights, system, sigma)
     if observed != sigma:
         findings += _scatters(sigma, observed)
         sigma = observed
-        state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
-    findings += _suspects(dots, weights, system)
-    return _result(calibration, dots, state, weights, system, sigma, findings)
+        travel, weights, system = fit(stops, travel, sigma)
+    findings += _suspects(stops, weights, system)
+    return _result(calibration, stops, travel, weights, system, sigma, findings)
 
 
-def _dots(
-    calibration: Calibration, table: pd.DataFrame, positions_mm: Mapping[str, float] | pd.DataFrame
-) -> tuple[Dots, list[Finding]]:
+def _stops(
+    calibration: Calibration,
+    target: Target,
+    table: pd.DataFrame,
+    positions_mm: Mapping[str, float] | pd.DataFrame,
+) -> tuple[Stops, list[Finding]]:
     """Return the dots that the calibration knows, and findings on those that it does not."""
     readings = _readings(positions_mm)
     names = [c.name for c in calibration.cameras]
     _check_names(table, "view", list(readings), "has no position")
     _check_names(table, "camera", names, "is not in the calibration")
-    index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
-    known = table["dot"].isin(index).to_numpy()
+    known = table["dot"].isin(calibration.dot_ids).to_numpy()
     unknown = int((~known).sum())
     findings = [Code.UNKNOWN_DOTS.found(count=unknown)] if unknown else []
     if unknown and not known.any():
@@ -217,24 +232,16 @@ def _dots(
             where=FOLDER,
             todo="number the dots as in the calibration, and show the same target",
         )
-    rows = table[known]
-    views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
-    unseen = [v for v in readings if v not in views]
+    rows = _with_covariance(table[known], calibration)
+    held = replace(target, scale_dots=None)
+    problem = replace(problem_from_dots(rows, calibration.cameras, held), free=calibration.free)
+    unseen = [v for v in readings if v not in problem.views]
     findings += [Code.UNSEEN_POSITIONS.found(views=unseen)] if unseen else []
-    reading = np.array([readings[v] for v in views])
+    reading = np.array([readings[v] for v in problem.views])
     _check_enough(reading, set(rows["camera"]))
-    number = {v: i for i, v in enumerate(views)}
-    place = np.array([index[int(d)] for d in rows["dot"]], np.int64)
-    found = Dots(
-        views,
-        reading,
-        np.array([number[str(v)] for v in rows["view"]], np.int64),
-        np.array([names.index(c) for c in rows["camera"]], np.int64),
-        calibration.target_points_mm[place],
-        rows[["u_px", "v_px"]].to_numpy(float),
-        np.asarray(np.linalg.inv(_covariance(rows, calibration)), np.float64),
-    )
-    return found, findings
+    index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
+    place = calibration.target_points_mm[[index[int(d)] for d in problem.dot_ids]]
+    return Stops(problem, replace(nominal_state(problem), dots_mm=place), reading), findings
 
 
 def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, float]:
@@ -285,20 +292,17 @@ def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
         )
 
 
-def _covariance(rows: pd.DataFrame, calibration: Calibration) -> Array:
-    """Return the pixels' covariances (M, 2, 2), from the columns or the calibration's scatter."""
+def _with_covariance(rows: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
+    """Return the table with the pixels' covariances, by default the calibration's scatter."""
     if all(c in rows for c in _COVARIANCE):
-        uu, uv, vv = rows[_COVARIANCE].to_numpy(float).T
-    else:
-        scatter = float(calibration.statistics.get("scatter_px", 0.02))
-        sigma = rows["sigma_px"].to_numpy(float) if "sigma_px" in rows else scatter
-        uu = vv = np.broadcast_to(np.square(sigma), (len(rows),))
-        uv = np.zeros(len(rows))
-    return np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
+        return rows
+    scatter = float(calibration.statistics.get("scatter_px", 0.02))
+    variance = rows.get("sigma_px", scatter) ** 2
+    return rows.assign(suu_px2=variance, suv_px2=0.0, svv_px2=variance)
 
 
 def _observed_sigma(
-    state: State, weights: Weights, system: StageEquations, sigma_mm: tuple[float, float]
+    travel: Travel, weights: Weights, system: StageEquations, sigma_mm: tuple[float, float]
 ) -> tuple[float, float]:
     """Return the carriage's standard deviations, as observed if significantly larger than given.
 
@@ -310,7 +314,7 @@ def _observed_sigma(
     spare = int(kept.sum()) - 2
     if spare < 1:
         return sigma_mm
-    axis = state.slope / np.linalg.norm(state.slope)
+    axis = travel.slope / np.linalg.norm(travel.slope)
     basis = across(axis)
     out, limit = [], Code.READINGS_SCATTER.limit
     for directions, given in ((axis[:, None], sigma_mm[0]), (basis, sigma_mm[1])):
@@ -332,26 +336,25 @@ def _scatters(given: tuple[float, float], observed: tuple[float, float]) -> list
     ]
 
 
-def _suspects(dots: Dots, weights: Weights, system: StageEquations) -> list[Finding]:
+def _suspects(stops: Stops, weights: Weights, system: StageEquations) -> list[Finding]:
     """Return findings on readings and dots of almost no weight, and on only two positions."""
     found = []
     for v in np.flatnonzero(weights.views < Code.WRONG_READING.limit).tolist():
         error = float(np.linalg.norm(system.shift_mm[v]))
-        reading = float(dots.reading_mm[v])
-        wrong = Code.WRONG_READING.found(views=dots.views[v], reading_mm=reading, error_mm=error)
-        found.append(wrong)
+        reading, view = float(stops.reading_mm[v]), stops.problem.views[v]
+        found.append(Code.WRONG_READING.found(views=view, reading_mm=reading, error_mm=error))
     odd = int((weights.dots < Code.STAGE_OUTLIERS.limit).sum())
     if odd:
         found.append(Code.STAGE_OUTLIERS.found(count=odd, dots=len(weights.dots)))
-    if len(dots.views) == 2:
+    if len(stops.reading_mm) == 2:
         found.append(Code.TWO_POSITIONS.found())
     return found
 
 
 def _result(
     calibration: Calibration,
-    dots: Dots,
-    state: State,
+    stops: Stops,
+    travel: Travel,
     weights: Weights,
     system: StageEquations,
     sigma_mm: tuple[float, float],
@@ -359,16 +362,16 @@ def _result(
 ) -> StageAxis:
     """Return the stage with its covariance, which includes that of the cameras' calibration."""
     kept = weights.dots > Code.STAGE_OUTLIERS.limit
-    spare = 2 * int(kept.sum()) - 3 * len(dots.views) - 3
+    spare = 2 * int(kept.sum()) - 3 * len(stops.reading_mm) - 3
     chi2_dof = float(system.dot_score[kept].sum() / spare) if spare > 0 else 1.0
-    inverse = np.linalg.inv(system.normal)
-    by_rig = -inverse @ system.by_rig
-    full = max(chi2_dof, 1.0) * inverse + by_rig @ calibration.covariance @ by_rig.T
-    travel_per_reading = float(np.linalg.norm(state.slope))
-    axis = state.slope / travel_per_reading
+    own = system.given_cameras().marginal(np.arange(6, 9))
+    by_rig = system.gaussian.moved_by(np.arange(system.rig))[6:9]
+    full = max(chi2_dof, 1.0) * own + by_rig @ calibration.covariance @ by_rig.T
+    travel_per_reading = float(np.linalg.norm(travel.slope))
+    axis = travel.slope / travel_per_reading
     basis = across(axis)
     turn = np.vstack([basis.T / travel_per_reading, -axis / travel_per_reading**2])
-    joint = turn @ full[6:, 6:] @ turn.T
+    joint = turn @ full @ turn.T
     return StageAxis(
         axis,
         basis,
@@ -376,19 +379,19 @@ def _result(
         1 / travel_per_reading - 1,
         float(np.sqrt(joint[2, 2])),
         joint,
-        state.rig_from_target,
+        Pose(travel.rig_from_target[:3, :3], travel.rig_from_target[:3, 3]),
         chi2_dof,
         *sigma_mm,
-        (_summary(dots, axis, travel_per_reading, joint), *findings),
+        (_summary(stops, axis, travel_per_reading, joint), *findings),
     )
 
 
-def _summary(dots: Dots, axis: Array, travel_per_reading: float, joint: Array) -> Finding:
+def _summary(stops: Stops, axis: Array, travel_per_reading: float, joint: Array) -> Finding:
     return Code.STAGE.found(
         **dict(zip("xyz", axis.tolist())),
         sd_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(joint[:2, :2])[-1]))),
-        positions=len(dots.views),
-        range_mm=float(np.ptp(dots.reading_mm)),
+        positions=len(stops.reading_mm),
+        range_mm=float(np.ptp(stops.reading_mm)),
         scale_ppm=1e6 * (1 / travel_per_reading - 1),
         scale_sd_ppm=float(1e6 * np.sqrt(joint[2, 2])),
     )
@@ -400,35 +403,40 @@ _SUSPECT = 3.5
 
 
 @dataclass(frozen=True)
-class Dots:
-    """M measured dots of one target in V views.
-
-    reading_mm : (V,) encoder reading of each view.
-    view, camera : (M,) indices.
-    place_mm : (M, 3) position of each dot in the target frame.
-    uv_px : (M, 2) measured pixels.
-    information : (M, 2, 2) inverse covariances of the pixels (1/px^2).
-    """
-
-    views: tuple[str, ...]
-    reading_mm: Array
-    view: Ints
-    camera: Ints
-    place_mm: Array
-    uv_px: Array
-    information: Array
-
-
-@dataclass(frozen=True)
-class State:
+class Travel:
     """The unknowns of the fit.
 
-    rig_from_target : pose of the target at reading 0.
+    rig_from_target : (4, 4) pose of the target at reading 0.
     slope : (3,) travel in rig axes per mm of the encoder's reading.
     """
 
-    rig_from_target: Pose
+    rig_from_target: Array
     slope: Array
+
+    def moved(self, step: Array) -> Travel:
+        """Return the travel after a step (9,): of the pose's tangent, and of the slope."""
+        return Travel(retracted(self.rig_from_target, step[:6]), self.slope + step[6:])
+
+
+@dataclass(frozen=True)
+class Stops:
+    """Views of one target at V positions of the stage.
+
+    problem : the measured dots, with the calibrated cameras.
+    known : the cameras, and the dots' places in the target's frame, which are those of the
+        calibration.
+    reading_mm : (V,) encoder reading of each view.
+    """
+
+    problem: Problem
+    known: State
+    reading_mm: Array
+
+    def state(self, travel: Travel, shift_mm: Array | float = 0.0) -> State:
+        """Return the state in which the views are displaced from the travel by (V, 3)."""
+        poses = np.tile(travel.rig_from_target, (len(self.reading_mm), 1, 1))
+        poses[:, :3, 3] += shift_mm - self.reading_mm[:, None] * travel.slope
+        return replace(self.known, rig_from_target=poses)
 
 
 @dataclass(frozen=True)
@@ -441,51 +449,46 @@ class Weights:
 
 @dataclass(frozen=True)
 class StageEquations:
-    """The normal equations of the 9 unknowns (6 of the pose, 3 of the slope).
+    """The equations at one `Travel`.
 
-    The errors of the carriage's position in each of the V views have been eliminated.
-
-    normal, right : (9, 9) matrix and (9,) right-hand side.
-    by_rig : (9, P) coupling with the P parameters of the cameras.
+    gaussian : of the P parameters of the cameras, the 9 of the travel, and the carriage's errors in
+        each view (3 each), in standard deviations.
+    rig : P.
     shift_mm, shift_covariance : (V, 3) deviation of each view from the straight line in mm, and
         (V, 3, 3) its covariance in mm^2.
     dot_score : (M,) squared residual of each of the M dots, divided by its variance, if each
         view may deviate freely.
     """
 
-    normal: Array
-    right: Array
-    by_rig: Array
+    gaussian: Gaussian
+    rig: int
     shift_mm: Array
     shift_covariance: Array
     dot_score: Array
 
+    def given_cameras(self) -> Gaussian:
+        """Return the Gaussian of the travel and the carriage's errors, with the cameras held."""
+        return self.gaussian.hold(np.arange(self.rig))
+
 
 def fit(
-    cameras: tuple[Camera, ...],
-    free: tuple[tuple[str, ...], ...],
-    dots: Dots,
-    state: State,
-    sigma_mm: tuple[float, float],
-) -> tuple[State, Weights, StageEquations]:
-    """Fit the state to the dots by robust Gauss-Newton steps from a start.
+    stops: Stops, travel: Travel, sigma_mm: tuple[float, float]
+) -> tuple[Travel, Weights, StageEquations]:
+    """Fit the travel to the dots by robust Gauss-Newton steps from a start.
 
-    free : for each camera the names of its free intrinsics. sigma_mm : standard deviations of the
-    carriage's position along and across the axis. A dot or an encoder reading that is farther than
-    3.5 standard deviations from the fit loses weight (`travel_weights`).
-    Returns the fitted state, the weights and the equations at this state. Raises CalibrationError
-    if the fit does not converge.
+    sigma_mm : standard deviations of the carriage's position along and across the axis. A dot or an
+    encoder reading that is farther than 3.5 standard deviations from the fit loses weight
+    (`travel_weights`).
+    Returns the fitted travel, the weights and the equations there. Raises CalibrationError if the
+    fit does not converge.
     """
-    weights = Weights(np.ones(len(dots.view)), np.ones(len(dots.views)))
-    system = linearised(cameras, free, dots, state, sigma_mm, weights)
+    weights = Weights(np.ones(len(stops.problem.view)), np.ones(len(stops.reading_mm)))
+    system = linearised(stops, travel, sigma_mm, weights)
     limit = np.inf
     for turn in range(_STEPS):
-        step = np.asarray(np.linalg.solve(system.normal, system.right), np.float64)
-        state = State(
-            state.rig_from_target @ Pose(rotation_from_rotvec(step[:3]), step[3:6]),
-            state.slope + step[6:],
-        )
-        scores = _scores(system, state, sigma_mm[0])
+        step = system.given_cameras().step()[0][:9]
+        travel = travel.moved(step)
+        scores = _scores(system, travel, sigma_mm[0])
         highest = float(np.sqrt(max(s.max() for s in scores)))
         limit = next_limit(limit, highest, _SUSPECT)
         fresh = weights
@@ -493,9 +496,9 @@ def fit(
             fresh = Weights(*(travel_weights(score, limit) for score in scores))
         moved = np.ptp(fresh.dots - weights.dots) + np.ptp(fresh.views - weights.views)
         weights = fresh
-        system = linearised(cameras, free, dots, state, sigma_mm, weights)
+        system = linearised(stops, travel, sigma_mm, weights)
         if limit == _SUSPECT and moved < 1e-3 and np.abs(step).max() < 1e-7:
-            return state, weights, system
+            return travel, weights, system
     raise CalibrationError(
         "the fit of a straight stage axis to the views of the target does not converge",
         where="stage_axis",
@@ -504,12 +507,12 @@ def fit(
     )
 
 
-def _scores(system: StageEquations, state: State, sigma_mm: float) -> tuple[Array, Array]:
+def _scores(system: StageEquations, travel: Travel, sigma_mm: float) -> tuple[Array, Array]:
     """Return squared distances of the dots (M,) and of the readings (V,), in standard deviations.
 
     If readings scatter by more than twice the stated value, the observed scatter replaces it.
     """
-    axis = state.slope / np.linalg.norm(state.slope)
+    axis = travel.slope / np.linalg.norm(travel.slope)
     own = np.einsum("i,vij,j->v", axis, system.shift_covariance, axis)
     off = system.shift_mm @ axis
     spread = float(robust_sd(off))
@@ -519,44 +522,42 @@ def _scores(system: StageEquations, state: State, sigma_mm: float) -> tuple[Arra
 
 
 def linearised(
-    cameras: tuple[Camera, ...],
-    free: tuple[tuple[str, ...], ...],
-    dots: Dots,
-    state: State,
-    sigma_mm: tuple[float, float],
-    weights: Weights,
+    stops: Stops, travel: Travel, sigma_mm: tuple[float, float], weights: Weights
 ) -> StageEquations:
-    """Return the normal equations at a state, with the carriage's error of each view eliminated.
-
-    free, sigma_mm : as for `fit`.
-    """
-    residual, by_point, by_state, by_rig = derivatives(cameras, free, dots, state)
-    weighted = np.linalg.cholesky(dots.information).swapaxes(-1, -2)
-    value = np.einsum("mij,mj->mi", weighted, residual)
-    by_point = weighted @ by_point
-    seen, pull = np.zeros((len(dots.views), 3, 3)), np.zeros((len(dots.views), 3))
-    root = np.sqrt(weights.dots)[:, None, None]
-    white, right = root * by_point, root[..., 0] * value
-    np.add.at(seen, dots.view, white.swapaxes(-1, -2) @ white)
-    np.add.at(pull, dots.view, np.einsum("mki,mk->mi", white, right))
+    """Return the equations at a travel. sigma_mm : as for `fit`."""
+    problem, state = replace(stops.problem, weight=weights.dots), stops.state(travel)
+    system, views = System(problem), len(stops.reading_mm)
+    rig, turn = system.views_at, travel.rig_from_target[:3, :3]
+    # the pose of each view by the common rotation, and by its own place in rig axes
+    by_place = np.eye(system.dots_at, rig + 3 + 3 * views)
+    poses = by_place[rig:].reshape(views, 2, 3, -1)
+    poses[:] = 0.0
+    poses[:, 0, :, rig : rig + 3] = np.eye(3)
+    at = rig + 3 + np.arange(3 * views).reshape(-1, 3)
+    for pose, columns in zip(poses, at):
+        pose[1, :, columns] = turn
+    held = np.arange(system.dots_at, system.size)
+    placed = system.gaussian(state).hold(held).in_terms_of(by_place)
+    seen = placed.common[at[:, :, None], at[:, None]]
     spread = np.asarray(np.linalg.pinv(seen, rcond=1e-9, hermitian=True), np.float64)
-    shift = np.einsum("vij,vj->vi", spread, pull)
-    # the carriage's error is in units of its standard deviation, because that may be zero
-    unit = np.tile(_across(state.slope), (len(dots.views), 1, 1))
+    shift = np.einsum("vij,vj->vi", spread, placed.right[at])
+    # the places by the target's position, the slope, and the carriage's error, which is in units of
+    # its standard deviation, because that may be zero
+    unit = np.tile(_across(travel.slope), (views, 1, 1))
     unit[..., 0] *= sigma_mm[0] / np.sqrt(weights.views)[:, None]
     unit[..., 1:] *= sigma_mm[1]
-    kept = root * weighted @ np.concatenate([by_state, by_rig], -1)
-    cross = np.zeros((len(dots.views), kept.shape[-1], 3))
-    np.add.at(cross, dots.view, kept.swapaxes(-1, -2) @ white)
-    cross, blocks = cross @ unit, np.eye(3) + unit.swapaxes(-1, -2) @ seen @ unit
-    gain = np.linalg.solve(blocks, cross.swapaxes(-1, -2))
-    flat = kept.reshape(-1, kept.shape[-1])
-    normal = flat.T @ flat - np.einsum("vki,vil->kl", cross, gain)
-    own = np.einsum("vij,vi->vj", unit, pull)
-    moment = flat.T @ right.ravel() - np.einsum("vik,vi->k", gain, own)
-    off = value - np.einsum("mki,mi->mk", by_point, shift[dots.view])
-    score = (off**2).sum(-1)
-    return StageEquations(normal[:9, :9], moment[:9], normal[:9, 9:], shift, spread, score)
+    by_travel = np.eye(rig + 3 + 3 * views, rig + 9 + 3 * views)
+    places = by_travel[rig + 3 :].reshape(views, 3, -1)
+    places[:] = 0.0
+    places[..., rig + 3 : rig + 6] = turn
+    places[..., rig + 6 : rig + 9] = -stops.reading_mm[:, None, None] * np.eye(3)
+    for place, columns, error in zip(places, at + 6, unit):
+        place[:, columns] = error
+    errors = np.eye(by_travel.shape[1])[rig + 9 :]
+    gaussian = placed.in_terms_of(by_travel).add_rows(errors, np.zeros(len(errors)))
+    deviating = stops.state(travel, shift)
+    off = whitened_error(deviating, problem.unweighted(), problem.rho_mm)
+    return StageEquations(gaussian, rig, shift, spread, (off**2).sum(-1))
 
 
 def _across(slope: Array) -> Array:
@@ -565,52 +566,26 @@ def _across(slope: Array) -> Array:
     return np.asarray(basis)
 
 
-def derivatives(
-    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], dots: Dots, state: State
-) -> tuple[Array, Array, Array, Array]:
-    """Return the residuals of M dots, and the derivatives of the predicted pixels.
-
-    Returns the residuals (M, 2) in px, measured minus predicted, and the derivatives (M, 2, 3) with
-    respect to the dot's position in the rig frame, (M, 2, 9) with respect to the state, and
-    (M, 2, P) with respect to the cameras' P parameters.
-    """
-    pose = state.rig_from_target
-    points = pose.apply(dots.place_mm) - dots.reading_mm[dots.view, None] * state.slope
-    whole = rig_jacobian(cameras, free, points)
-    residual, by_point = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
-    by_rig = np.empty((len(points), 2, whole.shape[-1]))
-    for c, camera in enumerate(cameras):
-        mine = dots.camera == c
-        in_camera = camera.camera_from_rig.apply(points[mine])
-        uv, by_camera_point, _ = camera.pixel_jacobians(in_camera, ())
-        residual[mine] = dots.uv_px[mine] - uv
-        by_point[mine] = by_camera_point @ camera.camera_from_rig.rotation
-        by_rig[mine] = whole[mine, 2 * c : 2 * c + 2]
-    by_move = by_point @ pose.rotation
-    by_turn = -by_move @ hat(dots.place_mm)
-    by_slope = -dots.reading_mm[dots.view, None, None] * by_point
-    return residual, by_point, np.concatenate([by_turn, by_move, by_slope], -1), by_rig
-
-
-def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
-    """Return a state in closed form from which `fit` can start.
+def start(stops: Stops) -> Travel:
+    """Return a travel in closed form from which `fit` can start.
 
     The dots are triangulated. The travel (mm along the rig's axes for each mm of the encoder) is a
     median over pairs of views, and the target is fitted to the median position of each dot. Raises
     CalibrationError if no dot is seen by two cameras at once at two positions of the stage.
     """
-    ids = np.unique(dots.place_mm, axis=0, return_inverse=True)[1].reshape(-1)
-    keys = dots.view * (ids.max() + 1) + ids
-    _, first, point = np.unique(keys, return_index=True, return_inverse=True)
-    pixels = np.full((len(cameras), len(first), 2), np.nan)
-    pixels[dots.camera, point] = dots.uv_px
+    problem, count = stops.problem, len(stops.known.dots_mm)
+    found, point = np.unique(problem.view * count + problem.dot, return_inverse=True)
+    pixels = np.full((len(problem.cameras), len(found), 2), np.nan)
+    pixels[problem.camera, point] = problem.uv_px
     several = np.isfinite(pixels[..., 0]).sum(0) > 1
-    one = first[several]
-    points = triangulate_any(cameras, list(pixels[:, several]), 0.02).points_mm
-    reading = dots.reading_mm[dots.view[one]]
-    slope = _median_slope(reading, ids[one], points)
+    view, dot = np.divmod(found[several], count)
+    points = triangulate_any(problem.cameras, list(pixels[:, several]), 0.02).points_mm
+    reading = stops.reading_mm[view]
+    slope = _median_slope(reading, dot, points)
     at_zero = points + slope * reading[:, None]
-    return State(_fitted_pose(ids[one], dots.place_mm[one], at_zero), slope)
+    seen = np.unique(dot)
+    middle = np.array([np.median(at_zero[dot == one], axis=0) for one in seen])
+    return Travel(_fitted_pose(stops.known.dots_mm[seen], middle), slope)
 
 
 def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
@@ -632,11 +607,9 @@ def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
     return np.asarray(np.median(every, axis=0))
 
 
-def _fitted_pose(dot: Ints, place: Array, points: Array) -> Pose:
-    """Return rig_from_target by a least-squares fit to the median position of each dot (Kabsch)."""
-    _, first = np.unique(dot, return_index=True)
-    nominal = place[first]
-    middle = np.array([np.median(points[dot == d], axis=0) for d in dot[first]])
-    a, b = nominal.mean(0), middle.mean(0)
-    rotation = nearest_rotation((middle - b).T @ (nominal - a))
-    return Pose(rotation, b - rotation @ a)
+def _fitted_pose(place: Array, points: Array) -> Array:
+    """Return rig_from_target (4, 4) by a least-squares fit of places to points (N, 3) (Kabsch)."""
+    pose, a, b = np.eye(4), place.mean(0), points.mean(0)
+    pose[:3, :3] = nearest_rotation((points - b).T @ (place - a))
+    pose[:3, 3] = b - pose[:3, :3] @ a
+    return pose

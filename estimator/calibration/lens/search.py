@@ -21,6 +21,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
+from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
 from telerig.estimator.calibration.thresholds import GROUP_PENALTY
@@ -53,8 +54,7 @@ class QuadraticCost:
     sums of intrinsics for each camera, which describe the homography of a tilted sensor.
 
     names : (camera, parameter) of each coordinate.
-    offset : (K,) coordinates of the minimum, relative to nominal.
-    covariance : (K, K).
+    minimum : the K coordinates of the minimum, relative to nominal, and their covariance.
     prior : (K,) standard deviations of the priors.
     least : chi-square at the minimum.
     variance : variance of the residuals relative to the stated noise, by which every chi-square
@@ -64,8 +64,7 @@ class QuadraticCost:
     """
 
     names: tuple[tuple[int, str], ...]
-    offset: Array
-    covariance: Array
+    minimum: Estimate
     prior: Array
     least: float
     variance: float
@@ -87,23 +86,23 @@ class QuadraticCost:
         )
         nominal = [problem.cameras[c].intrinsics[INDEX[p]] for c, p in names]
         there = [solution.state.intrinsics[c, INDEX[p]] for c, p in names]
-        offset = (np.array(there) - nominal + step[:size]) / unit
-        covariance = joint.matrix[:size, :size] / np.outer(unit, unit)
+        minimum = Estimate(np.array(there) - nominal + step[:size], joint.matrix[:size, :size])
         more = [
             ((c, f"{a}+{b}"), names.index((c, a)), names.index((c, b)))
             for c in range(len(problem.cameras))
             for a, b in _HOMOGRAPHY
             if (c, a) in names and (c, b) in names
         ]
-        extend = np.eye(size + len(more), size)
+        extend = np.diag(1 / unit)
+        extend = np.concatenate([extend, np.zeros((len(more), size))])
         for row, (_, a, b) in enumerate(more, size):
-            extend[row, [a, b]] = 1.0
+            extend[row, [a, b]] = 1 / unit[[a, b]]
         groups = sum(1 for c in range(len(problem.cameras)) for g in PLAIN_GROUPS
                      if (c, GROUPS[g][0]) in names)  # fmt: skip
         variance = _variance(problem, solution, joint)
         rows = 2 * int(np.sum(problem.kept))
         return QuadraticCost(
-            (*names, *(m[0] for m in more)), extend @ offset, extend @ covariance @ extend.T,
+            (*names, *(m[0] for m in more)), minimum.predict(extend),
             np.r_[prior / unit, np.ones(len(more))],
             2 * (solution.cost - still) / variance, variance,
             float(np.log(rows)), float(GROUP_PENALTY * np.log(max(groups, 1))),
@@ -111,11 +110,7 @@ class QuadraticCost:
 
     def rise(self, lenses: Lenses) -> float:
         """Return by how much chi-square of a model exceeds that of the richest one."""
-        held = self._held(lenses)
-        if len(held) == 0:
-            return 0.0
-        d, inside = self.offset[held], self.covariance[np.ix_(held, held)]
-        return float(d @ np.linalg.solve(inside, d)) / self.variance
+        return self.minimum.chi_square(self._held(lenses)) / self.variance
 
     def cost(self, lenses: Lenses) -> float:
         """Return the information criterion of a model, up to a constant.
@@ -146,13 +141,9 @@ class QuadraticCost:
 
         It is the largest ratio of posterior to prior standard deviation among the parameters.
         """
-        held = self._held(lenses)
         mine = [i for i, n in enumerate(self.names) if n[0] == camera and n[1] in GROUPS[group]]
-        cross = self.covariance[np.ix_(mine, held)]
-        inside = self.covariance[np.ix_(held, held)]
-        block = self.covariance[np.ix_(mine, mine)] - cross @ np.linalg.solve(inside, cross.T)
-        sd = np.sqrt(np.maximum(np.diag(block), 0.0))
-        return float((sd / self.prior[mine]).max()) if mine else 0.0
+        share = self.minimum.hold(self._held(lenses)).sd / self.prior
+        return float(share[mine].max()) if mine else 0.0
 
     def _held(self, lenses: Lenses) -> list[int]:
         return [

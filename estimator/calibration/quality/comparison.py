@@ -18,18 +18,14 @@ from scipy.special import chdtrc
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.thresholds import SURE_SD, UNLIKELY
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
-from telerig.rig.triangulation import aligned_shift, triangulate_any, working_volume
+from telerig.rig.triangulation import aligned_covariance, triangulate_any, working_volume
 from telerig.short_text import number, with_sd
 
-_RANK = 1e-3
-"""Directions whose standard deviation is smaller than this share of the largest one are left out,
-because second-order effects of the others are larger there."""
 _ROUNDING = 1e-6
-_EXACT = 1e-9
-"""Largest difference (mm or rad) of two rigs without uncertainty that counts as rounding."""
 _LEAST_CHANCE = 1e-12
 
 
@@ -280,8 +276,7 @@ def compare_rigs(first: Rig, second: Rig) -> RigComparison:
     The covariance of a change is the sum of both covariances.
     """
     cameras = tuple(camera.name for camera in first.cameras)
-    pose, covariance = _pose_change(first, second)
-    sd = np.sqrt(np.diag(covariance))
+    pose = _pose_change(first, second)
     names = [f"rotation about {a}" for a in "xyz"] + ["offset along the common perpendicular"]
     if len(cameras) > 2:
         names = [f"{name} of camera {camera}" for camera in cameras[1:] for name in names]
@@ -290,13 +285,12 @@ def compare_rigs(first: Rig, second: Rig) -> RigComparison:
     factors = np.tile([1e6, 1e6, 1e6, 1e3], others)
     changes = [
         Change(n, u, float(f * c), float(f * s))
-        for n, u, f, c, s in zip(names, units, factors, pose, sd)
+        for n, u, f, c, s in zip(names, units, factors, pose.value, pose.sd)
     ]
     changes += [_scale_change(first, second, i) for i in range(len(cameras))]
-    moved = _chance(pose, _root(covariance))
     field = field_difference(first, second)
     exchanged = _exchanged(first, second, changes[4 * others :])
-    return RigComparison(cameras, tuple(changes), field, moved, exchanged)
+    return RigComparison(cameras, tuple(changes), field, pose.p_value(), exchanged)
 
 
 def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
@@ -321,8 +315,8 @@ def _of(medium: str) -> str:
     return "the water" if medium == "water" else medium
 
 
-def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:
-    """Return how each camera but the first moved relative to the first, and the covariance.
+def _pose_change(first: Rig, second: Rig) -> Estimate:
+    """Return how each camera but the first moved relative to the first.
 
     A camera has four numbers: the rotation about the x, y and z axis of the rig frame (rad) and the
     offset along the common perpendicular (mm).
@@ -338,7 +332,7 @@ def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:
         rows[4 * c : 4 * c + 3, 6 * c : 6 * c + 3] = a.rotation
         rows[4 * c + 3, 6 * c + 3 : 6 * c + 6] = across @ a.rotation
     blocks = sum(r.covariance[-6 * others :, -6 * others :] for r in (first, second))
-    return np.concatenate(changes), rows @ blocks @ rows.T
+    return Estimate(np.concatenate(changes), rows @ blocks @ rows.T)
 
 
 def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
@@ -388,35 +382,11 @@ def field_difference(first: Rig, second: Rig, points_mm: Array | None = None) ->
     pixels = [camera.project(points) for camera in first.cameras]
     found = triangulate_any(second.cameras, pixels, 1.0).points_mm
     shift = after_rigid_motion(found, points)
-    root = np.concatenate(
-        [
-            aligned_shift(rig.cameras, rig.free, points) @ _root(rig.covariance)
-            for rig in (first, second)
-        ],
-        -1,
+    one, other = (
+        aligned_covariance(rig.cameras, rig.free, rig.covariance, points) for rig in (first, second)
     )
-    sd = np.linalg.norm(root, axis=-1).reshape(-1, 3)
-    return FieldDifference(points, shift, sd, _chance(shift.ravel(), root))
-
-
-def _root(covariance: Array) -> Array:
-    """Return a matrix R with R R^T = covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
-
-
-def _chance(difference: Array, root: Array) -> float:
-    """Return the probability of a difference (K,) as large, with the covariance root root^T.
-
-    Directions with (almost) no variance are left out of the chi-square. Without any variance, a
-    difference beyond rounding has the probability 0.
-    """
-    if not np.any(root):
-        return float(np.all(np.abs(difference) < _EXACT))
-    directions, sizes, _ = np.linalg.svd(root, full_matrices=False)
-    seen = sizes > _RANK * sizes.max()
-    along = directions[:, seen].T @ difference / sizes[seen]
-    return float(chdtrc(int(seen.sum()), float(along @ along)))
+    both = Estimate(shift.ravel(), one + other)
+    return FieldDifference(points, shift, both.sd.reshape(-1, 3), both.p_value())
 
 
 def _norm(parts: tuple[Change, ...]) -> Change:

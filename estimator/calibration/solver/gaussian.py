@@ -13,12 +13,13 @@ blocks. Large problems are eliminated by NumPy; the result has the same form.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.special import chdtrc
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError
@@ -79,7 +80,7 @@ class Gaussian:
     @property
     def of_blocks(self) -> Ints:
         """The indices (B, n) of the blocks' parameters."""
-        return np.arange(len(self.common), len(self.right)).reshape(len(self.blocks), -1)
+        return np.arange(len(self.common), len(self.right)).reshape(self.blocks.shape[:2])
 
     def step(self, damping: float = 0.0) -> tuple[Array, float]:
         """Return the step (D,) to the minimum with Marquardt's damping, and the predicted gain.
@@ -92,6 +93,54 @@ class Gaussian:
         for at, axes in self.turned:
             step[at] = axes @ step[at]
         return step, gain
+
+    def hold(self, index: Ints) -> Gaussian:
+        """Return the Gaussian of the other parameters, while those with an index keep their values.
+
+        index : of common parameters, of the parameters of all blocks, or of both.
+        """
+        stay = np.setdiff1d(np.arange(len(self.right)), index)
+        common = stay[stay < len(self.common)]
+        has_blocks = len(stay) > len(common)
+        cross = self.cross[common] if has_blocks else self.cross[common][..., :0]
+        return replace(
+            self, common=self.common[np.ix_(common, common)], cross=cross,
+            blocks=self.blocks if has_blocks else self.blocks[:0], right=self.right[stay],
+            rig=int(np.searchsorted(common, self.rig)),
+            distance=self.distance if has_blocks else None,
+            by_gtsam=self.by_gtsam and has_blocks,
+            turned=[(np.searchsorted(common, at), axes) for at, axes in self.turned],
+        )  # fmt: skip
+
+    def moved_by(self, index: Ints) -> Array:
+        """Return how far (D - n, n) the minimum moves with n common parameters that are held."""
+        stay = np.setdiff1d(np.arange(len(self.common)), index)
+        across = self.cross[index].transpose(2, 1, 0).reshape(-1, len(index))
+        coupling = np.concatenate([self.common[np.ix_(stay, index)], across])
+        held = self.hold(index)
+        moved = -held.eliminated().solve(coupling)
+        for at, axes in held.turned:
+            moved[at] = axes @ moved[at]
+        return moved
+
+    def in_terms_of(self, matrix: Array) -> Gaussian:
+        """Return the Gaussian of parameters y (m,), if those here, without blocks, are matrix y."""
+        matrix = matrix.copy()
+        for at, axes in self.turned:
+            matrix[at] = axes.T @ matrix[at]
+        return replace(
+            self, common=matrix.T @ self.common @ matrix, right=matrix.T @ self.right,
+            cross=np.zeros((matrix.shape[1], *self.cross.shape[1:])), rig=matrix.shape[1],
+            turned=(),
+        )  # fmt: skip
+
+    def add_rows(self, rows: Array, residual: Array) -> Gaussian:
+        """Return the Gaussian with further residuals (r,), whose derivatives by the common
+        parameters are rows (r, K)."""
+        right = self.right.copy()
+        right[: len(self.common)] -= rows.T @ residual
+        cost = self.cost + 0.5 * float(residual @ residual)
+        return replace(self, common=self.common + rows.T @ rows, right=right, cost=cost)
 
     def marginal(self, index: Ints) -> Array:
         """Return the covariance (n, n) of n parameters, whatever the others are.
@@ -165,6 +214,68 @@ class Gaussian:
         return Eliminated(kept, away, *_by_arrays(matrix, coupling, blocks))
 
 
+_RANK = 1e-6
+"""Directions whose variance is smaller than this share of the largest one are left out of a test,
+because second-order effects of the others are larger there."""
+_EXACT = 1e-9
+"""Largest value (mm or rad) of a quantity without uncertainty that counts as rounding."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Some numbers with a Gaussian error: their values (n,) and covariance (n, n)."""
+
+    value: Array
+    covariance: Array
+
+    @property
+    def sd(self) -> Array:
+        """The standard deviations (n,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def predict(self, rows: Array) -> Estimate:
+        """Return the linear functions rows (m, n) of the numbers."""
+        return Estimate(rows @ self.value, rows @ self.covariance @ rows.T)
+
+    def hold(self, index: Sequence[int]) -> Estimate:
+        """Return all numbers if those with an index are exactly zero."""
+        across = self.covariance[index]
+        gain = np.linalg.solve(self.covariance[np.ix_(index, index)], across).T
+        return Estimate(
+            self.value - gain @ self.value[index], self.covariance - gain @ across
+        )  # fmt: skip
+
+    def chi_square(self, index: Sequence[int]) -> float:
+        """Return Wald's statistic of the hypothesis that the numbers with an index are zero."""
+        value = self.value[index]
+        return float(value @ np.linalg.solve(self.covariance[np.ix_(index, index)], value))
+
+    def p_value(self) -> float:
+        """Return the probability of numbers as large as these if all are zero.
+
+        Directions with (almost) no variance do not count. Without any variance, numbers beyond
+        rounding have the probability 0.
+        """
+        if not np.any(self.covariance):
+            return float(np.all(np.abs(self.value) < _EXACT))
+        variance, directions = np.linalg.eigh(self.covariance)
+        seen = variance > _RANK * variance[-1]
+        along = (self.value @ directions)[seen]
+        return float(chdtrc(int(seen.sum()), float(np.sum(along**2 / variance[seen]))))
+
+    def saved_by(self, rows: Array, onto: Array) -> Array:
+        """Return by how much further measurements lower the summed variance of onto^T x.
+
+        rows : (..., r, n) whitened derivatives of r measurements. onto : (n, R).
+        With A the rows and C the covariance, it is the trace of
+        onto^T C A^T (1 + A C A^T)^-1 A C onto.
+        """
+        through = rows @ self.covariance
+        both = through @ rows.mT + np.eye(rows.shape[-2])
+        seen = through @ onto
+        return np.asarray(np.sum(seen * np.linalg.solve(both, seen), axis=(-1, -2)))
+
+
 def _by_gtsam(matrix: Array, coupling: Array, blocks: Array) -> tuple[Array, Array, Array] | None:
     """Return `Eliminated.root`, ``coupling`` and ``factor`` from GTSAM's Bayes net.
 
@@ -221,9 +332,11 @@ def _by_arrays(matrix: Array, coupling: Array, blocks: Array) -> tuple[Array, Ar
         np.multiply(coupling[:, 0], root[:, i, 0], out=whitened[:, i])
         for j in range(1, i + 1):
             whitened[:, i] += coupling[:, j] * root[:, i, j]
-    flat = whitened.reshape(len(matrix), -1)
+    flat = whitened.reshape(len(matrix), blocks[..., 0].size)
     # the transpose of a C-ordered array is in Fortran order; the matrix is symmetric
-    schur = dsyrk(-1.0, flat.T, 1.0, matrix.T, trans=1, lower=1, overwrite_c=1)
+    schur = matrix.T
+    if flat.size:  # BLAS refuses arrays without elements
+        schur = dsyrk(-1.0, flat.T, 1.0, schur, trans=1, lower=1, overwrite_c=1)
     factor, failed = dpotrf(schur, lower=1, overwrite_a=1, clean=0)
     if failed:
         raise undetermined()

@@ -256,7 +256,7 @@ class _Sums:
         self.cross[own] += of_camera
         self.common[np.ix_(own, own)] += gram[:, :size, :size].sum(0)
         self.common[views[:, :, None], views[:, None]] += gram[:, size:-1, size:-1]
-        across = gram[:, :size, size:-1].swapaxes(0, 1).reshape(size, -1)
+        across = gram[:, :size, size:-1].swapaxes(0, 1).reshape(size, views.size)
         self.common[own, first:] += across
         self.common[first:, own] += across.T
         self.right[own] -= gram[:, :size, -1].sum(0)

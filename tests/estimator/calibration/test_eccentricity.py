@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from discs import polygon_centroid
 
 import telerig
 from telerig.estimator.calibration.solver.problem import (
@@ -23,14 +24,6 @@ from telerig.rig.pose import Pose
 from telerig.rig.target import Target
 
 pytestmark = pytest.mark.usefixtures("without_advice")
-
-
-def polygon_centroid(rim: Any) -> Any:
-    """Area centroid of a closed polygon (shoelace formula)."""
-    x, y = (rim - rim.mean(0)).T
-    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
-    centre = [((a + np.roll(a, -1)) * cross).sum() / (3 * cross.sum()) for a in (x, y)]
-    return np.array(centre) + rim.mean(0)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from telerig.estimator.calibration.solver import covariance
 from telerig.estimator.calibration.solver import robust_least_squares as lm
 from telerig.estimator.calibration.solver import system as systems
 from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.gaussian import Gaussian
+from telerig.estimator.calibration.solver.gaussian import Estimate, Gaussian
 from telerig.estimator.calibration.solver.problem import (
     GAUGE_SIGMA_MM,
     Problem,
@@ -266,6 +266,62 @@ def test_views_are_eliminated_where_dots_are_fewer(rng: Any) -> None:
     )  # fmt: skip
     assert 6 * len(problem.views) > 3 * 6
     check(problem, state_of(problem, {"k1": 0.02}, rng))
+
+
+@pytest.mark.parametrize("blocks", [True, False], ids=["with dots", "dots held"])
+def test_parameters_are_held_and_rows_added(blocks: bool, rng: Any) -> None:
+    """Against the dense information matrix; one view is seen by one camera alone."""
+    problem = problem_of(("k1", "p1"), rng)
+    problem = problem.subset((problem.view > 0) | (problem.camera == 0))
+    whole = System(problem).gaussian(state_of(problem, {"k1": 0.02}, rng))
+    held = np.r_[1, 3, [] if blocks else whole.of_blocks.ravel()].astype(int)
+    gaussian = whole.hold(held)
+    stay = np.setdiff1d(np.arange(len(whole.right)), held)
+    usual = np.eye(len(whole.right))
+    for at, axes in whole.turned:
+        usual[np.ix_(at, at)] = axes
+    information = usual @ dense(whole) @ usual.T
+    own = information[np.ix_(stay, stay)]
+    right = (usual @ whole.right)[stay]
+    length = np.sqrt(np.diag(own))
+
+    def alike(found: Any, wanted: Any) -> None:
+        assert np.abs((found - wanted) * length).max() < 1e-6 * np.abs(wanted * length).max()
+
+    alike(gaussian.step()[0], np.linalg.solve(own, right))
+    if blocks:
+        moved = whole.moved_by(held)
+        wanted = -np.linalg.solve(own, information[np.ix_(stay, held)])
+        for column, other in zip(moved.T, wanted.T):
+            alike(column, other)
+        return
+    matrix, rows = rng.normal(size=(len(stay), 4)), rng.normal(size=(3, 4))
+    other = gaussian.in_terms_of(matrix).add_rows(rows, np.array([1.0, 2.0, 3.0]))
+    mapped = matrix.T @ own @ matrix + rows.T @ rows
+    np.testing.assert_allclose(other.common, mapped, rtol=1e-9)
+    expected = np.linalg.solve(mapped, matrix.T @ right - rows.T @ [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(other.step()[0], expected, rtol=1e-6)
+    assert other.cost == pytest.approx(whole.cost + 7.0)
+
+
+def test_a_number_is_held_and_others_are_measured(rng: Any) -> None:
+    root = rng.normal(size=(5, 5))
+    found = Estimate(rng.normal(size=5), root @ root.T)
+    information = np.linalg.inv(found.covariance)
+    held = found.hold([1, 3])
+    free = [0, 2, 4]
+    own = information[np.ix_(free, free)]
+    np.testing.assert_allclose(held.covariance[np.ix_(free, free)], np.linalg.inv(own))
+    pull = information[free][:, [1, 3]] @ found.value[[1, 3]]
+    moved = found.value[free] + np.linalg.solve(own, pull)
+    np.testing.assert_allclose(held.value[free], moved)
+    np.testing.assert_allclose(held.value[[1, 3]], 0, atol=1e-12)
+    whole, part = (x.value @ information @ x.value for x in (found, held))
+    assert found.chi_square([1, 3]) == pytest.approx(whole - part)
+    rows, onto = rng.normal(size=(2, 3, 5)), rng.normal(size=(5, 2))
+    after = [np.linalg.inv(information + a.T @ a) for a in rows]
+    saved = [np.trace(onto.T @ (found.covariance - c) @ onto) for c in after]
+    np.testing.assert_allclose(found.saved_by(rows, onto), saved)
 
 
 def test_a_view_that_is_left_out_stays_and_is_infinitely_uncertain(rng: Any) -> None:

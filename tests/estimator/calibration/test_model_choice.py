@@ -124,10 +124,11 @@ def test_the_search_finds_what_brute_force_does(fitted: Any) -> None:
     _, _, real = fitted
     options = possible(Lens({"kappa", "affine", "k1", "k2", "p"}))
     rng = np.random.default_rng(3)
-    factor = np.linalg.cholesky(real.covariance + 1e-12 * np.diag(np.diag(real.covariance)))
+    covariance = real.minimum.covariance
+    factor = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
     for _ in range(4):
         z = rng.normal(0, 1, len(factor)) + rng.choice([0, 0, 5], len(factor))
-        quadratic = replace(real, offset=factor @ z)
+        quadratic = replace(real, minimum=replace(real.minimum, value=factor @ z))
         best = min(product(options, options), key=quadratic.cost)
         assert quadratic.cost(search(quadratic, [options, options])) == quadratic.cost(best)
 
@@ -150,13 +151,13 @@ def test_what_the_views_do_not_determine_is_not_chosen(fitted: Any) -> None:
     _, _, real = fitted
     i = real.names.index((0, "k2"))
     prior = real.prior.copy()
-    prior[i] = np.sqrt(real.covariance[i, i])
-    offset = real.offset.copy()
-    offset += 10 * real.covariance[:, i] / prior[i]
+    prior[i] = real.minimum.sd[i]
+    value = real.minimum.value + 10 * real.minimum.covariance[:, i] / prior[i]
+    wants = replace(real, minimum=replace(real.minimum, value=value))
     options = [possible(RICH)] * 2
-    wanted = search(replace(real, offset=offset), options)
+    wanted = search(wants, options)
     assert "k2" in wanted[0]
-    vague = replace(real, offset=offset, prior=0.5 * prior)
+    vague = replace(wants, prior=0.5 * prior)
     assert vague.sd_over_prior(wanted, 0, "k2") > UNDETERMINED
     assert "k2" not in model_choice._determined(vague, options)[0]
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from discs import polygon_centroid
 from finding_codes import codes, only
 
 import telerig
@@ -29,6 +30,8 @@ pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
 AXIS = np.array([0.01, -1.0, 0.02]) / np.linalg.norm([0.01, -1.0, 0.02])
 TURN = rotation_from_rotvec([0.1, -0.7, 0.05])
 POSE = Pose(TURN, np.array([0.5, -1.0, 2.0]) - TURN @ [14.0, 7.0, 0.0])
+ANGLE = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+CIRCLE = np.stack([np.cos(ANGLE), np.sin(ANGLE), 0 * ANGLE], -1)
 STOPS = {"low": -5.0, "middle": 0.0, "high": 5.0, "top": 8.0}
 
 
@@ -57,12 +60,16 @@ def calibration(dataset: Dataset) -> Calibration:
 def dots(dataset: Dataset) -> pd.DataFrame:
     parts = []
     for view, stop in STOPS.items():
-        points = POSE.apply(dataset.target.nominal_mm(dataset.target.ids())) - AXIS * stop / 1.01
+        ids = dataset.target.ids()
+        places, radius = dataset.target.nominal_mm(ids), dataset.target.diameter_mm(ids) / 2
         for camera in calibration(dataset).cameras:
-            uv = camera.project(points)
+            uv = np.array([
+                polygon_centroid(camera.project(POSE.apply(p + r * CIRCLE) - AXIS * stop / 1.01))
+                for p, r in zip(places, radius)
+            ])  # fmt: skip
             parts.append(
                 pd.DataFrame(
-                    {"view": view, "camera": camera.name, "dot": dataset.target.ids(),
+                    {"view": view, "camera": camera.name, "dot": ids,
                      "u_px": uv[:, 0], "v_px": uv[:, 1], "sigma_px": 0.02}
                 )
             )  # fmt: skip

@@ -12,10 +12,11 @@ from finding_codes import codes, only
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.next_view import next_view
-from telerig.estimator.calibration.quality.comparison import _chance, compare_calibrations
+from telerig.estimator.calibration.quality.comparison import compare_calibrations
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
+from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -64,9 +65,9 @@ def test_a_movement_is_found_with_its_size(scene: Any, at_rest: list[Any]) -> No
 
 def test_chance_does_not_judge_what_the_second_order_fills() -> None:
     """A direction ten thousand times better known than the largest error is no evidence."""
-    root = np.diag([1.0, 0.2, 1e-4])
-    assert _chance(np.array([0.5, 0.1, 0.01]), root) > 0.3
-    assert _chance(np.array([0.5, 1.1, 0.01]), root) < 1e-3
+    covariance = np.diag([1.0, 0.2, 1e-4]) ** 2
+    assert Estimate(np.array([0.5, 0.1, 0.01]), covariance).p_value() > 0.3
+    assert Estimate(np.array([0.5, 1.1, 0.01]), covariance).p_value() < 1e-3
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.5])

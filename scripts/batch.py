@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from telerig.command_options import CalibrationOptions, SmoothingOptions, TrackingOptions
 from telerig.errors import InputError
 from telerig.scripts import options
 from telerig.scripts.console import (
@@ -22,9 +23,13 @@ if TYPE_CHECKING:
     from telerig.estimator.batch.jobs import Job
 
 
+@options.with_options(in_batch=True)
 @errors_in_words()
 def batch(
     datasets: Annotated[list[Path], typer.Argument(help="Dataset folders.")],
+    calibrating: CalibrationOptions,
+    tracking: TrackingOptions,
+    smoothing: SmoothingOptions,
     out: Annotated[
         Path, typer.Option(help="Folder for the journal, batch.csv and report.html.")
     ] = Path("telerig-batch"),
@@ -42,12 +47,6 @@ def batch(
     ] = "1/1",
     only: options.Only = None,
     calibration: options.GivenCalibration = None,
-    model: options.ModelHere = "auto",
-    medium: options.Medium = "air",
-    shake: options.ShakeModel = None,
-    refine_rig: options.RefineRig = False,
-    accept: options.AcceptedFaults = None,
-    cluster: options.Cluster = None,
     tracks: options.TracksOfRuns = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
@@ -65,13 +64,13 @@ def batch(
         DONE,
         Journal,
         batch_words,
-        dask_executor,
         local_executor,
         run_batch,
         summary_line,
         write_batch,
     )
-    from telerig.estimator.batch.jobs import check_options, jobs_of, shake_model, share_of
+    from telerig.estimator.batch.cluster import dask_executor
+    from telerig.estimator.batch.jobs import check_options, jobs_of, shake_of_model, share_of
 
     def tell(job: Job, record: dict[str, Any], done: int, of: int) -> None:
         say(f"[{done}/{of}] {summary_line(job, record, whole_path=same_names)}")
@@ -85,12 +84,11 @@ def batch(
     if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
         raise InputError(f"--share {share}", todo="give I/N with I from 1 to N, like 3/40")
     index, of = int(first) - 1, int(last)
-    model, shake = shake_model(model, shake, only or ())
-    check_options(calibration, model, medium)
+    calibrating, smoothing = shake_of_model(calibrating, smoothing, only or ())
+    check_options(calibration, calibrating)
     jobs = jobs_of(
-        datasets, calibration=calibration, model=model, medium=medium, shake=shake,
-        refine_rig=refine_rig, accept=accept or (), cluster=cluster, tracks=tracks, report=report,
-        only=only or (),
+        datasets, calibration=calibration, calibrating=calibrating, tracking=tracking,
+        smoothing=smoothing, tracks=tracks, report=report, only=only or (),
     )  # fmt: skip
     mine = share_of(jobs, index, of)
     places = {job.dataset for job in mine}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from telerig.command_options import CalibrationOptions
 from telerig.errors import InputError
 from telerig.scripts import options
 from telerig.scripts.console import (
@@ -29,40 +30,21 @@ if TYPE_CHECKING:
     from telerig.io.dataset.dataset import Dataset
 
 
-_SOURCES = ("images", "dots")
 _POLL_S = 1.0
 """Time between two looks into the folder that is watched."""
 
 
+@options.with_options()
 @errors_in_words()
 def calibrate(
     dataset: options.Dataset,
+    chosen: CalibrationOptions,
     out: options.CalibrationFolder = None,
-    model: options.Model = "auto",
-    dots: Annotated[
-        str,
-        typer.Option(
-            help="Where the dots may lie: 3d (estimated in space), plane (estimated in the plane "
-            "of the target) or nominal (held at their nominal places)."
-        ),
-    ] = "3d",
-    outlier_sd: Annotated[
-        float,
-        typer.Option(
-            help="Reject dots whose residual is larger than this many standard deviations; at "
-            "least 3."
-        ),
-    ] = 4.5,
-    medium: options.Medium = "air",
     compare: Annotated[
         Path | None,
         typer.Option(
             help="An earlier calibration of this rig, or its dataset: report what has moved since."
         ),
-    ] = None,
-    source: Annotated[
-        str | None,
-        typer.Option("--from", help="Use images or dots; needed if the dataset has both."),
     ] = None,
     watch: Annotated[
         bool,
@@ -108,18 +90,13 @@ def calibrate(
     from telerig.io.results.inputs import fingerprints
 
     begun = time.perf_counter()
-    settings: dict[str, Any] = {
-        "model": model, "medium": medium, "dots_free": dots, "outlier_sd": outlier_sd,
-    }  # fmt: skip
+    settings = chosen.keywords
     check_options(**settings)
-    record: dict[str, Any] = {
-        "model": model, "dots": dots, "medium": medium, "outlier_sd": outlier_sd,
-        "compare": None if compare is None else str(compare), "from": source,
-    }  # fmt: skip
+    record = {**chosen.record(), "compare": None if compare is None else str(compare)}
     with report_beside(report) as write_report:
         earlier = None if compare is None else _earlier(compare, dataset)
         if watch:
-            data, run = _watched(dataset, source, until_um, poll or _POLL_S, settings)
+            data, run = _watched(dataset, chosen.source, until_um, poll or _POLL_S, settings)
             used = None
             record |= {"watch": True, "until_um": until_um}
         else:
@@ -129,7 +106,7 @@ def calibrate(
                         f"{option} goes with --watch", todo="add --watch, or leave it out"
                     )
             begin = None if write_report is None else write_report.begin
-            data = load_dataset(dataset, source=options.chosen("--from", source, _SOURCES))
+            data = load_dataset(dataset, source=chosen.source)
             used = fingerprints(out or data.results / "calibration", sources(data))
             run = _at_once(data, quiet, settings, begin)
         folder = out or data.results / "calibration"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from telerig.command_options import TrackingOptions
 from telerig.errors import InputError
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, run_file, say, say_written
+from telerig.scripts.console import errors_in_words, progress, run_file, say, say_written
 
 
 @errors_in_words()
@@ -42,29 +43,30 @@ def correct(
     Exit code 0: corrected. 2: the correction does not fit the tracks, or they are stale; the
     message says why. 130: interrupted.
     """
+    from telerig.estimator.batch.work import default_folder, track_run
     from telerig.estimator.tracking.corrections import add_correction
     from telerig.estimator.tracking.tracks import count_words
     from telerig.io.results.stale import stale
-    from telerig.scripts.track import default_folder, track_run
 
     folder = out or default_folder(run)
     if old := stale(folder, ["tracks.csv"]):
         todo = "then correct the new tracks, which may have other ids"
         raise InputError(" ".join(old), where=str(folder), todo=todo)
-    recorded, calibration, again = _tracking(folder)
+    chosen, calibration, again = _tracking(folder)
     row = {"action": action, "particle": particle, "other": other, "frame": frame, "reason": reason}
     say(add_correction(run, folder, row))
     report = (folder / "report.html").is_file()
-    summary, _ = track_run(
-        run, folder, calibration, recorded, again=again, report=report, quiet=quiet
-    )
+    with progress(quiet) as stage:
+        summary = track_run(
+            run, folder, chosen, calibration, again=again, report=report, stage=stage
+        )
     say(count_words(summary))
     for sentence in (*(f"  warning: {w}" for w in summary["warnings"]), *stale(folder)):
         say(sentence)
     say_written(folder, report)
 
 
-def _tracking(folder: Path) -> tuple[dict[str, Any], list[Path], str]:
+def _tracking(folder: Path) -> tuple[TrackingOptions, list[Path], str]:
     """Return how the tracks in a folder were made: options, calibration, and the command line."""
     from telerig.io.results.manifest import read_manifest
     from telerig.io.results.record import RunFile
@@ -78,8 +80,8 @@ def _tracking(folder: Path) -> tuple[dict[str, Any], list[Path], str]:
             where=str(folder),
             todo="run `telerig track` first",
         )
-    recorded.pop("track", None)
-    return recorded, [folder / file for file in recorded.pop("calibration")], section.again
+    files = [folder / file for file in recorded["calibration"]]
+    return TrackingOptions.of(recorded), files, section.again
 
 
 if __name__ == "__main__":

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from telerig.command_options import Options, SmoothingOptions
 from telerig.errors import InputError
-from telerig.rig.lens_parameters import NAMES
 
 Dataset = Annotated[
     Path, typer.Argument(help="Dataset folder, with rig.toml and the views in calibration/.")
@@ -30,34 +32,6 @@ GivenCalibration = Annotated[
     Path | None,
     typer.Option(help="A calibration.json to use. Without it each dataset is calibrated."),
 ]
-Model = Annotated[
-    str,
-    typer.Option(
-        help=f"Lens model: auto chooses one per camera. Others: {', '.join(NAMES)}, or several "
-        "joined by + (k1+k2). "
-        "left=brown,right=auto gives each camera its own."
-    ),
-]
-Medium = Annotated[
-    str,
-    typer.Option(
-        help="Where the target was: air or water. With [walls] in rig.toml, runs are in water."
-    ),
-]
-ModelHere = Annotated[
-    str,
-    typer.Option(
-        help=f"Lens model: auto chooses one per camera. Others: {', '.join(NAMES)}, or several "
-        "joined by + (k1+k2). left=brown,right=auto gives each camera its own. With --only smooth "
-        "as in `telerig smooth`: auto or default."
-    ),
-]
-ShakeModel = Annotated[
-    str | None,
-    typer.Option(
-        help="Priors of the shake: auto learns what no sensor measures, default fixes them [auto]."
-    ),
-]
 Only = Annotated[
     list[str] | None,
     typer.Option(
@@ -71,29 +45,71 @@ TracksOfRuns = Annotated[
         "run's name [the results folders]."
     ),
 ]
-RefineRig = Annotated[
-    bool,
-    typer.Option(
-        "--refine-rig",
-        help="Estimate how a camera has moved against the others since the calibration.",
-    ),
-]
 AcceptedFaults = Annotated[
     list[str] | None,
-    typer.Option(
-        "--accept",
-        help="Use a sensor although it was refused: code of the fault, which the error names. Can "
-        "be given several times.",
-    ),
-]
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        help="Detect bubbles on a Dask cluster: its scheduler's address, tcp://host:port."
-    ),
+    typer.Option("--accept", help=SmoothingOptions.settings()["accept"].help),
 ]
 Report = Annotated[bool, typer.Option(help="Write report.html.")]
 Quiet = Annotated[bool, typer.Option(help="Print the summary only.")]
+
+
+def with_options(*, in_batch: bool = False) -> Callable[..., Callable[..., None]]:
+    """Decorate a command: its parameters of a class of `Options` become one option for each field.
+
+    in_batch : whether the options get the names that `run` and `batch` give them.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(command, include_extras=True)
+        taken: dict[str, dict[str, str]] = {}
+        parameters: list[inspect.Parameter] = []
+        for parameter in inspect.signature(command).parameters.values():
+            kind = hints[parameter.name]
+            if isinstance(kind, type) and issubclass(kind, Options):
+                options = _typer_options(kind, in_batch)
+                parameters += [one for _, one in options]
+                taken[parameter.name] = {field: one.name for field, one in options}
+            else:
+                parameters.append(parameter.replace(annotation=kind))
+        for i, parameter in enumerate(parameters):
+            if parameter.default is not inspect.Parameter.empty:
+                parameters[i] = parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        parameters.sort(key=lambda p: p.kind)
+
+        def spread(**given: Any) -> None:
+            for name, fields in taken.items():
+                values = {field: given.pop(option) for field, option in fields.items()}
+                lists = {f: tuple(values[f] or ()) for f in values if hints[name].repeats(f)}
+                given[name] = hints[name](**values | lists)
+            command(**given)
+
+        spread.__doc__, spread.__name__ = command.__doc__, command.__name__
+        spread.__module__ = command.__module__
+        spread.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        spread.__annotations__ = {p.name: p.annotation for p in parameters}
+        return spread
+
+    return decorate
+
+
+def _typer_options(kind: type[Options], in_batch: bool) -> list[tuple[str, inspect.Parameter]]:
+    """Return the name of each field and the parameter by which the command line gives it."""
+    hints, found = get_type_hints(kind), []
+    for field, setting in kind.settings().items():
+        flags = (setting.in_batch,) if in_batch else setting.flags
+        if not all(flags):
+            continue
+        default, type_ = getattr(kind, field), hints[field]
+        if kind.repeats(field):
+            default, type_ = None, list[str] | None
+        words = f"{setting.help} {setting.also_there}" if in_batch else setting.help
+        name = flags[0].strip("-").replace("-", "_") if in_batch else field
+        parameter = inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=default,
+            annotation=Annotated[type_, typer.Option(*flags, help=words.strip())],
+        )  # fmt: skip
+        found.append((field, parameter))
+    return found
 
 
 def split_names(text: str | None) -> list[str] | None:
@@ -113,11 +129,3 @@ def numbers_of(option: str, text: str, count: int, separator: str, todo: str) ->
     if len(numbers) != count:
         raise InputError(f"{option} {text}: {count} numbers are needed", todo=todo)
     return numbers
-
-
-def chosen(option: str, text: str | None, choices: tuple[str, ...]) -> Any:
-    """Return the text of an option, or None. Raises InputError if it is none of ``choices``."""
-    if text is not None and text not in choices:
-        todo = "use " + " or ".join(f"{option} {word}" for word in choices)
-        raise InputError(f"{option} {text}: there is no such choice", todo=todo)
-    return text

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from telerig.command_options import CalibrationOptions, SmoothingOptions, TrackingOptions
 from telerig.errors import TelerigError
 from telerig.scripts import options
 from telerig.scripts.console import (
@@ -21,17 +22,15 @@ if TYPE_CHECKING:
     from telerig.estimator.batch.jobs import Job
 
 
+@options.with_options(in_batch=True)
 @errors_in_words()
 def run(
     dataset: options.Dataset,
+    calibrating: CalibrationOptions,
+    tracking: TrackingOptions,
+    smoothing: SmoothingOptions,
     calibration: options.GivenCalibration = None,
     only: options.Only = None,
-    model: options.ModelHere = "auto",
-    medium: options.Medium = "air",
-    shake: options.ShakeModel = None,
-    refine_rig: options.RefineRig = False,
-    accept: options.AcceptedFaults = None,
-    cluster: options.Cluster = None,
     tracks: options.TracksOfRuns = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
@@ -45,14 +44,13 @@ def run(
     used. 130: interrupted; the same command continues.
     """
     from telerig.estimator.batch.batch import DONE, FAILED, LEFT_OUT, batch_words, failure
-    from telerig.estimator.batch.jobs import check_options, jobs_of, shake_model
+    from telerig.estimator.batch.jobs import check_options, jobs_of, shake_of_model
 
-    model, shake = shake_model(model, shake, only or ())
-    check_options(calibration, model, medium)
+    calibrating, smoothing = shake_of_model(calibrating, smoothing, only or ())
+    check_options(calibration, calibrating)
     jobs = jobs_of(
-        [dataset], calibration=calibration, only=only or (), model=model, medium=medium,
-        shake=shake, refine_rig=refine_rig, accept=accept or (), cluster=cluster, tracks=tracks,
-        report=report, strict=True,
+        [dataset], calibration=calibration, only=only or (), calibrating=calibrating,
+        tracking=tracking, smoothing=smoothing, tracks=tracks, report=report, strict=True,
     )  # fmt: skip
     records: dict[str, dict[str, Any]] = {}
     for job in jobs:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from telerig.command_options import SmoothingOptions
 from telerig.errors import TelerigError
 from telerig.scripts import options
 from telerig.scripts.console import (
@@ -21,9 +22,11 @@ from telerig.scripts.console import (
 )
 
 
+@options.with_options()
 @errors_in_words()
 def smooth(
     runs: options.Runs,
+    chosen: SmoothingOptions,
     calibration: options.CalibrationFiles = None,
     tracks: Annotated[
         Path | None,
@@ -39,16 +42,6 @@ def smooth(
             "run gets a folder."
         ),
     ] = None,
-    model: Annotated[
-        str,
-        typer.Option(
-            "--model",
-            "--shake",
-            help="Priors of the shake: auto learns what no sensor measures, default fixes them.",
-        ),
-    ] = "auto",
-    refine_rig: options.RefineRig = False,
-    accept: options.AcceptedFaults = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
@@ -73,11 +66,10 @@ def smooth(
     for run, name in zip(runs, names):
         try:
             _smooth_one(
-                run, calibration,
+                run, chosen, calibration,
                 tracks / name if several and tracks else tracks,
                 out / name if several and out else out,
-                model=model, refine_rig=refine_rig, accept=accept or [], report=report, quiet=quiet,
-                again="" if several else typed_command(), titled=several,
+                report=report, quiet=quiet, several=several,
             )  # fmt: skip
         except TelerigError as error:
             if not several:
@@ -93,55 +85,39 @@ def smooth(
 
 def _smooth_one(
     run: Path,
+    chosen: SmoothingOptions,
     calibration: list[Path] | None,
     tracks: Path | None,
     out: Path | None,
     *,
-    model: str,
-    refine_rig: bool,
-    accept: list[str],
     report: bool,
     quiet: bool,
-    again: str,
-    titled: bool,
+    several: bool,
 ) -> None:
     """Smooth a run, write its results and say what was found.
 
-    again : the command that makes the results again; "" for one with the options given here.
-    titled : whether the run is named before what was found.
+    several : whether the command smooths other runs, too, so that the run is named.
     """
-    from telerig.estimator.calibration.result.calibration import calibration_for
-    from telerig.estimator.smoothing.results_folder import smooth_run
+    from telerig.estimator.batch.jobs import command_line
+    from telerig.estimator.batch.work import default_folder, smooth_run
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
-    from telerig.io.dataset.run import load_run
-    from telerig.scripts.track import cameras_without_rig, default_folder
 
-    calibrated, files = calibration_for(run, calibration)
     folder = out or default_folder(run)
     own = folder if (folder / "tracks.csv").is_file() else default_folder(run)
-    words = ["telerig", "smooth", str(run)]
-    for option, value in (("--calibration", calibration), ("--tracks", tracks), ("--out", out)):
-        for path in value if isinstance(value, list) else [value] if value else []:
-            words += [option, str(path)]
-    words += [f"--model={model}", *(["--refine-rig"] if refine_rig else [])]
-    words += [word for code in accept for word in ("--accept", code)]
+    given: dict[str, Sequence[Path | None]] = {
+        "--calibration": calibration or [], "--tracks": [tracks], "--out": [out]
+    }  # fmt: skip
+    again = command_line("smooth", str(run), chosen, given, report=report)
     with progress(quiet) as stage:
-        stage("reading the run", 0, 1)
-        # tracks are smoothed: it does not matter whether a run with both has images or detections
-        data = load_run(
-            run, source="detections" if (run / "detections.csv").is_file() else None,
-            **cameras_without_rig(run, calibrated),
-        )  # fmt: skip
         found = smooth_run(
-            data, calibrated, tracks or own, folder, model=model, inputs=files,
-            refine_rig=refine_rig, accept=accept, report=report, stage=stage,
-            again=again or shlex.join(words),
+            run, folder, chosen, calibration, tracks=tracks or own, report=report, stage=stage,
+            again=again if several else typed_command(),
         )  # fmt: skip
-    if titled:
+    if several:
         say(f"{run}:")
     say(smoothing_words(found))
     say_written(folder, report and (folder / "report.html").is_file())
-    if titled:
+    if several:
         say("")
 
 

@@ -43,17 +43,13 @@ def validate(
     Exit code 0: the marks stand still within the stated standard deviations. 1: they do not. 2:
     the input cannot be used. 130: interrupted.
     """
+    from telerig.estimator.batch.work import default_folder, load_tracked_run
     from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.smoothing.validate import validate_run
-    from telerig.io.dataset.run import load_run
     from telerig.io.results.validation import Stillness, table_words, validation_words
-    from telerig.scripts.track import cameras_without_rig, default_folder
 
     calibrated, files = calibration_for(run, calibration)
-    data = load_run(
-        run, source="detections" if (run / "detections.csv").is_file() else None,
-        **cameras_without_rig(run, calibrated),
-    )  # fmt: skip
+    data = load_tracked_run(run, calibrated)
     folder = out or default_folder(run)
     with progress(quiet) as stage:
         found = validate_run(

@@ -19,18 +19,20 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from telerig.command_options import CalibrationOptions, SmoothingOptions, TrackingOptions
 from telerig.errors import InputError, TelerigWarning
 from telerig.estimator.batch.jobs import Job, check_run_name
+from telerig.estimator.batch.work import calibrate_dataset, smooth_run, track_run
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
@@ -173,22 +175,12 @@ def failure(status: str, words: str) -> dict[str, Any]:
 
 def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
     """Calibrate a dataset and write its results."""
-    from telerig.estimator.calibration.calibrate import run_calibration
-    from telerig.estimator.calibration.results_folder import sources, write_report, write_results
-    from telerig.io.dataset.dataset import load_dataset
     from telerig.io.results.findings import objections
-    from telerig.io.results.inputs import fingerprints
 
-    begun = time.perf_counter()
-    data = load_dataset(Path(job.dataset))
-    used = fingerprints(job.results, sources(data))
-    run = run_calibration(data, model=job.model, medium=job.medium, stage=stage, pictures=True)
-    found = run.calibration
-    write_results(
-        data, run, job.results, command="run",
-        options={"model": job.model, "medium": job.medium},
-        seconds={"calibrate": time.perf_counter() - begun},
-        report=write_report if job.report else None, used=used, again=job.command,
+    assert isinstance(job.options, CalibrationOptions)
+    found = calibrate_dataset(
+        Path(job.dataset), job.results, job.options, again=job.command, report=job.report,
+        stage=stage,
     )  # fmt: skip
     verdict, against = found.verdict, objections(found.findings or ())
     figures = {
@@ -204,27 +196,15 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
     """Track a run and write its results."""
-    from telerig.estimator.calibration.result.calibration import calibration_for
-    from telerig.estimator.tracking.results_folder import write_tracking
-    from telerig.estimator.tracking.track import TrackOptions
     from telerig.estimator.tracking.tracks import tracking_words
-    from telerig.io.dataset.run import load_run
 
-    begun = time.perf_counter()
-    run = Path(job.dataset) / "runs" / job.run
+    assert isinstance(job.options, TrackingOptions)
+    begun, run = time.perf_counter(), Path(job.where)
     check_run_name(run)
-    calibration, files = calibration_for(run, [Path(job.calibration)] if job.calibration else None)
-    options = TrackOptions()
-    record = {
-        "command": "run", "options": {"min_diameter_px": options.min_diameter_px}, "inputs": files,
-        "again": job.command,
-    }  # fmt: skip
-    chosen = dask_executor(job.cluster, "--cluster") if job.cluster else nullcontext()
-    with chosen as executor:
-        summary = write_tracking(
-            load_run(run), calibration, job.results, options=options, record=record,
-            report=job.report, stage=stage, executor=executor,
-        )  # fmt: skip
+    summary = track_run(
+        run, job.results, job.options, job.calibrations, again=job.command, report=job.report,
+        stage=stage,
+    )  # fmt: skip
     figures = {name: summary[name] for name in ("frames", "detections", "points", "tracks")}
     words = tracking_words(summary, time.perf_counter() - begun)
     return {"status": DONE, "words": words, "figures": figures}
@@ -232,20 +212,12 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
     """Smooth a tracked run and write its results."""
-    from telerig.estimator.calibration.result.calibration import calibration_for
-    from telerig.estimator.smoothing.results_folder import smooth_run
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
-    from telerig.io.dataset.run import load_run
 
-    run = Path(job.dataset) / "runs" / job.run
-    calibration, files = calibration_for(run, [Path(job.calibration)] if job.calibration else None)
-    source: Literal["detections"] | None = (
-        "detections" if (run / "detections.csv").is_file() else None
-    )
+    assert isinstance(job.options, SmoothingOptions)
     found = smooth_run(
-        load_run(run, source=source), calibration, Path(job.tracks or job.results), job.results,
-        model=job.shake, refine_rig=job.refine_rig, accept=job.accept, inputs=files,
-        report=job.report, stage=stage, again=job.command,
+        Path(job.where), job.results, job.options, job.calibrations, again=job.command,
+        tracks=Path(job.tracks or job.results), report=job.report, stage=stage,
     )  # fmt: skip
     table = found.trajectories
     figures: dict[str, Any] = {
@@ -293,7 +265,7 @@ class Journal:
         record = self.read(job)
         if record is None or record.get("status") != DONE or not is_whole(job.result):
             return None
-        same = (record.get("options"), record.get("telerig")) == (job.options, VERSION)
+        same = (record.get("options"), record.get("telerig")) == (job.asked, VERSION)
         manifest = read_manifest(job.results)
         section = None if manifest is None else manifest.sections.get(job.kind)
         fresh = section is not None and not section.changes(job.results, alone=False)
@@ -311,7 +283,7 @@ class Journal:
         """Write the result of a job to the journal and return the record."""
         record = {
             "kind": job.kind, "dataset": job.dataset, "run": job.run, **result,
-            "options": job.options,
+            "options": job.asked,
             "telerig": VERSION,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         }  # fmt: skip
@@ -419,8 +391,6 @@ Tell = Callable[[Job, dict[str, Any], int, int], None]
 """Function that is called after each job with (job, its record, number of jobs done, number of
 jobs)."""
 
-_CONNECT_S = 20
-
 
 def run_batch(
     jobs: Sequence[Job], executor: Executor, journal: Journal, *, tell: Tell | None = None
@@ -507,39 +477,3 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def dask_executor(address: str, option: str = "--scheduler") -> Iterator[Executor]:
-    """Give an executor that uses the workers of a running Dask cluster.
-
-    The datasets must be at the same paths on every worker. If a worker dies, another one does its
-    job again, as often as the cluster's setting allowed-failures permits.
-
-    address : tcp://host:port of the scheduler. option : name of the command-line option with which
-    the user gave the address, for messages.
-    Raises InputError if Dask is not installed, if no scheduler answers, or if the scheduler has no
-    workers.
-    """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError(
-            "Dask is not installed", where=f"{option} {address}",
-            todo="pip install 'telerig[cluster]'",
-        ) from error  # fmt: skip
-    try:
-        client = Client(address, timeout=_CONNECT_S)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise InputError(
-            f"no Dask scheduler answers: {error}", where=f"{option} {address}",
-            todo="start one with `dask scheduler` and workers with `dask worker ADDRESS "
-            "--nthreads 1`, and give the address that it prints",
-        ) from error  # fmt: skip
-    with client:
-        if not client.scheduler_info()["workers"]:
-            raise InputError(
-                "the scheduler has no workers", where=f"{option} {address}",
-                todo="start some with `dask worker ADDRESS --nthreads 1`",
-            )  # fmt: skip
-        yield client.get_executor(pure=False)

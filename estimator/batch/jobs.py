@@ -8,16 +8,20 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, cast, get_args
 
+from telerig.command_options import (
+    KINDS,
+    CalibrationOptions,
+    Kind,
+    Options,
+    ShakePriors,
+    SmoothingOptions,
+    TrackingOptions,
+)
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.files.names import absent
-
-Kind = Literal["calibrate", "track", "smooth"]
-KINDS: tuple[Kind, ...] = ("calibrate", "track", "smooth")
-SHAKE_MODELS = ("auto", "default")
-"""The priors of the shake that `telerig smooth --model` can name."""
 
 MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
 RESERVED = "calibration"
@@ -28,11 +32,9 @@ RESERVED = "calibration"
 class Job:
     """The calibration of one dataset, or the tracking or smoothing of one run; paths are text.
 
+    options : the options of its kind.
     run : name of the run; "" for a calibration.
     calibration : calibration.json to use; "" for that of the dataset.
-    model, medium : options of a calibration, see `telerig.calibrate`.
-    shake, refine_rig, accept : options of a smoothing, see `telerig.smooth`.
-    cluster : address of the Dask scheduler whose workers detect bubbles; "" for this computer.
     tracks : tracks.csv or its folder; "" for the run's results folder.
     report : whether to write report.html.
     only_report : whether to write nothing else.
@@ -41,14 +43,9 @@ class Job:
 
     kind: Kind
     dataset: str
+    options: Options
     run: str = ""
     calibration: str = ""
-    model: str = "auto"
-    medium: str = "air"
-    shake: str = "auto"
-    refine_rig: bool = False
-    accept: tuple[str, ...] = ()
-    cluster: str = ""
     tracks: str = ""
     report: bool = True
     only_report: bool = False
@@ -65,6 +62,11 @@ class Job:
     def where(self) -> str:
         """The place of the data, for messages."""
         return f"{self.dataset}/runs/{self.run}" if self.run else self.dataset
+
+    @property
+    def calibrations(self) -> list[Path] | None:
+        """The calibration to use; None for that of the dataset."""
+        return [Path(self.calibration)] if self.calibration else None
 
     @property
     def results(self) -> Path:
@@ -84,27 +86,14 @@ class Job:
     @property
     def command(self) -> str:
         """The command line that does the same as the job."""
-        words = ["telerig", self.kind, self.where]
-        if self.calibration:
-            words += ["--calibration", self.calibration]
-        if self.kind == "calibrate":
-            words += [f"--model={self.model}", f"--medium={self.medium}"]
-        if self.kind == "track" and self.cluster:
-            words += ["--cluster", self.cluster]
-        if self.kind == "smooth":
-            words += self._smoothing_options()
-        return shlex.join(words if self.report else [*words, "--no-report"])
-
-    def _smoothing_options(self) -> list[str]:
-        words = ["--tracks", self.tracks] if self.tracks else []
-        words += [f"--model={self.shake}"] if self.shake != "auto" else []
-        words += ["--refine-rig"] if self.refine_rig else []
-        return [*words, *(word for code in self.accept for word in ("--accept", code))]
+        places = {"--calibration": [self.calibration], "--tracks": [self.tracks]}
+        return command_line(self.kind, self.where, self.options, places, report=self.report)
 
     @property
-    def options(self) -> str:
+    def asked(self) -> str:
         """Return as text what the result depends on besides the inputs and the version."""
-        return replace(self, report=True, only_report=False, cluster="").as_json()
+        same = replace(self, options=type(self.options)(), report=True, only_report=False)
+        return same.as_json() + json.dumps(self.options.record())
 
     def as_json(self) -> str:
         """Return the job as one line of JSON."""
@@ -114,19 +103,36 @@ class Job:
     def from_json(cls, line: str) -> Job:
         """Return the job that `as_json` has written."""
         content = json.loads(line)
-        return cls(**{**content, **{key: tuple(content[key]) for key in ("needs", "accept")}})
+        options = {k: tuple(v) if isinstance(v, list) else v for k, v in content["options"].items()}
+        made = {"options": KINDS[content["kind"]](**options), "needs": tuple(content["needs"])}
+        return cls(**{**content, **made})
+
+
+def command_line(
+    kind: Kind,
+    where: str,
+    options: Options,
+    places: Mapping[str, Iterable[Any]],
+    *,
+    report: bool = True,
+) -> str:
+    """Return the command line of a kind of job.
+
+    where : the dataset or the run. places : the folders and files of each option that names some;
+    those that are empty or None are left out.
+    """
+    named = [word for option, of in places.items() for one in of if one for word in (option, one)]
+    words = ["telerig", kind, where, *map(str, named), *options.words()]
+    return shlex.join(words if report else [*words, "--no-report"])
 
 
 def jobs_of(
     datasets: Iterable[Path],
     *,
     calibration: Path | None = None,
-    model: str = "auto",
-    medium: str = "air",
-    shake: str = "auto",
-    refine_rig: bool = False,
-    accept: Sequence[str] = (),
-    cluster: str | None = None,
+    calibrating: CalibrationOptions | None = None,
+    tracking: TrackingOptions | None = None,
+    smoothing: SmoothingOptions | None = None,
     tracks: Path | None = None,
     report: bool = True,
     only: Sequence[str] = (),
@@ -138,7 +144,8 @@ def jobs_of(
     calibrated before.
 
     calibration : a calibration.json to use for all datasets, none of which is then calibrated.
-    model, medium, shake, refine_rig, accept, cluster, report : see `Job`.
+    calibrating, tracking, smoothing : options of the kinds of jobs; None for the defaults.
+    report : see `Job`.
     tracks : folder with a folder of tracks for each run, if nothing is tracked; None for the
         results folders.
     only : kinds of jobs (`KINDS`) and names of runs to do; all if empty.
@@ -155,24 +162,23 @@ def jobs_of(
             todo="add --only smooth, or leave --tracks out",
         )
     places = _checked(datasets)
+    options: dict[Kind, Options] = {
+        "calibrate": calibrating or CalibrationOptions(),
+        "track": tracking or TrackingOptions(),
+        "smooth": smoothing or SmoothingOptions(),
+    }
     shared: dict[str, Any] = {
         "calibration": "" if calibration is None else str(Path(calibration).resolve()),
-        "model": model,
-        "medium": medium,
-        "shake": shake,
-        "refine_rig": refine_rig,
-        "accept": tuple(accept),
-        "cluster": cluster or "",
         "report": report,
     }
     jobs: list[Job] = []
     for place in places:
         try:
-            jobs += _jobs_of_one(place, kinds, only, shared)
+            jobs += _jobs_of_one(place, kinds, only, options, shared)
         except InputError:
             if strict:
                 raise
-            jobs.append(Job("calibrate", str(place), **shared))
+            jobs.append(Job("calibrate", str(place), options["calibrate"], **shared))
     _check_only(jobs, only)
     return jobs if tracks is None else _with_tracks(jobs, tracks)
 
@@ -184,26 +190,29 @@ def kinds_and_runs(only: Iterable[str]) -> tuple[tuple[Kind, ...], list[str]]:
     """
     words = list(only)
     kinds = tuple(kind for kind in KINDS if kind in words)
-    return kinds or KINDS, [word for word in words if word not in KINDS]
+    return kinds or tuple(KINDS), [word for word in words if word not in KINDS]
 
 
-def shake_model(model: str, shake: str | None, only: Iterable[str]) -> tuple[str, str]:
-    """Return the lens model and the shake's priors that `--model` and `--shake` mean.
+def shake_of_model(
+    calibrating: CalibrationOptions, smoothing: SmoothingOptions, only: Iterable[str]
+) -> tuple[CalibrationOptions, SmoothingOptions]:
+    """Return the options as `run` and `batch` mean them.
 
-    Where only smoothing is done, `--model` has the meaning that it has for `telerig smooth`. Raises
-    InputError for unknown priors, and for a model of jobs that are not done.
+    Where only smoothing is done, `--model` has the meaning that it has for `telerig smooth`, unless
+    `--shake` is given, too. Raises InputError for a model of jobs that are not done.
     """
-    smooths_only = kinds_and_runs(only)[0] == ("smooth",)
-    if smooths_only and shake is None:
-        model, shake = "auto", model
-    elif model == "default":
+    plain = CalibrationOptions.model
+    if kinds_and_runs(only)[0] == ("smooth",):
+        if smoothing.model == SmoothingOptions.model:
+            if calibrating.model not in get_args(ShakePriors):
+                todo = f"with --only smooth use one of: {', '.join(get_args(ShakePriors))}"
+                raise InputError(f"--model {calibrating.model} names no priors", todo=todo)
+            smoothing = replace(smoothing, model=cast(ShakePriors, calibrating.model))
+        return replace(calibrating, model=plain), smoothing
+    if calibrating.model == "default":
         todo = "give --shake default for the shake's priors; --model names a lens model here"
         raise InputError("--model default is no lens model", todo=todo)
-    if (shake or "auto") not in SHAKE_MODELS:
-        option = "--model" if smooths_only else "--shake"
-        todo = f"use one of: {', '.join(SHAKE_MODELS)}"
-        raise InputError(f"{option} {shake}: there is no such choice", todo=todo)
-    return model, shake or "auto"
+    return calibrating, smoothing
 
 
 def _with_tracks(jobs: Sequence[Job], tracks: Path) -> list[Job]:
@@ -231,20 +240,26 @@ def check_distinct(folders: Sequence[str], option: str) -> None:
 
 
 def _jobs_of_one(
-    place: Path, kinds: Sequence[Kind], only: Sequence[str], shared: Mapping[str, Any]
+    place: Path,
+    kinds: Sequence[Kind],
+    only: Sequence[str],
+    options: Mapping[Kind, Options],
+    shared: Mapping[str, Any],
 ) -> list[Job]:
     given = bool(shared["calibration"])
     calibrated_before = (place / "results" / "calibration" / "calibration.json").is_file()
     calibrates = "calibrate" in kinds and not given
     data = load_dataset(place, need_views=calibrates and not calibrated_before)
-    jobs = [Job("calibrate", str(place), **shared)] if data.views and calibrates else []
+    jobs = []
+    if data.views and calibrates:
+        jobs.append(Job("calibrate", str(place), options["calibrate"], **shared))
     calibrated = tuple(job.name for job in jobs)
     for run in data.runs:
         if only and run not in only:
             continue
         needs = calibrated
-        for kind in (kind for kind in KINDS[1:] if kind in kinds):
-            jobs.append(Job(kind, str(place), run, needs=needs, **shared))
+        for kind in (kind for kind in kinds if kind != "calibrate"):
+            jobs.append(Job(kind, str(place), options[kind], run, needs=needs, **shared))
             needs = (*needs, jobs[-1].name)
     return jobs
 
@@ -290,17 +305,15 @@ def check_run_name(run: Path) -> None:
         )  # fmt: skip
 
 
-def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
-    """Raise InputError for a calibration that does not exist, an unknown lens model or medium."""
+def check_options(calibration: Path | None, options: CalibrationOptions) -> None:
+    """Raise InputError for a calibration that does not exist, and for options of no calibration."""
     from telerig.errors import CalibrationError
-    from telerig.estimator.calibration.calibrate import checked_medium
-    from telerig.rig.lens_parameters import checked_model
+    from telerig.estimator.calibration.calibrate import check_options as check
 
     if calibration is not None and not Path(calibration).exists():
         todo = "give the calibration.json that `telerig calibrate` wrote"
         raise absent(Path(calibration), "calibration", todo)
     try:
-        checked_model(model)
+        check(**options.keywords)
     except CalibrationError as error:
-        raise InputError(f"--model {model}", todo=error.todo) from error
-    checked_medium(medium)
+        raise InputError(f"--model {options.model}", todo=error.todo) from error

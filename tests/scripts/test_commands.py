@@ -19,9 +19,7 @@ import tifffile
 from typer.testing import CliRunner
 
 import telerig
-from telerig.estimator.calibration.calibrate import run_calibration
 from telerig.scripts import console
-from telerig.scripts.calibrate import calibrate as calibrate_command
 from telerig.scripts.main import app
 
 pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
@@ -188,14 +186,6 @@ def test_a_truncated_image_and_one_of_another_size_are_refused_and_nothing_is_wr
 def test_unknown_preset_and_model_are_named(paper_images, tmp_path):
     assert "paper" in run("simulate", "papper", "--out", tmp_path / "x", code=2)
     assert "radial" in run("calibrate", paper_images, "--model", "radail", code=2)
-
-
-def test_calibrate_as_a_command_and_from_python_have_the_same_defaults() -> None:
-    command = inspect.signature(calibrate_command).parameters
-    python = inspect.signature(run_calibration).parameters
-    same = {name: name for name in ("model", "medium", "outlier_sd")}
-    for option, parameter in (same | {"dots": "dots_free"}).items():
-        assert command[option].default == python[parameter].default, option
 
 
 def test_bubbles_of_single_images(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from batch_dataset import make_dataset, outcome_here
 from typer.testing import CliRunner
 
+from telerig.command_options import CalibrationOptions
 from telerig.estimator.batch import batch as work
 from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
 from telerig.estimator.batch.jobs import Job, jobs_of, share_of
@@ -168,7 +169,7 @@ def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path, mo
 
 
 def test_a_folder_that_this_machine_does_not_see_is_named(tmp_path):
-    result = perform(Job("calibrate", str(tmp_path / "elsewhere")))
+    result = perform(Job("calibrate", str(tmp_path / "elsewhere"), CalibrationOptions()))
     assert result["status"] == "failed"
     assert "elsewhere" in result["words"] and "available there" in result["words"]
 

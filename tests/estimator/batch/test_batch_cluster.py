@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from telerig.errors import InputError
-from telerig.estimator.batch import batch
-from telerig.estimator.batch.batch import Journal, dask_executor, local_executor, run_batch
+from telerig.estimator.batch import cluster as connecting
+from telerig.estimator.batch.batch import Journal, local_executor, run_batch
+from telerig.estimator.batch.cluster import dask_executor
 from telerig.estimator.batch.jobs import jobs_of
 from telerig.io.simulation.simulate import simulate
 
@@ -79,7 +80,7 @@ def _kill_a_busy_worker(cluster, killed: list[int]) -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_an_error_in_words(monkeypatch):
-    monkeypatch.setattr(batch, "_CONNECT_S", 1)
+    monkeypatch.setattr(connecting, "_CONNECT_S", 1)
     with (
         pytest.raises(InputError, match="no Dask scheduler answers"),
         dask_executor("tcp://127.0.0.1:9"),

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from batch_dataset import make_dataset
 
+from telerig.command_options import CalibrationOptions
 from telerig.estimator.batch import batch as work
 from telerig.estimator.batch.batch import Journal, local_executor, perform, run_batch
 from telerig.estimator.batch.jobs import Job, jobs_of
@@ -96,7 +97,7 @@ def test_an_interrupted_job_takes_its_temporary_files_away(tmp_path, monkeypatch
     before = signal.signal(signal.SIGINT, handler)
     try:
         with pytest.raises(KeyboardInterrupt), local_executor(1) as executor:
-            executor.submit(perform, Job("calibrate", str(tmp_path)))
+            executor.submit(perform, Job("calibrate", str(tmp_path), CalibrationOptions()))
             deadline = time.monotonic() + 20
             while not list(tmp_path.glob(".results.*.part/x")):
                 assert time.monotonic() < deadline

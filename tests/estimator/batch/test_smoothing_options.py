@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import shlex
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +14,15 @@ import pytest
 from typer.testing import CliRunner
 
 import telerig
+from telerig.command_options import (
+    CalibrationOptions,
+    Options,
+    SmoothingOptions,
+    TrackingOptions,
+)
 from telerig.errors import InputError
-from telerig.estimator.batch.jobs import Job, jobs_of, shake_model
+from telerig.estimator.batch.jobs import Job, jobs_of, shake_of_model
+from telerig.estimator.calibration.calibrate import run_calibration
 from telerig.estimator.smoothing import results_folder
 from telerig.scripts.main import app
 
@@ -104,27 +114,61 @@ def test_jobs_are_chosen_by_kind_and_run(data: Path) -> None:
 
 def test_a_job_says_the_command_that_does_the_same(tank: Path) -> None:
     (job,) = jobs_of(
-        [tank], only=["smooth"], shake="default", refine_rig=True, accept=["A", "B"],
+        [tank], only=["smooth"], smoothing=SmoothingOptions("default", True, ("A", "B")),
         tracks=Path("/t"), report=False,
     )  # fmt: skip
     assert job.command == (
         f"telerig smooth {tank}/runs/rise --tracks /t/rise --model=default --refine-rig "
-        "--accept A --accept B --no-report"
+        "--accept=A --accept=B --no-report"
     )
     assert Job.from_json(job.as_json()) == job
 
 
 def test_model_means_the_shake_where_only_smoothing_is_done() -> None:
-    assert shake_model("default", None, ["smooth"]) == ("auto", "default")
-    assert shake_model("auto", None, ["smooth", "rise"]) == ("auto", "auto")
-    assert shake_model("radial", "default", []) == ("radial", "default")
-    for model, shake, only, words in (
-        ("default", None, [], "give --shake default"),
-        ("radial", None, ["smooth"], "--model radial: there is no such choice"),
-        ("auto", "rough", [], "--shake rough: there is no such choice"),
+    for model, shake, only, expected in (
+        ("default", "auto", ["smooth"], ("auto", "default")),
+        ("auto", "auto", ["smooth", "rise"], ("auto", "auto")),
+        ("auto", "default", ["smooth"], ("auto", "default")),
+        ("radial", "default", [], ("radial", "default")),
     ):
-        with pytest.raises(InputError, match=words):
-            shake_model(model, shake, only)
+        found = shake_of_model(CalibrationOptions(model), SmoothingOptions(shake), only)  # type: ignore[arg-type]
+        assert (found[0].model, found[1].model) == expected
+    for model, only in (("default", []), ("radial", ["smooth"])):
+        with pytest.raises(InputError, match=f"--model {model}"):
+            shake_of_model(CalibrationOptions(model), SmoothingOptions(), only)
+
+
+@pytest.mark.parametrize(
+    ("options", "function"),
+    [
+        (CalibrationOptions("radial", "plane", 5.0, "water"), run_calibration),
+        (SmoothingOptions("default", True, ("A",)), telerig.smooth),
+    ],
+)
+def test_the_functions_have_the_defaults_of_the_command_line(
+    options: Options, function: Callable[..., Any]
+) -> None:
+    defaults = {n: p.default for n, p in inspect.signature(function).parameters.items()}
+    assert {name: defaults[name] for name in options.keywords} == type(options)().keywords
+
+
+def test_options_are_kept_in_the_record_and_in_words() -> None:
+    for options in (
+        CalibrationOptions("radial", "plane", 5.0, "water", "dots"),
+        TrackingOptions(5.0, "images", "0:100"),
+        SmoothingOptions("default", True, ("A", "B")),
+    ):
+        assert type(options).of(json.loads(json.dumps(options.record()))) == options
+        assert not type(options)().words()
+    words = TrackingOptions(5.0, frames="0:100", cluster="tcp://here:1").words()
+    assert words == ["--min-diameter=5.0", "--frames=0:100", "--cluster=tcp://here:1"]
+
+
+def test_a_changed_option_of_one_kind_leaves_the_others_done(data: Path) -> None:
+    before = jobs_of([data])
+    after = jobs_of([data], smoothing=SmoothingOptions(refine_rig=True))
+    same = [(a.kind, a.asked == b.asked) for a, b in zip(before, after)]
+    assert set(same) == {("calibrate", True), ("track", True), ("smooth", False)}
 
 
 def test_one_folder_for_two_runs_is_refused(tank: Path, tmp_path: Path) -> None:
@@ -140,14 +184,17 @@ def test_one_folder_for_two_runs_is_refused(tank: Path, tmp_path: Path) -> None:
 def test_a_cluster_is_named_where_runs_are_tracked(
     data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from telerig.estimator.batch import batch
+    from telerig.estimator.batch import cluster
     from telerig.estimator.batch.batch import do_job
 
-    monkeypatch.setattr(batch, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
     address = "tcp://127.0.0.1:1"
-    here, there = (jobs_of([data], only=["track"], cluster=c) for c in (None, address))
-    assert all(job.command.endswith(f"--cluster {address}") for job in there)
-    assert [job.options for job in here] == [job.options for job in there]
+    here, there = (
+        jobs_of([data], only=["track"], tracking=TrackingOptions(cluster=c))
+        for c in (None, address)
+    )
+    assert all(job.command.endswith(f"--cluster={address}") for job in there)
+    assert [job.asked for job in here] == [job.asked for job in there]
     assert Job.from_json(there[0].as_json()) == there[0]
     with pytest.raises(InputError, match="Dask"):
         do_job(there[0], None)

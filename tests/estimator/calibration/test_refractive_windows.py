@@ -21,6 +21,7 @@ from ray_tracer import trace_pixels
 from typer.testing import CliRunner
 
 import telerig
+from telerig.command_options import CalibrationOptions
 from telerig.errors import InputError
 from telerig.estimator.batch.jobs import Job, check_options, jobs_of
 from telerig.estimator.calibration.calibrate import run_calibration
@@ -339,11 +340,11 @@ def test_rig_toml_states_the_wall(tank: Path, tmp_path: Path) -> None:
 
 
 def test_run_and_batch_pass_the_medium_on(tank: Path) -> None:
-    jobs = jobs_of([tank], medium="water")
-    assert {job.medium for job in jobs} == {"water"}
+    jobs = jobs_of([tank], calibrating=CalibrationOptions(medium="water"))
+    assert isinstance(jobs[0].options, CalibrationOptions) and jobs[0].options.medium == "water"
     assert Job.from_json(jobs[0].as_json()) == jobs[0]
     with pytest.raises(InputError, match="unknown medium 'oil'"):
-        check_options(None, "auto", "oil")
+        check_options(None, CalibrationOptions(medium="oil"))
 
 
 @pytest.mark.parametrize(("kappa", "model"), [(0.0, "none"), (1 / 300, "kappa")])

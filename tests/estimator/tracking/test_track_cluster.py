@@ -13,7 +13,7 @@ import pytest
 
 import telerig
 from telerig.errors import InputError
-from telerig.estimator.batch.batch import dask_executor
+from telerig.estimator.batch.cluster import dask_executor
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions

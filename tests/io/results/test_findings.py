@@ -15,6 +15,7 @@ from finding_codes import codes
 from report_page import Page, edit
 
 import telerig
+from telerig.command_options import CalibrationOptions
 from telerig.errors import InputError
 from telerig.estimator.batch.batch import do_job, write_batch
 from telerig.estimator.batch.jobs import Job
@@ -112,7 +113,7 @@ def test_terminal_file_page_and_batch_say_the_same(case: str, tmp_path: Path) ->
     text = rig.read_text(encoding="utf-8")
     stated = f"right_from_left_rotvec_deg = [0.0, {angle_deg}, 0.0]"
     rig.write_text(re.sub(r"right_from_left_rotvec_deg = .*", stated, text), encoding="utf-8")
-    job = Job("calibrate", str(data), model=model)
+    job = Job("calibrate", str(data), CalibrationOptions(model))
     record = {"kind": job.kind, "dataset": job.dataset, "run": "", **do_job(job)}
     write_batch([record], tmp_path / "out")
 

@@ -33,7 +33,7 @@ def test_the_command_writes_the_contract(tank_copy: Path) -> None:
     summary = json.loads((out / "smoothing.json").read_text(encoding="utf-8"))
     assert summary["verdict"] in Verdict.__members__ and summary["verdict"] in result.output
     record = json.loads((out / "run.json").read_text(encoding="utf-8"))
-    assert (record["command"], record["tracks"]["command"]) == ("smooth", "run")
+    assert (record["command"], record["tracks"]["command"]) == ("smooth", "track")
     assert list(pd.read_csv(out / "trajectories.csv")["frame"]) == list(range(24))
 
 

@@ -377,7 +377,7 @@ def test_the_command_writes_what_the_contract_names(rise: Path, tmp_path: Path) 
     [
         (["nowhere/runs/rise"], "there is no calibration"),
         (["RUN", "--calibration", "a.txt"], "two OpenLPT camera files"),
-        (["RUN", "--from", "video"], "--from images"),
+        (["RUN", "--from", "video"], "'detections'"),
     ],
 )
 def test_bad_input_of_the_command(rise: Path, arguments: list[str], words: str) -> None:

@@ -94,6 +94,8 @@ def test_solution_and_covariances_equal_dense_algebra(
         if own.size:
             expected = np.array([of(k, k) for k in some])
             np.testing.assert_allclose(own, expected, atol=1e-6 * np.abs(expected).max())
+            # a difference between both triangles can grow from frame to frame without a limit
+            np.testing.assert_array_equal(own, np.swapaxes(own, 1, 2))
     if shake:
         pairs = zip(graph.node_of_row, keys[1])
         expected = np.array([of(node, row) for node, row in pairs])

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
-from telerig.errors import CalibrationError, GeometryError, InputError
+from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.lens.choice import (
     Choice,
     choose,
@@ -118,14 +118,8 @@ def self_calibrate(
         problem, turned = symmetric_target.number_consistently(problem, nominal)
         known += turned
         start_dots = problem.nominal_mm
-    try:
-        found = _solved(problem, start_dots, nominal, models, pre, known, name, progress)
-    except (CalibrationError, GeometryError) as error:
-        _refuse_wrong_pairs(problem, start_dots, error)
-        raise
-    if found.verdict["status"] == "REJECTED":
-        _refuse_wrong_pairs(problem, start_dots)
-    return found
+    checks.refuse_wrong_pairs(problem)
+    return _solved(problem, start_dots, nominal, models, pre, known, name, progress)
 
 
 def _solved(
@@ -223,15 +217,6 @@ def _with_origin(problem: Problem, start: State) -> Problem:
         intrinsics[scale] = found[scale]
         cameras.append(replace(camera, intrinsics=intrinsics))
     return replace(problem, cameras=tuple(cameras), hold_scales=True)
-
-
-def _refuse_wrong_pairs(problem: Problem, dots_mm: Array, cause: Exception | None = None) -> None:
-    """Raise CalibrationError if images of different views were paired; otherwise do nothing."""
-    words = checks.wrong_pairs(problem, dots_mm)
-    if words:
-        raise CalibrationError(
-            words, todo="give images that were taken at the same time the same file name"
-        ) from cause
 
 
 def _nominal(

@@ -6,8 +6,7 @@ time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -15,18 +14,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv
 
 from telerig.arrays import Array
-from telerig.errors import CalibrationError, TelerigError
+from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
-from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start.known_target import (
     ImageMap,
     image_maps,
     offset_freedom,
     origin_camera,
     overlap_tree,
-    plate_sides,
-    stereo_states,
 )
 from telerig.estimator.calibration.thresholds import (
     CLEAR_MISFIT,
@@ -37,6 +33,7 @@ from telerig.estimator.calibration.thresholds import (
     PARALLEL_DEG,
     RECOMMENDED_VIEWS,
     STRONG_PERSPECTIVE,
+    UNPAIRED,
 )
 from telerig.estimator.dots.grid.numbering import check_handedness
 from telerig.factors.calibration import State
@@ -294,12 +291,11 @@ def linked_parameters(names: tuple[str, ...], covariance: Array) -> list[Finding
 
 
 WINDOW = 3
-"""Number of consecutive views that are solved together to find the offset of a camera's images."""
+"""Number of consecutive views that show together whether two cameras' images belong together."""
 FARTHEST = 2
-"""Largest offset, in views, that is tried."""
-MOST_WINDOWS = 12
-WORST_WINDOWS = 3
-"""In so many windows, those that fit worst, other offsets are tried first."""
+"""Largest offset of a camera's images, in views, that is tried."""
+LEAST_PAIRS = 18
+"""Least number of dots in a window, twice that of the unknowns of their common equation."""
 
 
 def refuse_copies(problem: Problem) -> None:
@@ -335,66 +331,60 @@ def refuse_copies(problem: Problem) -> None:
             )
 
 
-def wrong_pairs(problem: Problem, dots_mm: Array) -> str:
-    """Return a sentence if a camera's images fit the views before or after far better, else "".
+def refuse_wrong_pairs(problem: Problem) -> None:
+    """Raise CalibrationError if a camera's images fit the views before or after far better.
 
-    A camera may have missed a trigger, or its first image was lost. Every few consecutive views are
-    solved with one camera's images from up to `FARTHEST` views later or earlier.
+    A camera may have missed a trigger, or its first image was lost.
     """
-    count = len(problem.views)
-    if count < WINDOW:
-        return ""
-    starts = np.unique(np.linspace(0, count - WINDOW, MOST_WINDOWS).round().astype(int))
     offsets = [s * n for n in range(1, FARTHEST + 1) for s in (1, -1)]
-    own = np.array([_cost(problem, dots_mm, 0, v, 0) for v in starts])
-    # a window that has no solution, for example without a shared view, proves nothing
-    solved = np.flatnonzero(np.isfinite(own))
-    for c in range(1, len(problem.cameras) if len(solved) else 0):
-        cost = cache(partial(_cost, problem, dots_mm, c))
-        # images of other views fit worst: if they are right even there, they are everywhere
-        for some in (solved[np.sort(np.argsort(-own[solved])[:WORST_WINDOWS])], solved):
-            costs = np.array([[cost(v, s) for s in offsets] for v in starts[some]])
-            clear = costs.min(1) < FAR_BETTER * own[some]
-            if not clear.any():
-                break
-        if not clear.any():
+    seen = np.zeros((len(problem.cameras), len(problem.views)))
+    seen[problem.camera, problem.view] = 1
+    for c in range(1, len(problem.cameras)):
+        other = int(np.argmax(seen[:c] @ seen[c]))
+        own, *shifted = (epipolar_misfits(problem, (other, c), s) for s in (0, *offsets))
+        least = np.min(shifted, axis=0)
+        far = np.isfinite(own) & (own > UNPAIRED) & (least < FAR_BETTER * own)
+        if not far.any():
             continue
-        best = costs.argmin(1)
-        chosen = int(np.bincount(best[clear]).argmax())
-        first = int(starts[some[clear & (best == chosen)]][0])
+        best = np.argmin(shifted, axis=0)
+        chosen = int(np.bincount(best[far]).argmax())
+        first = int(np.flatnonzero(far & (best == chosen))[0])
         camera, offset = problem.cameras[c].name, offsets[chosen]
         own_view, right_view = problem.views[first], problem.views[first + offset]
         side = "later" if offset > 0 else "earlier"
-        return (
+        raise CalibrationError(
             f"from view {own_view!r} on, the images of camera {camera!r} do not belong to the "
             f"views whose names they have: those {abs(offset)} {side} fit (image {right_view!r} of "
             f"camera {camera!r} shows view {own_view!r}), so an image of one camera was lost or "
-            "added"
+            "added",
+            todo="give images that were taken at the same time the same file name",
         )
-    return ""
 
 
-def _cost(problem: Problem, dots_mm: Array, camera: int, first: int, offset: int) -> float:
-    """Return the cost of `WINDOW` views with one camera's images ``offset`` later, or infinity."""
-    last = first + WINDOW
-    if not 0 <= first + offset <= len(problem.views) - WINDOW:
-        return float(np.inf)
-    mine = problem.camera == camera
-    view = problem.view - np.where(mine, offset, 0) - first
-    inside = (view >= 0) & (view < WINDOW)
-    if camera and len(np.intersect1d(view[inside & mine], view[inside & ~mine])) < 2:
-        return float(np.inf)  # two cameras can be turned so that any single view fits
-    part = replace(
-        problem.subset(inside),
-        view=view[inside],
-        views=problem.views[first:last],
-        plate_shift=problem.plate_shift[first:last],
-    ).with_model("none")
-    try:
-        return min(
-            solve(side, start, max_iterations=8, relative=1e-2).cost
-            for side in plate_sides(part)
-            for start in stereo_states(side, dots_mm)
-        )
-    except TelerigError:
-        return float(np.inf)
+def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Array:
+    """Return how far the dots of every `WINDOW` consecutive views are from one epipolar geometry.
+
+    With any lens but its distortion, the pixels x and x' of a dot in two cameras that saw it at the
+    same time satisfy x'^T F x = 0 with one matrix F (Luong and Faugeras, IJCV 17:43, 1996).
+
+    pair : indices of the cameras. offset : by how many views the second one's images are later.
+    Returns the mean squares (W,) of x'^T F x with the F of unit norm that makes them least, in
+    units of half the image; infinite where fewer than two views show enough dots to both cameras.
+    """
+    count = len(problem.views)
+    pixels = np.full((2, count, len(problem.dot_ids), 3), np.nan)
+    for own, c, late in zip(pixels, pair, (0, offset)):
+        view, half = problem.view - late, np.array(problem.cameras[c].image_size_px) / 2
+        mine = (problem.camera == c) & (view >= 0) & (view < count)
+        own[view[mine], problem.dot[mine], :2] = problem.uv_px[mine] / half - 1
+        own[view[mine], problem.dot[mine], 2] = 1
+    products = (pixels[0][..., :, None] * pixels[1][..., None, :]).reshape(*pixels.shape[1:3], 9)
+    both = np.isfinite(products[..., 0]).sum(1)
+    products = np.where((both >= LEAST_DOTS)[:, None, None], np.nan_to_num(products), 0.0)
+    moments = products.mT @ products
+    first = np.arange(count - WINDOW + 1)
+    windows = first[:, None] + np.arange(WINDOW)
+    many = both[windows].sum(1)
+    least = np.linalg.eigvalsh(moments[windows].sum(1))[:, 0]
+    shown = ((both[windows] >= LEAST_DOTS).sum(1) > 1) & (many >= LEAST_PAIRS)
+    return np.where(shown, np.maximum(least, 0) / np.maximum(many, 1), np.inf)

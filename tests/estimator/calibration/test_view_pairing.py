@@ -11,6 +11,9 @@ import pytest
 from finding_codes import codes
 
 from telerig.errors import CalibrationError
+from telerig.estimator.calibration.quality import checks
+from telerig.estimator.calibration.solver.problem import problem_from_dots
+from telerig.estimator.calibration.thresholds import UNPAIRED
 from telerig.io.results.findings import objections
 
 pytestmark = pytest.mark.usefixtures("without_advice")
@@ -46,6 +49,41 @@ def test_images_under_the_names_of_other_views_are_refused(
     assert "images of camera 'right' do not belong to the views whose names they have" in text
     assert f"those {abs(by)} {'later' if by > 0 else 'earlier'} fit" in text
     assert "same file name" in text
+
+
+@pytest.mark.parametrize("by", [1, -1, 2, -2])
+@pytest.mark.parametrize("camera", ["left", "right"])
+def test_only_images_of_one_moment_have_one_epipolar_geometry(
+    camera: str, by: int, paper: Any
+) -> None:
+    """A hundredth of bad dots does not hide it, and makes right pairs no wrong ones."""
+    rng = np.random.default_rng(0)
+    bad = rng.random(len(paper.dots)) < 0.01
+    dots = paper.dots.assign(u_px=paper.dots["u_px"] + 100 * bad * rng.standard_normal(len(bad)))
+    for table in (paper.dots, dots):
+        checks.refuse_wrong_pairs(problem_from_dots(table, paper.cameras, paper.target))
+        shifted = problem_from_dots(offset(table, camera, 0, by), paper.cameras, paper.target)
+        with pytest.raises(CalibrationError, match="do not belong to the views"):
+            checks.refuse_wrong_pairs(shifted)
+    right = problem_from_dots(paper.dots, paper.cameras, paper.target)
+    assert checks.epipolar_misfits(right, (0, 1), 0).max() < 1e-7
+    assert checks.epipolar_misfits(right, (0, 1), by).min() > 10 * UNPAIRED
+
+
+def test_a_target_that_is_not_tilted_shows_nothing_of_the_pairs(paper: Any) -> None:
+    """Moved without a turn, a flat target fits all pairs: the refusal is that of parallel views."""
+    views = sorted(paper.dots["view"].unique())
+    first = paper.dots[paper.dots["view"] == views[0]]
+    rng = np.random.default_rng(0)
+    step = rng.uniform(-20, 20, (len(views), 2))
+    dots = pd.concat([
+        first.assign(view=v, u_px=first["u_px"] + du + 0.01 * rng.standard_normal(len(first)),
+                     v_px=first["v_px"] + dv + 0.01 * rng.standard_normal(len(first)))
+        for v, (du, dv) in zip(views, step)
+    ])  # fmt: skip
+    made = paper.changed(lambda _: offset(dots.reset_index(drop=True), "right", 0, 1))
+    with pytest.raises(CalibrationError, match=r"parallel|tilt"):
+        made.calibrate("radial")
 
 
 def test_views_that_no_two_cameras_share_hide_no_other_error(paper: Any) -> None:

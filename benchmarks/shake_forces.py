@@ -93,3 +93,16 @@ def _limit_cycle(t: Array, hz: float, rng: Generator) -> Array:
         slope = k * cosine * rate
         out += a * np.stack([sine, slope, k * cosine * bend - k**2 * sine * rate**2], -1)
     return out
+
+
+def hunting_stage(t: Array, reach_mm: float, rng: Generator) -> tuple[Array, Array]:
+    """Position and acceleration (N,) of a stage that hunts at 14 Hz, sticks and slips.
+
+    reach_mm : amplitude of the limit cycle; friction moves the stage by a third of it.
+    """
+    cycle = reach_mm * _limit_cycle(t, 14.0, rng)
+    step = float(t[1] - t[0])
+    slip = _forced(_stick_slip(len(t), step, rng), step, 11.0)
+    slip *= reach_mm / 3 / max(float(slip[:, 0].std()), 1e-12)
+    both = cycle + slip
+    return both[:, 0], both[:, 2]

@@ -61,6 +61,9 @@ from telerig.rig.pose import Pose
 Array = NDArray[np.float64]
 
 UP = np.array([0.0, -1.0, 0.0])
+Motions = tuple[Array, Array, Shake, Shake]
+"""Position and acceleration (N,) of the carriage, shake common to the cameras and of their arms."""
+
 LATERAL = (2.0, 6.0, 0.03)
 LATERAL_SHAKE = 0.5
 NONLINEAR = ("zigzag", *FORCED)
@@ -75,6 +78,7 @@ class Case:
     angle_deg between the cameras.  kappa_per_mm of both.  nonlinear : one of ``NONLINEAR``.
     force_hz : corner of what shakes the rig.  around_s : how long encoder and accelerometers record
     before the first and after the last frame; the stage starts and stops within that time.
+    bubbles : how many there are.
     """
 
     scenario: Scenario
@@ -89,6 +93,7 @@ class Case:
     ramp_s: float = 0.0
     force_hz: float = FORCE_HZ
     around_s: float = 0.0
+    bubbles: int = 5
 
     @property
     def name(self) -> str:
@@ -97,7 +102,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Run:
-    """Tables as a user has them, and truth: position_mm, velocity_mm_s (5, F, 3) lab.
+    """Tables as a user has them, and truth: position_mm, velocity_mm_s (B, F, 3) lab.
 
     offset_mm : (2, F, 3) rig axes.  oracle : tracks of a rig without shake, the same noise.
     """
@@ -160,10 +165,12 @@ def simulate(
     rng: Generator,
     rig: tuple[tuple[Camera, Camera], Calibration] | None = None,
     bubbles: Callable[[Array], tuple[Array, Array]] | None = None,
+    motion: Callable[[Array, Generator], Motions] | None = None,
 ) -> Run:
     """One run. rig : true cameras and what the estimator is told, by default the truth.
 
-    bubbles : positions and velocities (5, N, 3) at times (N,), in place of those of the case.
+    bubbles : positions and velocities (B, N, 3) at times (N,), in place of those of the case.
+    motion : motions of carriage and cameras at times (N,), in place of those of the case.
     """
     scenario = case.scenario
     true = cameras(case) if rig is None else rig[0]
@@ -171,18 +178,22 @@ def simulate(
     steps, lead = (scenario.frames - 1) * thin + 1, round(case.around_s * scenario.rate_hz) * thin
     t = np.arange(-lead, steps + lead) * H
     told = Calibration(true, np.zeros(0, int), np.zeros((0, 3)), {}, np.zeros((6, 6)), (), ((), ()))
-    carriage, push = _carriage(case, t, rng)
-    common, own = _shake(case, t - t[0], rng)
+    if motion is None:
+        carriage, push = _carriage(case, t, rng)
+        common, own = random_shake(case, t - t[0], rng)
+    else:
+        carriage, push, common, own = motion(t, rng)
     offset = common.offset_mm + own.offset_mm
     seen_s = t[lead : lead + steps]
     moving = _bubbles(case, seen_s, rng) if bubbles is None else bubbles(seen_s)
     place, velocity = (each[:, ::thin] for each in moving)
     frames = slice(lead, lead + steps, thin)
     moved = carriage[frames, None] * UP + offset[:, frames]
-    noise = scenario.noise_px * rng.standard_normal((2, 5, scenario.frames, 2))
-    spoiled = rng.random((2, 5, scenario.frames)) < case.outliers
+    count = len(place)
+    noise = scenario.noise_px * rng.standard_normal((2, count, scenario.frames, 2))
+    spoiled = rng.random((2, count, scenario.frames)) < case.outliers
     noise += spoiled[..., None] * rng.uniform(-20, 20, noise.shape)
-    kept = rng.random((5, scenario.frames)) >= case.dropped
+    kept = rng.random((count, scenario.frames)) >= case.dropped
     kept[:, [0, -1]] = True
     calibration = told if rig is None else rig[1]
     seen, calm = (
@@ -202,7 +213,7 @@ def _carriage(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
     """Position and acceleration along the axis, the servo's error included."""
     place, push = RISE_MM_S * t, np.zeros_like(t)
     if case.around_s > 0:
-        place, push = _started_and_stopped(t, case.around_s)
+        place, push = started_and_stopped(t, case.around_s)
     elif case.ramp_s > 0:
         from telerig.io.simulation.run.motion import stage_trajectory
 
@@ -212,7 +223,7 @@ def _carriage(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
     return place + states[:, 0], push + mode_acceleration(states, servo)
 
 
-def _started_and_stopped(t: Array, around_s: float) -> tuple[Array, Array]:
+def started_and_stopped(t: Array, around_s: float) -> tuple[Array, Array]:
     """Position (0 at t = 0) and acceleration of a stage that starts and stops in 0.3 s, 1 s away
     from the run or half of around_s if this is less, and rises at a steady speed between."""
     ramp, margin = 0.3, min(1.0, around_s / 2)
@@ -233,27 +244,28 @@ def _started_and_stopped(t: Array, around_s: float) -> tuple[Array, Array]:
 
 
 def _bubbles(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
-    """Positions and velocities (5, N, 3) in the lab."""
+    """Positions and velocities (B, N, 3) in the lab."""
+    count = case.bubbles
     if case.nonlinear == "zigzag":
         paths = []
-        for _ in range(5):
+        for _ in range(count):
             hz, reach = rng.uniform(5, 8), rng.uniform(2, 5)
             turns = {k: rng.uniform(0, 2 * np.pi) for k in ("azimuth_rad", "phase_rad")}
             paths.append(constant_speed_path(t, RISE_MM_S, hz, (reach, 0.0), **turns))
         columns = ("height_mm", "lateral_mm", "height_mm_s", "lateral_mm_s")
         motion = Motion(*(np.stack([getattr(p, c) for p in paths]) for c in columns))
         extra = ornstein_uhlenbeck(3.0, 0.3).paths(
-            H, len(t), rng, paths=15, start_covariance=np.diag([0.0, 9.0])
+            H, len(t), rng, paths=3 * count, start_covariance=np.diag([0.0, 9.0])
         )
-        wander = extra.reshape(3, 5, len(t), 2)
+        wander = extra.reshape(3, count, len(t), 2)
     else:
         motion = stochastic_paths(
             H, len(t), rng,
-            rise_mm_s=np.full(5, RISE_MM_S), wander_mm_s=WANDER[0], wander_tau_s=WANDER[1],
+            rise_mm_s=np.full(count, RISE_MM_S), wander_mm_s=WANDER[0], wander_tau_s=WANDER[1],
             height_oscillation=ZIGZAG, lateral_oscillation=LATERAL,
         )  # fmt: skip
-        wander = np.zeros((3, 5, len(t), 2))
-    start = rng.uniform(-5, 5, (5, 1, 3))
+        wander = np.zeros((3, count, len(t), 2))
+    start = rng.uniform(-5, 5, (count, 1, 3))
     across = np.stack([motion.lateral_mm, motion.lateral_mm_s])
     upwards = np.stack([motion.height_mm, motion.height_mm_s])
     both = np.stack([across[..., 0], -upwards, across[..., 1]], -1)
@@ -261,7 +273,7 @@ def _bubbles(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
     return start + both[0], both[1]
 
 
-def _shake(case: Case, t: Array, rng: Generator) -> tuple[Shake, Shake]:
+def random_shake(case: Case, t: Array, rng: Generator) -> tuple[Shake, Shake]:
     """Common shake and that of the arms, each (2, N, 3)."""
     scenario = case.scenario
     rms = scenario.amplitude_mm / np.sqrt(2) * np.array([LATERAL_SHAKE, 1.0, LATERAL_SHAKE])

@@ -28,12 +28,12 @@ from PIL import Image
 
 from telerig.io.report.calibration import dot_fit, rig, target
 from telerig.io.report.calibration import figures as calibration_figures
-from telerig.io.report.calibration.results import read_results
 from telerig.io.report.run.smoothing import figures
-from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.figures import ray_miss_histogram
-from telerig.io.report.run.tracking.results import read_track_results, run_cameras
 from telerig.io.report.run.tracking.two_rays import two_rays
+from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.smoothing import read_smoothing_results
+from telerig.io.results.folders.tracking import read_track_results, run_cameras
 
 FOLDER = Path(__file__).parent / "pictures"
 DPI = 150

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import rig_outline
 from telerig.io.report.page.figures import KEPT, LEFT_OUT, camera_colour
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.view.stream import grey_levels, log_image, need_rerun, path, rgb
 
 Images = Callable[[str, str], NDArray[Any] | None]

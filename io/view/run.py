@@ -14,9 +14,10 @@ from telerig.arrays import Array, Ints
 from telerig.io.report.film.views import outlines_px
 from telerig.io.report.page.figures import CAMERA_COLOURS, MUTED, NAIVE, SMOOTHED
 from telerig.io.report.plot.axes import colour_of
-from telerig.io.report.run.smoothing.results import AXES, SmoothingResults, shake_spectrum
-from telerig.io.report.run.tracking.results import TrackResults
+from telerig.io.report.plot.spectrum import shake_spectrum
 from telerig.io.results.bodies import ellipsoids_of
+from telerig.io.results.folders.smoothing import AXES, SmoothingResults
+from telerig.io.results.folders.tracking import TrackResults
 from telerig.io.view.stream import grey_levels, log_image, log_series, need_rerun, path, rgb
 from telerig.rig.camera import Camera
 
@@ -187,7 +188,7 @@ def _heights(rows: pd.DataFrame, prefix: str, up: Array) -> Array:
 def _log_shake(stream: Any, smoothing: SmoothingResults) -> None:
     rr, shake = need_rerun(), smoothing.shake
     for camera in smoothing.cameras:
-        spectrum = shake_spectrum(smoothing, camera)
+        spectrum = shake_spectrum(smoothing.shake, camera)
         for axis in smoothing.seen(camera):
             k, name = AXES.index(axis), f"{camera} {axis}"
             values = 1e3 * shake[f"{camera}_{axis}_mm"].to_numpy(float)

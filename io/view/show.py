@@ -15,10 +15,10 @@ from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import load_run, recordings
 from telerig.io.files.atomic import atomic_path
-from telerig.io.report.calibration.results import read_results
 from telerig.io.report.film.views import read_outlines
-from telerig.io.report.run.smoothing.results import read_smoothing_results
-from telerig.io.report.run.tracking.results import TrackResults, read_track_results, run_cameras
+from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.smoothing import read_smoothing_results
+from telerig.io.results.folders.tracking import TrackResults, read_track_results, run_cameras
 from telerig.io.tables.calibration import REJECTED
 from telerig.io.view import calibration as of_calibration
 from telerig.io.view import run as of_run

@@ -22,3 +22,15 @@ def robust_sd(deviations: ArrayLike, axis: int | None = None) -> Array:
     axis : the axis along which the median is taken; None takes all values together.
     """
     return np.asarray(NORMAL_FROM_MEDIAN * np.median(np.abs(deviations), axis=axis))
+
+
+def median(values: Array) -> float | None:
+    """Return the median of the finite values; None without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def rms(values: Array) -> float | None:
+    """Return the RMS of the finite values; None without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None

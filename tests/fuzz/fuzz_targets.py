@@ -139,7 +139,7 @@ def _exported(file: Path, to: str) -> Path:
 
 
 def _calibration_folder(file: Path) -> Any:
-    from telerig.io.report.calibration.results import read_results
+    from telerig.io.results.folders.calibration import read_results
 
     found = read_results(file.parent)
     return [found.points_mm, found.joint, found.residuals[["u_px", "v_px", "du_px", "dv_px"]]]
@@ -153,13 +153,13 @@ def _tracks(file: Path) -> Any:
 
 
 def _track_report(file: Path) -> Any:
-    from telerig.io.report.run.tracking.results import read_track_results
+    from telerig.io.results.folders.tracking import read_track_results
 
     return read_track_results(file.parent).up
 
 
 def _smoothing_report(file: Path) -> Any:
-    from telerig.io.report.run.smoothing.results import read_smoothing_results
+    from telerig.io.results.folders.smoothing import read_smoothing_results
 
     found = read_smoothing_results(file.parent, np.array([0.0, -1.0, 0.0]))
     return None if found is None else found.trajectories[["t_s", "x_mm", "vx_mm_s"]]

@@ -29,10 +29,10 @@ from telerig.estimator.tracking.tracks import load_tracks
 from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.exchange.formats import export_results
 from telerig.io.report.batch.report import write_batch_report
-from telerig.io.report.calibration.results import read_results
 from telerig.io.report.remake import remake_report, results_folders
-from telerig.io.report.run.smoothing.results import read_smoothing_results
-from telerig.io.report.run.tracking.results import read_track_results
+from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.smoothing import read_smoothing_results
+from telerig.io.results.folders.tracking import read_track_results
 
 pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes")
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from report_page import edit
 
-from telerig.io.report.run.smoothing.results import SmoothingResults, read_smoothing_results
+from telerig.io.results.folders.smoothing import SmoothingResults, read_smoothing_results
 
 RATE_HZ, SD_MM, SD_MM_S = 500.0, 0.02, 4.0
 COMMON_HZ, ARM_HZ, ALONE_HZ = 20.0, 45.0, 80.0

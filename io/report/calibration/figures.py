@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
-from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane
 from telerig.io.report.page.figures import (
     LEFT_OUT,
@@ -22,6 +21,7 @@ from telerig.io.report.page.figures import (
     image_axes,
     image_height_in,
 )
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.short_text import nice_below, number, short_names
 
 MOST_ARROWS = 1200

@@ -18,7 +18,6 @@ from telerig.io.report.calibration.figures import (
     tilts,
     trust_pictures,
 )
-from telerig.io.report.calibration.results import CalibrationResults, read_results
 from telerig.io.report.calibration.rig import dots_are_drawn, next_pictures, rig_plan, scene_json
 from telerig.io.report.calibration.target import target_pictures
 from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
@@ -26,6 +25,7 @@ from telerig.io.report.page.figures import Picture
 from telerig.io.report.page.page import drawn_over_cores, render_page
 from telerig.io.results.calibration_words import telecentricity_words
 from telerig.io.results.findings import TRUST, Status
+from telerig.io.results.folders.calibration import CalibrationResults, read_results
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
 from telerig.short_text import ABSENT, flat_rows, sentence

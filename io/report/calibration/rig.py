@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.figures import (
     MODEL,
     MUTED,
@@ -20,6 +19,7 @@ from telerig.io.report.page.figures import (
     image_axes,
 )
 from telerig.io.report.page.page import Trace, lines, scene_text, xyz
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.short_text import short_names

@@ -9,9 +9,9 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import GeometryError
-from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.results.calibration import CameraRecord
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import LENS_PARAMETERS, PARAMETERS

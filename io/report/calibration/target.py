@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.figures import WIDTH_IN, Picture, drawing
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.short_text import nice_below, number
 
 _MOST_LABELS = 40

@@ -15,10 +15,10 @@ from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.mp4 import Picture, Progress, write_film
-from telerig.io.report.run.smoothing.results import read_smoothing_results
-from telerig.io.report.run.tracking.results import TrackResults, read_track_results
 from telerig.io.report.run.tracking.scene import thinned, track_colour
 from telerig.io.results.bodies import ellipsoids_of
+from telerig.io.results.folders.smoothing import read_smoothing_results
+from telerig.io.results.folders.tracking import TrackResults, read_track_results
 from telerig.io.results.manifest import reading
 from telerig.io.tables.table import SHAPE_COLUMNS
 

@@ -18,7 +18,7 @@ from telerig.io.report.plot.axes import (
     finite,
     height_and_sides,
 )
-from telerig.io.report.plot.spectrum import velocity_density
+from telerig.io.report.plot.spectrum import velocity_spectrum
 from telerig.io.rig_file.fluid import liquid_of
 from telerig.rig.bubble_physics import (
     Liquid,
@@ -245,8 +245,14 @@ def spectra(
     "" for the smoothed velocity, "naive_" or "rts_" for the others of trajectories.csv.
     y_up : the vertical is called height. Raises InputError for tracks below 32 frames.
     """
-    found = velocity_density(trajectories, kind)
+    found = velocity_spectrum(trajectories, kind)
     axes = axes_of(axes, xlabel="frequency / Hz", ylabel="(mm/s)²/Hz", yscale="log")
     for i, name in enumerate(("x", "height" if y_up else "y", "z")):
-        axes.plot(found[0][1:], found[1][1:, i], color=COLOURS[i], linewidth=1.0, label=name)
+        axes.plot(
+            found.frequency_hz[1:],
+            found.density[1:, i],
+            color=COLOURS[i],
+            linewidth=1.0,
+            label=name,
+        )
     return axes

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pandas as pd
 
@@ -14,8 +16,21 @@ _MOST_TRACKS = 20
 _FINITE_SHARE = 0.7
 
 
-def velocity_density(trajectories: pd.DataFrame, kind: str = "") -> tuple[Array, Array]:
-    """Return frequencies (F,) in Hz and mean densities (F, 3) of the longest tracks.
+@dataclass(frozen=True)
+class Spectrum:
+    """One-sided power densities (F, 3) per axis at (F,) Hz."""
+
+    frequency_hz: Array
+    density: Array
+
+    @property
+    def step_hz(self) -> float:
+        """How finely frequencies are told apart."""
+        return float(self.frequency_hz[1])
+
+
+def velocity_spectrum(trajectories: pd.DataFrame, kind: str = "") -> Spectrum:
+    """Return the mean density of the velocity of the longest tracks, in (mm/s)²/Hz.
 
     kind : "", "naive_" or "rts_". Raises InputError when no track is long enough.
     """
@@ -39,7 +54,15 @@ def velocity_density(trajectories: pd.DataFrame, kind: str = "") -> tuple[Array,
     if not found:
         what = f"no track has {LEAST_FRAMES} frames with a velocity"
         raise InputError(what, where="telerig.plot.spectra", todo="give a longer run")
-    return frequencies, np.asarray(np.average(found, axis=0, weights=weights))
+    return Spectrum(frequencies, np.asarray(np.average(found, axis=0, weights=weights)))
+
+
+def shake_spectrum(shake: pd.DataFrame, camera: str) -> Spectrum | None:
+    """Return the density of a camera's shake in shake.csv, in µm²/Hz; None for a short run."""
+    if len(shake) < LEAST_FRAMES:
+        return None
+    values = 1e3 * shake[[f"{camera}_{axis}_mm" for axis in "xyz"]].to_numpy(float)
+    return Spectrum(*welch_density(shake["t_s"].to_numpy(float), values, segment(len(values))))
 
 
 def segment(frames: int) -> int:

@@ -14,7 +14,6 @@ from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.page.contact_sheet import BUDGET_BYTES, picture_sheet
 from telerig.io.report.page.page import drawn_over_cores, plotly_javascript, render_page
 from telerig.io.report.run.smoothing.figures import PLACES, smoothing_drawings
-from telerig.io.report.run.smoothing.results import SmoothingResults, read_smoothing_results
 from telerig.io.report.run.smoothing.tables import smoothing_words
 from telerig.io.report.run.tracking import tables as tables
 from telerig.io.report.run.tracking.figures import (
@@ -29,14 +28,15 @@ from telerig.io.report.run.tracking.figures import (
     sizes,
     time_series,
 )
-from telerig.io.report.run.tracking.results import (
+from telerig.io.report.run.tracking.scene import scene_widening, track_plans, track_scene_json
+from telerig.io.report.run.tracking.two_rays import two_rays
+from telerig.io.results.folders.smoothing import SmoothingResults, read_smoothing_results
+from telerig.io.results.folders.tracking import (
     TrackResults,
     binary_column,
     read_track_results,
     run_cameras,
 )
-from telerig.io.report.run.tracking.scene import scene_widening, track_plans, track_scene_json
-from telerig.io.report.run.tracking.two_rays import two_rays
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
 from telerig.rig.camera import Camera

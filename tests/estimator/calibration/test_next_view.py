@@ -26,8 +26,8 @@ from telerig.estimator.calibration.solver.problem import cameras_from_state, hel
 from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.factors.calibration import State, pixels
 from telerig.io.report.calibration.report import write_calibration_report
-from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.rig import next_pictures
+from telerig.io.results.folders.calibration import read_results
 from telerig.io.simulation.images.plates import Plate, pixel_from_plate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec

@@ -37,9 +37,9 @@ from telerig.factors.measurements import image_of_point
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.exchange.export.halcon import halcon_cameras
 from telerig.io.exchange.export.opencv import camera_matrices
-from telerig.io.report.calibration.results import read_results
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.findings import Code
+from telerig.io.results.folders.calibration import read_results
 from telerig.io.rig_file.description import WallDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.io.simulation.calibration.scene import true_cameras

@@ -26,7 +26,7 @@ from telerig.io.report.film.views import (
     view_frames,
     write_views_film,
 )
-from telerig.io.report.run.tracking.results import read_track_results
+from telerig.io.results.folders.tracking import read_track_results
 
 
 @pytest.fixture(scope="module")

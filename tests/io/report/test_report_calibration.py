@@ -18,10 +18,10 @@ from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.report.calibration.figures import residual_field
 from telerig.io.report.calibration.report import contact_sheet, write_calibration_report
-from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.tables import held_everywhere, parameter_rows, worst_rows
 from telerig.io.report.page import contact_sheet as sheets
 from telerig.io.report.remake import ResultsFolder, remake_report
+from telerig.io.results.folders.calibration import read_results
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 

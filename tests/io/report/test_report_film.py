@@ -32,9 +32,9 @@ from telerig.io.report.film.path import (
     view_matrix,
     write_path_film,
 )
-from telerig.io.report.run.tracking.results import read_track_results, run_cameras
 from telerig.io.report.run.tracking.scene import scene_widening, track_scene_json
 from telerig.io.report.run.tracking.two_rays import ray_pair, rays_of_row, two_rays, typical_row
+from telerig.io.results.folders.tracking import read_track_results, run_cameras
 
 BLUE = (31, 95, 168)
 

@@ -14,12 +14,12 @@ import pytest
 from telerig.errors import InputError
 from telerig.io.report.calibration.dot_fit import dot_pictures, edge_distance_px
 from telerig.io.report.calibration.figures import tilt_angles_rad, trust_pictures
-from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
 from telerig.io.report.calibration.target import target_shape
 from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page import page
 from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Diagnostics, Target
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.results.tracking import TrackingFile
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -16,11 +16,11 @@ from smoothed_folder import AXES, changed, read, write_folder
 
 from telerig.errors import InputError
 from telerig.io.report.page.figures import drawing
+from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.smoothing.figures import smoothing_drawings
-from telerig.io.report.run.smoothing.results import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.smoothing.tables import smoothing_verdict, use_rows
-from telerig.io.report.run.tracking.results import read_track_results
+from telerig.io.results.folders.tracking import read_track_results
 from telerig.io.results.verdict_words import uses_words, words_of_refusals
 
 LAST = ["rays", "quality", "images", "worst", "events", "more", "origin"]
@@ -237,7 +237,9 @@ def test_no_bubbles_leaves_the_shake(folder: Path) -> None:
 def test_short_runs_have_no_spectra(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "r", frames=20, bubbles=1)
     results = read(folder)
-    assert shake_spectrum(results, "left") is None and velocity_spectrum(results) is None
+    assert shake_spectrum(results.shake, "left") is None
+    with pytest.raises(InputError, match="32 frames"):
+        velocity_spectrum(results.trajectories)
     captions = _captions(folder, "velocity", "spectra")
     assert "Spectrum" not in captions and "Velocity in y" in captions
 

@@ -19,16 +19,14 @@ from smoothed_folder import (
     write_folder,
 )
 
-from telerig.io.report.plot.spectrum import evenly
+from telerig.io.report.plot.spectrum import evenly, shake_spectrum, velocity_spectrum
 from telerig.io.report.run.smoothing.figures import density_limits
-from telerig.io.report.run.smoothing.results import (
+from telerig.io.report.run.smoothing.tables import axis_table, mode_rows
+from telerig.io.results.folders.smoothing import (
     axis_sd,
     shake_rms_um,
-    shake_spectrum,
     taken_away,
-    velocity_spectrum,
 )
-from telerig.io.report.run.smoothing.tables import axis_table, mode_rows
 
 
 @pytest.fixture(scope="module")
@@ -67,15 +65,14 @@ def test_depth_is_read_from_the_file_else_from_what_stands_still(folder: Path) -
 
 def test_spectra_obey_parseval_and_show_the_lines(whole: Path) -> None:
     results = read(whole)
-    shake = shake_spectrum(results, "left")
+    shake = shake_spectrum(results.shake, "left")
     assert shake is not None
     variance = shake.density.sum(0) * shake.step_hz
     np.testing.assert_allclose(variance[0], ALONE_UM**2, rtol=0.05)
     np.testing.assert_allclose(variance[1], COMMON_UM**2 + ARM_UM**2, rtol=0.05)
     at = shake.frequency_hz[np.argmax(shake.density[:, 1])]
     assert at == pytest.approx(COMMON_HZ, abs=shake.step_hz)
-    naive, smooth = velocity_spectrum(results, "naive_"), velocity_spectrum(results)
-    assert naive is not None and smooth is not None
+    naive, smooth = (velocity_spectrum(results.trajectories, kind) for kind in ("naive_", ""))
     near = np.argmin(np.abs(naive.frequency_hz - COMMON_HZ))
     assert naive.density[near, 1] > 1e3 * smooth.density[near, 1]
 

@@ -27,7 +27,9 @@ from telerig.io.report.run.tracking.figures import (
     seen_where,
     time_series,
 )
-from telerig.io.report.run.tracking.results import (
+from telerig.io.report.run.tracking.scene import thinned, track_scene_json
+from telerig.io.report.run.tracking.tables import verdict
+from telerig.io.results.folders.tracking import (
     TrackResults,
     learnt_sd_mm,
     per_frame,
@@ -35,8 +37,6 @@ from telerig.io.report.run.tracking.results import (
     ray_miss_sd_mm,
     read_track_results,
 )
-from telerig.io.report.run.tracking.scene import thinned, track_scene_json
-from telerig.io.report.run.tracking.tables import verdict
 
 SECTIONS = [
     *("verdict", "look", "key", "time", "rays", "quality", "images", "worst", "events", "notes"),

@@ -9,10 +9,10 @@ import numpy as np
 from telerig.io.report import plot
 from telerig.io.report.page.figures import Curve, Picture, draw_curves, drawing
 from telerig.io.report.page.page import Figure, Row
-from telerig.io.report.run.smoothing.results import SmoothingResults, column
-from telerig.io.report.run.tracking.results import median
 from telerig.io.report.run.tracking.scene import track_colour
+from telerig.io.results.folders.smoothing import SmoothingResults, column
 from telerig.short_text import number, with_sd
+from telerig.statistics import median
 
 MOST_ROWS = 40
 LEAST_MANY = 10

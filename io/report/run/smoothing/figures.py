@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
+from telerig.errors import InputError
 from telerig.io.report.page.figures import (
     CAMERA_COLOURS,
     LEFT_OUT,
@@ -23,22 +24,20 @@ from telerig.io.report.page.figures import (
     draw_curves,
     drawing,
 )
+from telerig.io.report.plot.spectrum import Spectrum, shake_spectrum, velocity_spectrum
 from telerig.io.report.run.smoothing.bubbles import BUBBLE_PICTURES
-from telerig.io.report.run.smoothing.results import (
+from telerig.io.report.run.tracking.scene import track_colour
+from telerig.io.results.folders.smoothing import (
     AXES,
     PLACE,
     SPEED,
     SmoothingResults,
-    Spectrum,
     column,
     known_parts,
     shake_rms_um,
-    shake_spectrum,
-    velocity_spectrum,
 )
-from telerig.io.report.run.tracking.results import median, rms
-from telerig.io.report.run.tracking.scene import track_colour
 from telerig.short_text import is_number, number
+from telerig.statistics import median, rms
 
 PLACES = ("first", "bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")
 """Sections that hold drawings."""
@@ -275,7 +274,7 @@ def velocity_before_and_after(results: SmoothingResults, axis: int) -> Picture |
     found = {
         label: (spectrum, colour)
         for kind, colour, label in kinds
-        if (spectrum := velocity_spectrum(results, kind)) is not None
+        if (spectrum := _velocity_spectrum(results, kind)) is not None
     }
     if "smoothed" not in found:
         return None
@@ -300,13 +299,21 @@ def velocity_before_and_after(results: SmoothingResults, axis: int) -> Picture |
     return _spectra(title, unit, curves, caption + _resolution(smooth), _modes_hz(results))
 
 
+def _velocity_spectrum(results: SmoothingResults, kind: str) -> Spectrum | None:
+    """Return None where no track is long enough or the columns are empty."""
+    try:
+        return velocity_spectrum(results.trajectories, kind)
+    except InputError:
+        return None
+
+
 def _resolution(spectrum: Spectrum) -> str:
     return f"Welch's estimate, steps of {number(spectrum.step_hz, 2)} Hz."
 
 
 def shake_spectra(results: SmoothingResults, camera: str) -> Picture | None:
     """Draw the spectrum of a camera's shake on the axes that it sees."""
-    spectrum = shake_spectrum(results, camera)
+    spectrum = shake_spectrum(results.shake, camera)
     seen = results.seen(camera)
     if spectrum is None or not seen:
         return None

@@ -13,7 +13,8 @@ from telerig.io.report.run.smoothing.bubbles import (
     summary_rows,
     swarm_figures,
 )
-from telerig.io.report.run.smoothing.results import (
+from telerig.io.report.run.tracking.tables import Headline
+from telerig.io.results.folders.smoothing import (
     AXES,
     SPEED,
     SmoothingResults,
@@ -22,8 +23,7 @@ from telerig.io.report.run.smoothing.results import (
     shake_rms_um,
     taken_away,
 )
-from telerig.io.report.run.tracking.results import TrackResults
-from telerig.io.report.run.tracking.tables import Headline
+from telerig.io.results.folders.tracking import TrackResults
 from telerig.io.results.smoothing import AttributedLine, Flag, Grade, Mode, Verdict
 from telerig.io.results.verdict_words import (
     FLAG_WORDS,

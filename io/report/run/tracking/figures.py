@@ -18,17 +18,15 @@ from telerig.io.report.page.figures import (
     image_axes,
     image_height_in,
 )
-from telerig.io.report.run.tracking.results import (
+from telerig.io.report.run.tracking.scene import draw_tracks, thinned
+from telerig.io.results.folders.tracking import (
     TrackResults,
     learnt_sd_mm,
-    median,
     per_frame,
     ray_miss_sd_mm,
-    rms,
 )
-from telerig.io.report.run.tracking.scene import draw_tracks, thinned
 from telerig.short_text import number, share
-from telerig.statistics import robust_sd
+from telerig.statistics import median, rms, robust_sd
 
 _MOST_POINTS = 8_000
 _MOST_BINS = 400

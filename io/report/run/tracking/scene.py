@@ -10,7 +10,7 @@ import pandas as pd
 from telerig.arrays import Array
 from telerig.io.report.page.figures import Picture, Sheet, drawing
 from telerig.io.report.page.page import Trace, lines, scene_text
-from telerig.io.report.run.tracking.results import TrackResults
+from telerig.io.results.folders.tracking import TrackResults
 
 TRACK_COLOURS = (
     "#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0", "#a8324a", "#0f8a8a", "#8a6d00", "#5b4a42",

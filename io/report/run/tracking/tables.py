@@ -10,19 +10,18 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.io.report.page.page import Figure, Row
-from telerig.io.report.run.tracking.results import (
+from telerig.io.results.folders.tracking import (
     NORMAL_MEDIAN,
     TrackResults,
     frame_count,
     learnt_sd_mm,
-    median,
     ray_miss_ratio,
     ray_miss_sd_mm,
-    rms,
     track_lengths,
 )
 from telerig.io.results.tracking import share_words
 from telerig.short_text import ABSENT, number, sentence, share
+from telerig.statistics import median, rms
 
 MOST_EVENTS = 60
 _MISS_TOO_LARGE = 3.0

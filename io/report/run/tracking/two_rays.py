@@ -17,7 +17,7 @@ from telerig.io.report.page.figures import (
     camera_colour,
     drawing,
 )
-from telerig.io.report.run.tracking.results import TrackResults, outline_pixels, paired_rows
+from telerig.io.results.folders.tracking import TrackResults, outline_pixels, paired_rows
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
 from telerig.short_text import nice_below

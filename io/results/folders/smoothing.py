@@ -1,6 +1,6 @@
 """What a smoothed run's results folder holds besides tracks, and what it adds up to.
 
-Standard deviations and spectra are computed here; the files are checked as they are read.
+Standard deviations are computed here; the files are checked as they are read.
 """
 
 from __future__ import annotations
@@ -16,18 +16,12 @@ import pandas as pd
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.csv_table import header_of
-from telerig.io.report.plot.spectrum import (
-    LEAST_FRAMES,
-    segment,
-    velocity_density,
-    welch_density,
-)
-from telerig.io.report.run.tracking.results import median, rms
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import SmoothingFile
 from telerig.io.tables.smoothing import AXES, BUBBLES, SHAKE, STATE, SUMMARY, TRAJECTORIES
 from telerig.io.tables.smoothing import POSITION as PLACE
 from telerig.io.tables.smoothing import VELOCITY as SPEED
+from telerig.statistics import median, rms
 
 __all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
 
@@ -144,15 +138,6 @@ def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:
         raise InputError(what, where=f"{file}, column t_s", todo=SmoothingFile.AGAIN)
 
 
-@dataclass(frozen=True)
-class Spectrum:
-    """One-sided power densities (F, 3) per axis at (F,) Hz; ``step_hz`` as far as it resolves."""
-
-    frequency_hz: Array
-    density: Array
-    step_hz: float
-
-
 def column(table: pd.DataFrame, name: str) -> Array:
     """Return a column's values; NaN if the file has none."""
     if name not in table:
@@ -190,25 +175,3 @@ def shake_rms_um(results: SmoothingResults, camera: str, axis: str) -> float | N
     if axis in results.unseen(camera) or not len(results.shake):
         return None
     return float(1e3 * np.std(column(results.shake, f"{camera}_{axis}_mm")))
-
-
-def velocity_spectrum(results: SmoothingResults, kind: str = "") -> Spectrum | None:
-    """Mean over the longest tracks of the velocity's density, (mm/s)²/Hz.
-
-    kind : "", "naive_" or "rts_". None where no track is long enough or the columns are empty.
-    """
-    try:
-        frequency, density = velocity_density(results.trajectories, kind)
-    except InputError:
-        return None
-    return Spectrum(frequency, density, float(frequency[1]))
-
-
-def shake_spectrum(results: SmoothingResults, camera: str) -> Spectrum | None:
-    """Return the spectral density of a camera's shake by axis, µm²/Hz; None for a short run."""
-    values = 1e3 * np.stack([column(results.shake, f"{camera}_{axis}_mm") for axis in AXES], 1)
-    if len(values) < LEAST_FRAMES:
-        return None
-    time = results.shake["t_s"].to_numpy(float)
-    frequency, density = welch_density(time, values, segment(len(values)))
-    return Spectrum(frequency, density, float(frequency[1]))

@@ -25,6 +25,7 @@ from telerig.io.tables.run import DETECTIONS, EVENTS, REFERENCES, TRACKS
 from telerig.io.tables.table import POINT, SILHOUETTES
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate_views
+from telerig.statistics import median
 
 _FILES = (
     "tracking.json", "tracks.csv", "detections.csv", "events.csv", "references.csv", "run.json"
@@ -258,18 +259,6 @@ def ray_miss_ratio(
     units = np.abs(miss - (median(miss) or 0.0 if centred else 0.0)) / predicted_mm
     units = units[np.isfinite(units)]
     return float(np.median(units)) / NORMAL_MEDIAN if len(units) else None
-
-
-def median(values: Array) -> float | None:
-    """Return the median of the finite values; None without any."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else None
-
-
-def rms(values: Array) -> float | None:
-    """Return the RMS of the finite values; None without any."""
-    finite = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
 
 
 def frame_count(results: TrackResults) -> int:

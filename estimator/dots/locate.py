@@ -169,7 +169,7 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
         noise, np.array([fit.chi2_dof for fit in fits]), np.array([fit.dof for fit in fits])
     )
     fits, noise = [fit.under_noise(factor) for fit in fits], noise.scaled(factor)
-    look = look.with_contrasts(fits)
+    look = look.with_fits(fits)
     accepted: list[tuple[Any, ...]] = []
     for blob, fit in zip(blobs, fits):
         reason = reason_against_fit(blob, fit, grey.shape, found.polarity, look)

@@ -345,19 +345,28 @@ LOG_SPREAD = 0.35
 twice as large as dots, and light falls off towards the corners."""
 LOG_FITTED = 0.2
 """Standard deviation of the log of a dot's fitted size divided by that of its blob."""
-MODEL_RESIDUAL = 0.023
-"""Standard deviation of what the luminance model leaves of true dots at the edge (print, optics),
-divided by their contrast and without the noise."""
+MODEL_RESIDUAL = 0.03
+"""What the luminance model leaves of true dots (`DotFit.misfit`) where few dots show it; medians of
+seven images of real plates are 0.026 to 0.058."""
+MODEL_RESIDUAL_DOTS = 5
+"""It counts as so many dots of the image."""
+LOG_MISFIT = 0.2
+"""Standard deviation of the log of a true dot's misfit about the median of its image, both
+increased by `LEAST_MISFIT`: 0.1 to 0.2 on real plates."""
+LEAST_MISFIT = 0.02
+"""A misfit that any dot may have: rounding, specks of dust, an edge without blur."""
 _HOLE_SHARE = 0.02
 """Least share of a ring's area that is hole; specks of dust are smaller."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How the dots of an image look: medians of log radius (px) and log contrast, and the spread of
-    the contrast. The radius is that of the blobs weighted by area, so that specks do not count."""
+    """How the dots of an image look: medians of log radius (px), log contrast and misfit, and the
+    spread of the contrast. The radius is that of the blobs weighted by area, so that specks do not
+    count."""
 
     log_radius: float
+    misfit: float = MODEL_RESIDUAL
     log_contrast: float = 0.0
     contrast_spread: float = LOG_SPREAD
 
@@ -370,14 +379,15 @@ class Look:
         middle = np.searchsorted(np.cumsum(areas), 0.5 * np.sum(areas))
         return cls(0.5 * float(np.log(areas[min(middle, areas.size - 1)] / np.pi)))
 
-    def with_contrasts(self, fits: Sequence[DotFit]) -> Look:
-        """Return the look with the contrasts of fitted dots."""
-        logs = np.log(np.maximum([abs(fit.contrast) for fit in fits], 1e-12))
-        if not len(logs):
+    def with_fits(self, fits: Sequence[DotFit]) -> Look:
+        """Return the look with the contrasts and misfits of fitted dots."""
+        if not fits:
             return self
+        logs = np.log(np.maximum([abs(fit.contrast) for fit in fits], 1e-12))
         middle = float(np.median(logs))
         spread = max(LOG_SPREAD, float(robust_sd(logs - middle)))
-        return replace(self, log_contrast=middle, contrast_spread=spread)
+        misfits = [fit.misfit for fit in fits] + MODEL_RESIDUAL_DOTS * [MODEL_RESIDUAL]
+        return Look(self.log_radius, float(np.median(misfits)), middle, spread)
 
 
 def is_unlike(deviations: ArrayLike) -> Bools:
@@ -445,7 +455,8 @@ def reason_against_fit(
         return Reason.TOUCHES_BORDER
     if (fit.contrast > 0.0) != (polarity == "white_on_black"):
         return Reason.WRONG_SIGN
-    misfit = fit.edge_residual * sqrt(max(1.0 - 1.0 / fit.chi2_dof, 0.0)) / MODEL_RESIDUAL
+    ratio = (fit.misfit + LEAST_MISFIT) / (look.misfit + LEAST_MISFIT)
+    misfit = max(float(np.log(ratio)), 0.0) / LOG_MISFIT
     faint = (np.log(max(abs(fit.contrast), 1e-12)) - look.log_contrast) / look.contrast_spread
     if not is_unlike([misfit, min(faint, 0.0)]):
         return None

@@ -23,6 +23,7 @@ from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.dots.fit.blurred_ellipse import (
@@ -35,6 +36,9 @@ from telerig.statistics import NORMAL_FROM_MEDIAN
 
 PARAMETERS = 10
 """Free parameters of a fit; the two of the contrast gradient are held by their prior."""
+SIGNIFICANT = 1e-4
+"""A fit is worse than the noise if noise alone gives a chi-square as large with less than this
+probability."""
 
 
 class Reason(StrEnum):
@@ -147,8 +151,20 @@ class DotFit:
     def inflated_covariance_px2(self) -> Array:
         """The centre's covariance (2, 2), multiplied by chi2_dof if chi2_dof is significantly above
         1."""
-        significant = self.chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / self.dof)
+        significant = self.chi2_dof > self._by_chance
         return self.covariance_px2 * (self.chi2_dof if significant else 1.0)
+
+    @property
+    def misfit(self) -> float:
+        """RMS of what the model leaves near the edge beyond the noise, divided by C; 0 if chi2_dof
+        is not significantly above 1."""
+        beyond = 1.0 - self._by_chance / self.chi2_dof
+        return self.edge_residual * float(np.sqrt(beyond)) if beyond > 0.0 else 0.0
+
+    @property
+    def _by_chance(self) -> float:
+        """The largest chi2_dof that counts as noise."""
+        return float(chdtri(self.dof, SIGNIFICANT)) / self.dof
 
     def under_noise(self, factor: float) -> DotFit:
         """Return the fit as it would be if the noise variance were ``factor`` times as large."""

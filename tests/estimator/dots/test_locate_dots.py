@@ -216,6 +216,24 @@ def test_partial_merged_tiny_and_glared_dots_are_named() -> None:
         assert np.min(np.linalg.norm(places - place, axis=1)) < 0.2
 
 
+def test_dots_with_a_soft_glare_are_refused_or_right() -> None:
+    """A soft highlight across an edge moved dots by up to 3 px that were accepted."""
+    rng = np.random.default_rng(11)
+    truth = scene(12.0, size=320)
+    glare = np.zeros((320, 320))
+    lit = truth.centres_px[::3]
+    for centre in lit:
+        angle = rng.uniform(0.0, 2 * np.pi)
+        u, v = np.rint(centre + 10.0 * np.array([np.cos(angle), np.sin(angle)])).astype(int)
+        cv2.circle(glare, (int(u), int(v)), 7, 120.0, -1, cv2.LINE_AA)
+    image = renderer.render(truth) + cv2.GaussianBlur(glare, (0, 0), 4.0)
+    table = locate_dots(renderer.picture(image, 2.0, 8, rng))
+    apart = np.linalg.norm(table[["u_px", "v_px"]].to_numpy()[:, None] - truth.centres_px, axis=2)
+    gap = table[["u_px", "v_px"]].to_numpy() - truth.centres_px[apart.argmin(1)]
+    assert np.abs(gap / np.sqrt(table[["suu_px2", "svv_px2"]].to_numpy())).max() < 5.0
+    assert len(truth.centres_px) - len(lit) <= len(table) < len(truth.centres_px)
+
+
 def test_rings_are_marked_and_measured_by_their_outer_edge() -> None:
     truth = scene(18.0, size=260)
     image = renderer.render(truth)

@@ -6,7 +6,9 @@ a constant plus a slope along both lines of sight. Ray misses therefore identify
 components of the pose between two telecentric cameras: the shift along n, and the two rotations
 about axes perpendicular to n (roll about the second camera's own axis, and pitch). The others move
 the triangulated point but cause no ray miss; they keep their calibrated values. With perspective
-lenses more components are identifiable, and are estimated too.
+lenses more components are identifiable, and are estimated too. Beside them it is estimated how much
+later than the first camera the second one exposes: its pixels are then ahead by their speed times
+the delay.
 The noise of ray misses comes from pixels, differential shake and bubbles that change shape. It is a
 Gaussian process in time, whose hyper-parameters are learned: white noise of each pair, damped
 oscillations that are common to all pairs of a frame (shake), and an Ornstein-Uhlenbeck process for
@@ -326,6 +328,12 @@ POSE = len(POSE_COMPONENTS)
 FALSE_ALARM = 1e-4
 """Probability of reporting a movement if there is none."""
 
+LATE_SIGMAS = 5.0
+"""Cameras are said not to be synchronous if the delay exceeds so many standard deviations."""
+
+_LATE_S = 0.01
+"""Prior standard deviation of the delay."""
+
 _LEAST_EFFECT = 0.02
 """A direction of movement is estimated if its ray misses are larger than this share of those of the
 direction with the largest ray misses."""
@@ -373,6 +381,8 @@ class RigChange:
     refined : pose rig_from_<camera> that calibration and run give together, or None.
     against : name of the other camera.
     culprit : of more than two cameras the one that has moved, if all others agree; else "".
+    late_s, slate_s : how much later it exposes than the other camera, and the standard deviation;
+        nan if it was not estimated.
     """
 
     camera: str
@@ -387,11 +397,18 @@ class RigChange:
     refined: Pose | None = None
     against: str = ""
     culprit: str = ""
+    late_s: float = float("nan")
+    slate_s: float = float("nan")
 
     @property
     def moved(self) -> bool:
         """Whether calibration errors, shake and bubble shapes do not explain the ray misses."""
         return self.chance < FALSE_ALARM
+
+    @property
+    def unsynchronised(self) -> bool:
+        """Whether the cameras do not expose at the same time."""
+        return abs(self.late_s) > LATE_SIGMAS * self.slate_s
 
     def size_words(self) -> str:
         """Return the identifiable part of the movement in words, with standard deviations."""
@@ -412,6 +429,8 @@ class RigChange:
         out |= {"against": self.against, "culprit": self.culprit}
         out |= {n: float(v) for n, v in zip(names, self.values)}
         out |= {f"s{n}": float(s) for n, s in zip(names, self.sigmas)}
+        if np.isfinite(self.late_s):
+            out |= {"late_s": self.late_s, "slate_s": self.slate_s}
         out |= {
             "place_mm": self.place_mm.tolist(),
             "components": list(POSE_COMPONENTS),
@@ -461,11 +480,13 @@ class RayMisses:
     miss_mm : (M,).
     variance_mm2 : (M,) variances due to the pixels' noise.
     by_rig : (M, P) derivatives with respect to the P parameters of the rig, see `rig_jacobian`.
+    by_pixel : (M, 2, 2) derivatives with respect to the pixels (u, v) in both cameras.
     """
 
     miss_mm: Array
     variance_mm2: Array
     by_rig: Array
+    by_pixel: Array
 
 
 def ray_misses(
@@ -495,10 +516,10 @@ def ray_misses(
     miss, variance = np.zeros(len(points_mm)), np.zeros(len(points_mm))
     if uv_px is not None:
         miss = np.einsum("mi,mi->m", null, uv_px.reshape(-1, 4) - predicted)
+    by_pixel = null.reshape(-1, 2, 2)
     if covariance_px2 is not None:
-        by_camera = null.reshape(-1, 2, 2)
-        variance = np.einsum("mci,mcij,mcj->m", by_camera, covariance_px2, by_camera)
-    return RayMisses(miss, variance, by_rig)
+        variance = np.einsum("mci,mcij,mcj->m", by_pixel, covariance_px2, by_pixel)
+    return RayMisses(miss, variance, by_rig, by_pixel)
 
 
 @dataclass(frozen=True)
@@ -721,8 +742,10 @@ class PairCollector:
         """Add the reliable pairs of a part of the tracks."""
         import pandas as pd
 
-        names = pair_columns([c.name for c in self.calibration.cameras])
-        found = tracks.loc[_reliable(tracks), [n for n in names if n in tracks]]
+        cameras = [c.name for c in self.calibration.cameras]
+        names = pair_columns(cameras) + _speed_columns(cameras)
+        moving = with_speeds(tracks, cameras)
+        found = moving.loc[_reliable(tracks), [n for n in names if n in moving]]
         if not self.parts and len(found):
             self.first = int(found["frame"].iloc[0])
         self.parts.append(self._thinned(found))
@@ -785,6 +808,31 @@ def _seen_by(table: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
     return mine.assign(ray_miss_mm=midpoint(*rays[0], *rays[1])[1])
 
 
+def _speed_columns(cameras: Sequence[str]) -> list[str]:
+    return [f"{camera}_{axis}_px_s" for camera in cameras for axis in "uv"]
+
+
+def with_speeds(tracks: pd.DataFrame, cameras: Sequence[str]) -> pd.DataFrame:
+    """Return a table of tracks with the speed of each pixel (px/s), unless it has them.
+
+    They are central differences; 0 where a bubble was not seen in the frame before or after.
+    """
+    columns = _speed_columns(cameras)
+    if columns[0] in tracks:
+        return tracks
+    order = np.lexsort((tracks["frame"], tracks["particle"]))
+    pixels = [f"{camera}_{axis}_px" for camera in cameras for axis in "uv"]
+    frame, particle = (tracks[c].to_numpy()[order] for c in ("frame", "particle"))
+    t_s, uv = (tracks[c].to_numpy(float)[order] for c in ("t_s", pixels))
+    beside = (frame[2:] - frame[:-2] == 2) & (particle[2:] == particle[:-2])
+    speed = np.zeros(uv.shape)
+    inner = np.flatnonzero(beside)
+    speed[1 + inner] = (uv[2 + inner] - uv[inner]) / (t_s[2 + inner] - t_s[inner])[:, None]
+    back = np.empty_like(speed)
+    back[order] = np.nan_to_num(speed)
+    return tracks.assign(**dict(zip(columns, back.T)))
+
+
 def pair_columns(cameras: Sequence[str]) -> list[str]:
     """Return the names of the columns of tracks.csv that `rig_change` uses."""
     pixels = ("u_px", "v_px", "du_px", "dv_px", "suu_px2", "suv_px2", "svv_px2")
@@ -804,7 +852,8 @@ def rig_change(
     if len(calibration.cameras) != 2 or len(tracks) < LEAST_PAIRS:
         return None
     cameras = (calibration.cameras[0], calibration.cameras[1])
-    table = _without_outliers(tracks.loc[_reliable(tracks)])
+    names = [c.name for c in cameras]
+    table = _without_outliers(with_speeds(tracks, names).loc[_reliable(tracks)])
     if len(table) < LEAST_PAIRS or table["frame"].nunique() < _LEAST:
         return None
     movement = Movement.of(cameras, 1, 0, prior or DriftPrior())
@@ -813,14 +862,17 @@ def rig_change(
     root = covariance_root(with_drift(covariance, movement), singular=1e-12)
 
     def series_of(part: pd.DataFrame) -> Series:
-        misses = ray_misses(cameras, free, _points(part), *_pixels(part, [c.name for c in cameras]))
+        misses = ray_misses(cameras, free, _points(part), *_pixels(part, names))
+        speed = part[_speed_columns(names)].to_numpy(float).reshape(-1, 2, 2)
+        # half of it in each view, for then errors of both speeds and curved paths cancel
+        by_delay = 0.5 * _LATE_S * np.einsum("mci,mci,c->m", misses.by_pixel, speed, [-1.0, 1.0])
         return Series(
             part["frame"].to_numpy(np.int64),
             part["particle"].to_numpy(np.int64),
             part["t_s"].to_numpy(float),
             misses.miss_mm,
             misses.variance_mm2 / float(np.median(misses.variance_mm2)),
-            misses.by_rig @ root,
+            np.column_stack([misses.by_rig @ root, by_delay]),
         )
 
     scale = min(c["scale_px_per_mm"] for c in cameras)
@@ -828,15 +880,21 @@ def rig_change(
     if found is None:
         return None
     unit, spreads, noise, used = found
-    rig = root @ unit
+    late, slate = _LATE_S * float(unit[-1]), _LATE_S * float(np.sqrt(spreads[1][-1, -1]))
+    if abs(late) <= LATE_SIGMAS * slate:  # then the cameras are taken to be synchronous
+        hold = np.eye(len(unit))
+        hold[:, -1] -= spreads[0][:, -1] / spreads[0][-1, -1]
+        unit, spreads = hold @ unit, (hold @ spreads[0] @ hold.T, hold @ spreads[1] @ hold.T)
+    rig = root @ unit[:-1]
     (tangent, own), (_, with_shapes) = (
-        drift_posterior(rig, root @ spread @ root.T, covariance, movement) for spread in spreads
+        drift_posterior(rig, root @ spread[:-1, :-1] @ root.T, covariance, movement)
+        for spread in spreads
     )
     change = rig_change_from(cameras, tangent, own, drift, _points(table).mean(0), used)
     t = np.unique(table["t_s"].to_numpy(float))
     seen_s = float(np.median(np.diff(t)) * len(table))
     chance = p_value_of(tangent, with_shapes, drift) if seen_s >= LEAST_SEEN_S else 1.0
-    return replace(change, chance=chance), noise
+    return replace(change, chance=chance, late_s=late, slate_s=slate), noise
 
 
 def _reliable(tracks: pd.DataFrame) -> Bools:
@@ -910,6 +968,13 @@ def with_change(
             f"Camera {change.camera!r} has moved against {change.against!r} since the "
             f"calibration{unsure}, {change.size_words()}. All positions are wrong because of this "
             f"movement. Calibrate again{REFINE if len(names) == 2 or change.culprit else ''}."
+        )
+    if change is not None and change.unsynchronised:
+        late = _rounded(1e3 * change.late_s, 1e3 * change.slate_s)
+        words.append(
+            f"Camera {change.camera!r} exposes {late} ms after {change.against!r}: positions of "
+            "moving bubbles are off by half the way that they move in this time, and ray misses "
+            "are larger. Trigger both cameras by one signal, and compare their delays."
         )
     if change is not None and change.culprit:
         words.append(f"The other cameras agree, so it is {change.culprit!r} that has moved.")

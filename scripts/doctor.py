@@ -5,11 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from telerig.scripts.console import EXIT_REJECTED, errors_in_words, run_file, say
+from telerig.command_options import TrackingOptions
+from telerig.scripts import options
+from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, run_file, say
+
+if TYPE_CHECKING:
+    from telerig.estimator.doctor.checks import Check
 
 _SIGNS = {"ok": "ok", "note": "note", "warning": "WARNING", "failure": "FAILURE"}
 _WIDTH = 8
@@ -18,21 +23,34 @@ _WIDTH = 8
 @errors_in_words()
 def doctor(
     dataset: Annotated[Path | None, typer.Argument(help="Dataset or run to check as well.")] = None,
+    frames: Annotated[
+        str, typer.Option("--frames", help="Frames of a run that are tracked and smoothed.")
+    ] = "0:500",
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", help="How long the planned run is [as long as this one]."),
+    ] = None,
+    calibration: options.CalibrationFiles = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for other programs.")] = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Check the installation, the serial ports, and a dataset or a run if one is given.
 
-    Of each run it also estimates how long tracking and smoothing will take.
+    Of each run of a dataset it estimates how long tracking and smoothing will take. A run that is
+    given itself is taken for a trial recording: light, focus, frames, synchrony, sensors and shake
+    are measured, and the verdict that a run of --seconds may expect.
 
     Exit code 0: nothing prevents the work, though there may be warnings. 1: there is a failure.
     """
-    from telerig.estimator.doctor.checks import check_installation, check_ports
+    from telerig.estimator.doctor.checks import check_dataset, check_installation, check_ports
 
     checks = [*check_installation(), *check_ports()]
     if dataset is not None:
-        from telerig.estimator.doctor.checks import check_dataset
-
         checks += check_dataset(dataset)
+        if dataset.resolve().parent.name == "runs":
+            sensors = f"run {dataset.resolve().name} sensors"  # the trial says more of them
+            checks = [c for c in checks if c.what != sensors or c.status == "ok"]
+            checks += _recording(dataset, frames, seconds, calibration, quiet or as_json)
     if as_json:
         say(json.dumps([asdict(check) for check in checks], indent=1, ensure_ascii=False))
     else:
@@ -43,6 +61,34 @@ def doctor(
                 say(f"{'':{_WIDTH + width + 2}}-> {check.todo}")
     if any(check.status == "failure" for check in checks):
         raise typer.Exit(EXIT_REJECTED)
+
+
+def _recording(
+    run: Path, frames: str, seconds: float | None, files: list[Path] | None, quiet: bool
+) -> tuple[Check, ...]:
+    """Check a run as a trial recording."""
+    from telerig.errors import TelerigError
+    from telerig.estimator.batch.work import load_with
+    from telerig.estimator.calibration.result.calibration import calibration_for
+    from telerig.estimator.doctor.checks import Check
+    from telerig.estimator.doctor.recording import check_recording
+
+    count = TrackingOptions(frames=frames).first_frames
+    try:
+        calibration, _ = calibration_for(run, files)
+    except TelerigError as error:
+        return (Check("trial recording", "note", f"not looked at: {error.what}", error.todo),)
+    try:
+        found = (run / "detections.csv").is_file()
+        recorded = load_with(run, calibration, "detections" if found else None)
+        with progress(quiet) as stage:
+            return check_recording(
+                recorded.first(count or recorded.frame_count), calibration, seconds=seconds,
+                progress=stage,
+            ).checks  # fmt: skip
+    except TelerigError as error:
+        words = f"{error.where}: {error.what}" if error.where else error.what
+        return (Check("trial recording", "failure", words, error.todo),)
 
 
 if __name__ == "__main__":

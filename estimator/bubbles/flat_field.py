@@ -60,13 +60,13 @@ def nothing_to_see(image: NDArray[Any]) -> str:
         return "the image is black"
     if high - low > _UNIFORM_SHARE * high:
         return ""
-    if image.dtype.kind in "ui" and high >= _WHITE_SHARE * _full_scale(image):
+    if image.dtype.kind in "ui" and high >= _WHITE_SHARE * full_scale(image):
         return "the image is saturated"
     return "the image is uniform"
 
 
-def _full_scale(image: NDArray[Any]) -> float:
-    """White of the image's type; 16 bits may hold 10, 12 or 14."""
+def full_scale(image: NDArray[Any]) -> float:
+    """Return the grey level of white in an image; 16 bits may hold 10, 12 or 14."""
     if image.dtype.itemsize == 1:
         return 255.0
     high = float(image.max())
@@ -83,7 +83,7 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
     clipped = bool(
         image.dtype.kind in "ui"
         and np.mean(sample == sample.max()) > _CLIPPED_SHARE
-        and sample.max() >= _WHITE_SHARE * _full_scale(image)
+        and sample.max() >= _WHITE_SHARE * full_scale(image)
     )
     return ratio, clipped
 

@@ -13,6 +13,8 @@ from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
 
 _FLOATING_M_S2 = 0.6
 _DOUBLED = (1.8, 2.2)
+_SEEN = 0.3
+"""Share of gravity along an axis from which on it matters that the axis does not show it."""
 _FIT = 1.5
 _PARTS, _CLEAR_SIGMAS = 8, 4.0
 """A record determines gravity to 4 times the standard error that the medians of 8 parts give."""
@@ -29,8 +31,12 @@ _STEP_S, _KNOTS, _LEAST_OVERLAP_S = 0.005, 5, 0.3
 def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> list[Finding]:
     """Return what is wrong with unit, gravity and axes of one sensor.
 
-    up : (3,) unit vector against gravity in rig axes. gravity_m_s2 : of the laboratory.
+    up : (3,) unit vector against gravity in rig axes. gravity_m_s2 : of the laboratory. Nothing can
+    be said if gravity acts along an axis that never changes and is therefore not used.
     """
+    still = [i for i in sensor.unused_axes if np.ptp(sensor.reading_m_s2[:, i]) == 0]
+    if np.any(np.abs(sensor.axes[still] @ np.asarray(up, float)) > _SEEN):
+        return []
     return _check_gravity(sensor, np.asarray(up, float), gravity_m_s2) or check_axes(sensor, up)
 
 

@@ -13,6 +13,7 @@ from telerig.errors import InputError
 from telerig.estimator.sensors.accelerometer_checks import check_accelerometer
 from telerig.estimator.sensors.findings import Code, Finding, SensorError, settled
 from telerig.estimator.sensors.given import given_sensors, longest_increase, numbers, table_columns
+from telerig.estimator.sensors.samples import screened
 from telerig.io.rig_file.description import AccelerometerDescription
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
 
@@ -101,6 +102,13 @@ def test_gravity_missing_or_contained_twice(factor: float, code: str) -> None:
     assert [f.code for f in found] == [code]
     mended, _ = given(a_m_s2=sensor.reading_m_s2 + found[0].fix["add_m_s2"], axes=axes)
     assert check_accelerometer(mended, UP, STANDARD_GRAVITY_M_S2) == []
+
+
+def test_a_dead_axis_along_gravity_is_no_removed_gravity() -> None:
+    sensor, _ = given(a_m_s2=readings() * np.where(np.abs(UP) > 0, 0.0, 1.0))
+    kept, found = screened(sensor)
+    assert len(kept.unused_axes) == 1 and any("never changes" in f.words for f in found)
+    assert check_accelerometer(kept, UP, STANDARD_GRAVITY_M_S2) == []
 
 
 def test_axes_against_gravity_are_refused_and_the_fix_is_right() -> None:

@@ -1,0 +1,203 @@
+"""A trial recording: planted troubles are named, each by its check, and sound ones are not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+import telerig
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
+from telerig.estimator.doctor import recording
+from telerig.estimator.doctor.recording import Recording, check_recording, sensor_shake
+from telerig.estimator.sensors.findings import Code, Finding
+from telerig.io.dataset.run import RunData
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.presets import run_preset
+from telerig.io.simulation.simulate import simulate
+from telerig.scripts.main import app
+
+Image = NDArray[np.uint8]
+
+
+@dataclass
+class Shown:
+    """Images (None for missing ones) in place of a run's."""
+
+    images: list[Image | None]
+    rig: None = None
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.images)
+
+    def image(self, camera: str, frame: int) -> Image | None:
+        return self.images[frame]
+
+
+def pictures(level: float = 170.0, edge: float = 1.0, count: int = 30) -> list[Image | None]:
+    """A disc that falls before a backlight whose left edge has a share of the right's."""
+    rng = np.random.default_rng(3)
+    light = level * np.linspace(edge, 1.0, 128)[None, :] * np.ones((128, 1))
+    out: list[Image | None] = []
+    for frame in range(count):
+        image = light + rng.normal(0, 2, light.shape)
+        cv2.circle(image, (64, 30 + 2 * frame), 12, 10, -1, cv2.LINE_AA)
+        out.append(np.clip(image, 0, 255).astype(np.uint8))
+    return out
+
+
+def without(images: list[Image | None], frame: int) -> list[Image | None]:
+    return [*images[:frame], None, *images[frame + 1 :]]
+
+
+def twice(images: list[Image | None], frame: int) -> list[Image | None]:
+    return [*images[:frame], images[frame - 1], *images[frame + 1 :]]
+
+
+@pytest.mark.parametrize(
+    ("images", "failed"),
+    [
+        (pictures(), []),
+        (pictures(30.0), ["light"]),
+        (pictures(300.0), ["saturation"]),
+        (pictures(edge=0.1), ["evenness"]),
+        (without(pictures(), 7), ["missing frames"]),
+        (twice(pictures(), 7), ["doubled frames"]),
+        ([None, None], ["images"]),
+    ],
+)
+def test_light_and_frames_of_a_camera(images: list[Image | None], failed: list[str]) -> None:
+    run: Any = Shown(images)
+    found = [c for c in recording._images(run, "left") if c.status == "failure"]
+    assert [c.what.removesuffix(" of left") for c in found] == failed
+    assert all(c.todo for c in found)
+
+
+def test_frames_that_the_times_lack_are_counted() -> None:
+    t_s = np.delete(np.arange(100) / 250, [20, 21, 50])
+    (check,) = recording._steps(SimpleNamespace(t_s=t_s, frame_count=97))  # type: ignore[arg-type]
+    assert check.status == "failure" and check.words.startswith("3 frames of 100")
+
+
+def test_the_shake_by_an_accelerometer_is_that_of_a_sine() -> None:
+    t = np.arange(8000) / 2000
+    turn = 2 * np.pi * 31.0
+    table = pd.DataFrame({"t_s": t, "sensor": "arm", "ax_m_s2": 0.0, "az_m_s2": 0.0})
+    table["ay_m_s2"] = 9.81 + 1e-3 * 0.5 * turn**2 * np.sin(turn * t)
+    found = sensor_shake(SimpleNamespace(accelerometers=table))  # type: ignore[arg-type]
+    assert found == (pytest.approx(0.5 / np.sqrt(2), rel=0.02), pytest.approx(31.0))
+
+
+def test_only_refused_sensors_are_left_out() -> None:
+    table = pd.DataFrame({"sensor": ["a", "b"], "t_s": [0.0, 0.0]})
+    run: Any = Records(table, pd.DataFrame())
+    axes = Finding("", "x.csv, sensor b", "", Code.SENSOR_AXES, {"sensor": "b"})
+    assert list(recording._without_refused(run, [axes]).accelerometers["sensor"]) == ["a"]
+    encoder = Finding("", "stage.csv", "", Code.ENCODER_SIGN)
+    assert recording._without_refused(run, [encoder]).stage is None
+
+
+@dataclass(frozen=True)
+class Records:
+    accelerometers: pd.DataFrame | None
+    stage: pd.DataFrame | None
+    position_mm: None = None
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunData, telerig.Calibration]:
+    """Three bubbles from tables, with encoder and a sensor on each arm."""
+    base = run_preset("rise")
+    config = replace(
+        base, frames=150, frame_rate_hz=250.0, bubbles=3,
+        stage=replace(base.stage, accelerometers=("left", "right")),
+        bubble=replace(base.bubble, d_eq_mm=(3.0, 4.0)),
+        motion=replace(base.motion, spread=(0.3, 0.3)),
+    )  # fmt: skip
+    folder = tmp_path_factory.mktemp("trial") / "rise"
+    simulate(config, rng=np.random.default_rng(5), out=folder, images=False)
+    cameras = list(true_cameras(config.calibration).values())
+    return telerig.load_run(folder / "runs" / "rise"), calibration_from_cameras(cameras)
+
+
+def failed(found: Recording) -> list[str]:
+    return [check.what for check in found.checks if check.status == "failure"]
+
+
+def test_a_sound_recording_passes_and_expects_its_verdict(
+    trial: tuple[RunData, telerig.Calibration],
+) -> None:
+    found = check_recording(*trial)
+    assert failed(found) == []
+    assert found.smoothing is not None and found.expected is not None
+    assert found.expected.verdict == "RESOLVED"
+    assert {"synchrony", "cameras since calibration", "sensors", "expected verdict"} <= {
+        check.what for check in found.checks
+    }
+
+
+def in_g(run: RunData) -> RunData:
+    assert run.accelerometers is not None
+    columns = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
+    table = run.accelerometers
+    return replace(run, accelerometers=table.assign(**{c: table[c] / 9.80665 for c in columns}))
+
+
+def dead(run: RunData) -> RunData:
+    assert run.accelerometers is not None
+    return replace(run, accelerometers=run.accelerometers.assign(ay_m_s2=0.0))
+
+
+def late(run: RunData) -> RunData:
+    """The right camera's detections are those of the frame after."""
+    table = run.detections
+    assert isinstance(table, pd.DataFrame)
+    right = table["camera"] == "right"
+    shifted = table.assign(frame=table["frame"] - right.astype(int))
+    return replace(run, detections=shifted[shifted["frame"] >= 0].reset_index(drop=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("plant", "named"), [(in_g, "sensors"), (dead, "sensors"), (late, "synchrony")]
+)
+def test_planted_troubles_are_named(
+    trial: tuple[RunData, telerig.Calibration],
+    plant: Callable[[RunData], RunData],
+    named: str,
+) -> None:
+    run, calibration = trial
+    assert named in failed(check_recording(plant(run), calibration))
+
+
+def test_the_command_looks_at_a_calibrated_run_and_ends_with_1_for_a_trouble(
+    tank_copy: Path,
+) -> None:
+    run = tank_copy / "runs" / "rise"
+    file = run / "frames.csv"
+    rows = file.read_text().splitlines()
+    late = [f"{r.split(',')[0]},{float(r.split(',')[1]) + 0.05}" for r in rows[12:]]
+    file.write_text("\n".join([*rows[:12], *late]) + "\n")
+    result = CliRunner().invoke(app, ["doctor", str(run), "--json"])
+    assert result.exit_code == 1
+    checks = {c["what"]: c["status"] for c in json.loads(result.output)}
+    assert checks["times of the frames"] == "failure" and checks["motion"] == "ok"
+    assert {"shake of left", "expected verdict"} <= set(checks)
+
+
+def test_a_run_without_a_calibration_is_told_so(tank_copy: Path) -> None:
+    (tank_copy / "results" / "calibration" / "calibration.json").unlink()
+    result = CliRunner().invoke(app, ["doctor", str(tank_copy / "runs" / "rise"), "--json"])
+    (check,) = [c for c in json.loads(result.output) if c["what"] == "trial recording"]
+    assert check["status"] == "note" and check["todo"]

@@ -41,11 +41,12 @@ def frame_grid(t_s: Array, noise_mm: float, sensed_rms: Callable[[Grid], float] 
         the grid's kernel; None without sensors, for a kernel of medium width.
     """
     pace = float(np.median(np.diff(t_s)))
-    step = pace / np.ceil(pace / _COARSEST_STEP_S - 1e-9)
+    steps = int(np.ceil(pace / _COARSEST_STEP_S - 1e-9))
+    step = pace / steps
     count = int((t_s[-1] - t_s[0]) / step + 1e-6) + 1
     least = max(2, round(_LEAST_FRAMES * pace / step))
     knots = sorted({max(round(width / step), least) for width in _WIDTHS_S})
-    grids = [Grid(float(t_s[0]), step, count, k) for k in knots]
+    grids = [Grid(float(t_s[0]), step, count, k, steps) for k in knots]
     if sensed_rms is None:
         return grids[len(grids) // 2]
     for grid in grids:

@@ -32,7 +32,9 @@ class Expected:
     values : (n,) acceleration in mm/s^2 along it.
     known : (n,) whether it is known.
     whole : whether it is the sensor's complete acceleration along the direction, which then gives
-        the sensor's gain. That of the stage is not: an arm also moves relative to the stage.
+        the sensor's gain. That of the stage or of another arm is not: beyond its resonance an arm
+        moves in the opposite direction. It only tells which axes replace stated ones that gravity
+        excludes.
     """
 
     direction: Array
@@ -81,7 +83,8 @@ def mounting(
 ) -> Mounting:
     """Return the axes and the gain of a sensor that agree best with gravity and expected motion.
 
-    All signed permutations of the stated axes are compared.
+    All signed permutations of the stated axes are compared, by what is whole alone if the stated
+    ones agree with gravity.
 
     axes : (3, 3) stated direction of each of the sensor's axes.
     at_rest : (3,) median reading, which has to point along up (3,).
@@ -97,7 +100,8 @@ def mounting(
         upright[:] = True
     candidates = turned[upright]
     stated = np.flatnonzero(np.abs(candidates - axes).max((1, 2)) < 1e-9)
-    parts = [p for f in expected if (p := _Part.of(f, x, known)) is not None]
+    judging = [f for f in expected if f.whole or not len(stated)]
+    parts = [p for f in judging if (p := _Part.of(f, x, known)) is not None]
     if not parts:
         found = axes if len(stated) else candidates[0]
         return Mounting(found, not len(stated), 0.0, float("nan"), float("inf"))
@@ -196,18 +200,3 @@ def preference(y: Array, known: Bools, stated: Array, other: Array) -> float:
         squares.append((max(float(left @ left), 1e-12), effective_size(left, x)))
     size = min(size for _, size in squares)
     return 0.5 * size * float(np.log(squares[0][0] / squares[1][0]))
-
-
-def slope(y: Array, x: Array) -> tuple[float, float]:
-    """Return the regression coefficient of y on x, both (n,), and its standard deviation.
-
-    The means are removed. The standard deviation takes into account that errors are correlated.
-    """
-    y, x = y - y.mean(), x - x.mean()
-    square = float(x @ x)
-    if square <= 0 or len(x) < 20:
-        return float("nan"), float("inf")
-    found = float(x @ y) / square
-    rest = y - found * x
-    size = effective_size(rest, x)
-    return found, float(np.sqrt((rest**2).mean() / square * len(x) / size))

@@ -428,7 +428,8 @@ def _log_evidence(problem: SmoothingProblem) -> float:
     """Return the log marginal likelihood of the middle of a run by the default hyper-parameters."""
     first = max((len(problem.t_s) - _MOST_COMPARED) // 2, 0)
     part = cut_out(problem, first, first + _MOST_COMPARED, most_bubbles=_BUBBLES_COMPARED).problem
-    sensors = tuple(near_frames(s, part.t_s) for s in part.accelerometers)
+    near = (near_frames(s, part.t_s) for s in part.accelerometers)
+    sensors = tuple(s for s in near if len(s.t_s) > 1)
     part = replace(part, accelerometers=thinned(sensors, _COARSE_STEP_S))
     options = Options(covariances=False, robust=False)
     return solve(part, default_model(part), options).log_evidence

@@ -31,8 +31,8 @@ from telerig.estimator.sensors.mounting import (
     Mounting,
     mounting,
     preference,
-    slope,
 )
+from telerig.estimator.sensors.response import CommonGain, Response
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     Accelerometer,
@@ -63,7 +63,7 @@ _FRAME_FACTORS = {
     0.5: "the stated frame rate is half the true one",
     2.0: "the stated frame rate is twice the true one",
 }
-_CLEAR_GAIN, _CLEAR_UNIT, _DOUBTFUL_UNIT = 5.0, 4.0, 2.5
+_CLEAR_GAIN = 5.0
 _CORRELATED = 10.0
 """So many neighbouring pixels of a mark count as one, because the shake moves them alike."""
 
@@ -822,25 +822,17 @@ def _encoder(
         return stuck
     doubtful = {f.fix.get("sensor") for f in refused}
     sensors = [s for s in problem.accelerometers if s.confirmed and s.name not in doubtful]
-    gains = [] if images.encoder is None else _gains(problem, images, images.encoder, sensors)
-    marked = _gain_of_marks(problem)
+    marked, common = _gain_of_marks(problem), None
     if marked is not None:
-        gains.insert(0, marked)
-    weights = np.array([1 / sd**2 for _, sd in gains])
-    if len(gains):
-        gain = float(np.sum(weights * [g for g, _ in gains]) / weights.sum())
-        sd = float(weights.sum() ** -0.5)
+        gain, sd = marked
         usual = _USUAL_GAIN[0] < gain < _USUAL_GAIN[1]
-        finding = _gain_finding(gain, sd, where, "its sign is turned", "it reads {}, not mm")
-        scale = finding.code == Code.ENCODER_SCALE
-        usual |= scale and marked is None and len(problem.t_s) < _LEAST_FRAMES  # arms that flex
-        clear = _CLEAR_GAIN if scale else _CLEAR_UNIT
-        sigmas = 0.0 if usual else min(abs(gain), abs(gain - 1)) / sd
-        if sigmas > clear:
-            return [finding]
-        if sigmas > _DOUBTFUL_UNIT and not scale:
-            may = "its sign may be turned", "it may read {} in place of mm"
-            return [replace(_gain_finding(gain, sd, where, *may), code=None, fix={})]
+        if not usual and min(abs(gain), abs(gain - 1)) > _CLEAR_GAIN * sd:
+            return [_gain_finding(gain, max(3 * sd / abs(gain), 0.02), sd, where)]
+    elif images.encoder is not None:
+        common = CommonGain.of(_responses(problem, images, images.encoder, sensors))
+    if common is not None and (common.excludes(1.0) or common.opposed):
+        gain = -common.gain if common.opposed else common.gain
+        return [_gain_finding(gain, common.reach, common.gain * common.sd, where)]
     judged = clock is not None and clock.clear and len(problem.t_s) >= _LEAST_FRAMES
     if clock is not None and judged and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
         return [
@@ -857,33 +849,23 @@ def _encoder(
     return []
 
 
-def _gains(
+def _responses(
     problem: SmoothingProblem,
     images: _Images,
     encoder: Accelerations,
     sensors: Sequence[Accelerometer],
-) -> list[tuple[float, float]]:
-    """Return ratios of the true motion to the encoder's, with sd: one by images, one by each
-    sensor.
-
-    The images of several cameras count once, because their errors, the bubbles' motion, are the
-    same.
-    """
-    x, out = encoder.values[:, 0], []
-    seen_by = []
-    for camera, _, seen in images.cameras:
-        y = along_axis(problem, camera, seen)
-        if y is not None:
-            known = seen.known & encoder.known
-            seen_by.append(slope(y[known], x[known]))
-    if seen_by:
-        mean, sd = np.mean(seen_by, axis=0)
-        out.append((float(mean), float(sd)))
+) -> list[Response]:
+    """Return the responses of the cameras, as images and sensors show them, to the encoder."""
+    shown = [
+        (values, seen.known)
+        for camera, _, seen in images.cameras
+        if (values := along_axis(problem, camera, seen)) is not None
+    ]
     for sensor in sensors:
         values, there = _at_frames(images, sensor)
-        known = there & encoder.known
-        out.append(slope((values @ sensor.axes @ problem.axis)[known], x[known]))
-    return [(g, sd) for g, sd in out if np.isfinite(g) and np.isfinite(sd) and sd > 0]
+        shown.append((values @ sensor.axes @ problem.axis, there))
+    x = encoder.values[:, 0]
+    return [Response.of(y, x, known & encoder.known) for y, known in shown]
 
 
 def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
@@ -913,28 +895,26 @@ def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
     return gain, max(float(np.sqrt(_CORRELATED * spread / square)), 1e-4)
 
 
-def _gain_finding(gain: float, sd: float, where: str, sign: str, unit: str) -> Finding:
+def _gain_finding(gain: float, reach: float, sd: float, where: str) -> Finding:
     """Return a finding that names the sign or unit which explains a gain.
 
     gain, sd : true motion over the encoder's, and its standard deviation. A gain that no unit
         explains is proposed as a factor only if it is known to 1 %.
-    sign, unit : words for a turned sign, and for another unit with {} in place of its name.
+    reach : largest difference of its logarithm from that of its unit.
     """
     units = {1000.0: "m", 25.4: "inches", 10.0: "cm", 0.001: "µm", 1.0: "mm"}
     size = min(units, key=lambda u: abs(np.log(abs(gain) / u)))
-    known = sd < _KNOWN_GAIN * abs(gain)
-    likely = max(3 * sd / abs(gain), 0.02 if known else 0.3)
-    named = abs(np.log(abs(gain) / size)) < likely and (size != 1.0 or gain < 0)
+    named = abs(np.log(abs(gain) / size)) < reach and (size != 1.0 or gain < 0)
     factor = float(np.copysign(size, gain)) if named else gain
     seen = f"images and sensors show {gain:.4g} ± {sd:.2g} times the motion that it reads"
     todo, fix = f"multiply position_mm by {factor:.6g}", {"encoder_factor": factor}
     if factor == -1.0:
-        words, code = f"{seen}: {sign}", Code.ENCODER_SIGN
+        words, code = f"{seen}: its sign is turned", Code.ENCODER_SIGN
     elif named:
-        words, code = f"{seen}: {unit.format(units[size])}", Code.ENCODER_UNIT
+        words, code = f"{seen}: it reads {units[size]}, not mm", Code.ENCODER_UNIT
     else:
         words, code = f"{seen}: its scale is wrong", Code.ENCODER_SCALE
-        if not known:
+        if not sd < _KNOWN_GAIN * abs(gain):
             todo, fix = "check its unit and its counts per mm", {}
     return Finding(words, where, todo, code, fix)
 

@@ -18,7 +18,7 @@ from telerig.estimator.sensors.accelerations import (
     of_readings,
 )
 from telerig.estimator.sensors.alignment import Alignment, Channel, align
-from telerig.estimator.sensors.mounting import Expected, mounting, preference, slope
+from telerig.estimator.sensors.mounting import Expected, mounting, preference
 
 GRID = Grid(0.0, 0.002, 1000, 5)
 BOX = REAL / "accelerometers"
@@ -168,15 +168,6 @@ def of_motion(rng: Generator) -> Array:
     """Smoothed accelerations along one axis, as images show them."""
     t, place, _ = motion(rng, 0.0)
     return of_positions(GRID, GRID.t_s, place[(t >= 0)][::4][:1000]).values[20:320, 0]
-
-
-def test_a_slope_with_correlated_errors_has_a_true_standard_deviation() -> None:
-    rng, ratios = np.random.default_rng(9), []
-    for _ in range(60):
-        x, error = (np.convolve(rng.normal(size=2000), np.ones(30), "same") for _ in range(2))
-        found, sd = slope(2.0 * x + error, x)
-        ratios.append((found - 2.0) / sd)
-    assert 0.75 < float(np.std(ratios)) < 1.35
 
 
 @pytest.mark.skipif(not BOX.is_dir(), reason="the real records are not here")

@@ -25,13 +25,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from telerig.estimator.bubbles.detect import detect_bubbles
-from telerig.estimator.bubbles.pairing.groups import Matches
-from telerig.estimator.bubbles.pairing.learning import learn_rig
-from telerig.estimator.bubbles.pairing.matching import (
-    compared,
-    shared_axis,
-    view_of,
-)
+from telerig.estimator.bubbles.pairing.groups import Matches, compared, views_of
+from telerig.estimator.bubbles.pairing.learning import default_model, learn_rig
 from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 from telerig.io.images.read import read_image
 from telerig.rig.camera import Camera
@@ -93,8 +88,7 @@ def score(tables: list[pd.DataFrame], known: list[Array], first: Array, second: 
 
 
 def gap_only(tables: list[pd.DataFrame], cameras: tuple[Camera, Camera]) -> tuple[Array, Array]:
-    axis = shared_axis(cameras)
-    one, two = (view_of(t, c, axis) for t, c in zip(tables, cameras))
+    one, two = views_of(tables, default_model(cameras))
     gap = compared(cameras, one.take(np.s_[:, None]), two.take(None)).gap_px
     rows, columns = linear_sum_assignment(np.minimum(np.abs(gap), 6.0))
     kept = np.abs(gap[rows, columns]) < 6.0

@@ -29,7 +29,7 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.bubbles.pairing.matching import Finding
+from telerig.estimator.bubbles.pairing.model import Finding
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.triangulation import (
@@ -45,7 +45,7 @@ from telerig.statistics import robust_sd
 if TYPE_CHECKING:
     import pandas as pd
 
-    from telerig.estimator.bubbles.pairing.matching import PairModel
+    from telerig.estimator.bubbles.pairing.model import PairModel
     from telerig.estimator.calibration.result.calibration import Calibration
 
 

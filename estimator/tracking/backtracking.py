@@ -73,7 +73,7 @@ class Bubbles(Rows):
 
         offset_px : (C, 2) shift of all detections of each camera.
         """
-        found = [(x - by @ off, p, by) for (x, p, by), off in zip(sight.rays, offset_px)]
+        found = [(x - by @ off, p, by) for (x, p, by), off in zip(sight.candidates.rays, offset_px)]
         points, covariances, by_pixel = map(np.concatenate, zip(*found))
         mm_per_px = np.linalg.det(by_pixel.mT @ by_pixel) ** 0.25
         many = [len(ids) for ids in sight.given]
@@ -104,8 +104,6 @@ class Bubbles(Rows):
 class Sight:
     """Hold the detections of one frame as arrays; tuples have an entry for each camera.
 
-    rays : the centres in space, as `triangulation.on_rays` returns them; the share of the unknown
-        shape is in their covariances.
     centre_px : (N, 5) the columns CENTRE_PX, with the share of the unknown shape.
     a_px, d_eq_px : (N,) major semi-axes and equivalent diameters.
     given : (N,) ids given by the user, -1 for none.
@@ -114,7 +112,6 @@ class Sight:
     left_px : (E, C, 2) pixels less those of the points; NaN where a camera does not see it.
     """
 
-    rays: tuple[tuple[Array, Array, Array], ...]
     centre_px: tuple[Array, ...]
     a_px: tuple[Array, ...]
     d_eq_px: tuple[Array, ...]

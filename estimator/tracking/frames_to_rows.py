@@ -15,13 +15,13 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
 from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.bubbles.pairing.groups import (
     Candidates,
-    Pixels,
-    Places,
-    RigModel,
+    Groups,
+    View,
     candidates,
     match,
-    places_of,
+    views_of,
 )
+from telerig.estimator.bubbles.pairing.model import RigModel
 from telerig.estimator.bubbles.shape.body import Bodies, body_columns, fit_bodies
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
@@ -47,7 +47,6 @@ from telerig.estimator.tracking.filter import (
 )
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import on_rays
 
 _BUBBLES_AT_ONCE = 512
 """Bubbles whose bodies are fitted and whose rows are written together."""
@@ -89,25 +88,22 @@ class RowMaker:
     def sights(self, frames: Sequence[Tables]) -> list[Sight]:
         """Return the detections of several frames as arrays; all frames at once are quicker."""
         counts = np.array([[len(table) for table in tables] for tables in frames], np.int64)
-        pixels, ids, joined, of_cameras = [], [], [], []
-        for c, tables in enumerate(zip(*frames)):
-            table = pd.concat(tables, ignore_index=True)
-            pixels.append(_pixels(table, self._wander))
-            ids.append(_given_ids(table))
+        joined = [pd.concat(tables, ignore_index=True) for tables in zip(*frames)]
+        views = views_of(joined, self.model, WANDER * self.shapes.third)
+        ids, of_cameras = [_given_ids(table) for table in joined], []
+        for c, (table, view) in enumerate(zip(joined, views)):
             a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
-            joined.append(table)
             flags = ["|".join(words) for words in flag_words(table)]
-            uv, noise = pixels[c]
-            centre = np.column_stack([uv, noise[:, *np.triu_indices(2)]])
-            rays = on_rays(self.cameras[c], *pixels[c])
+            noise = view.covariance_px2[:, *np.triu_indices(2)]
+            centre = np.column_stack([view.uv_px, noise])
             ends = np.cumsum([0, *counts[:, c]]).tolist()
             of_cameras.append(
                 [
-                    (tuple(r[p] for r in rays), centre[p], a[p], d_eq[p], ids[c][p], flags[p])
+                    (centre[p], a[p], d_eq[p], ids[c][p], flags[p])
                     for p in (slice(low, high) for low, high in pairwise(ends))
                 ]
             )
-        possible = self._possible(pixels, ids, joined, counts)
+        possible = self._possible(views, ids, joined, counts)
         every: list[tuple[Any, ...]] = [
             (*zip(*own), *groups) for *own, groups in zip(*of_cameras, possible)
         ]
@@ -115,7 +111,7 @@ class RowMaker:
 
     def _possible(
         self,
-        pixels: Sequence[Pixels],
+        views: Sequence[View],
         ids: Sequence[Ints],
         tables: Sequence[pd.DataFrame],
         counts: Ints,
@@ -125,12 +121,10 @@ class RowMaker:
         counts : (F, C) detections of the frames, which follow each other in the other arguments.
         """
         barred = [own != NO_PARTICLE for own in ids]
-        found = candidates(tables, pixels, counts, self.model, barred=barred)
+        found = candidates(views, counts, self.model, barred)
         frames = [np.repeat(np.arange(len(counts)), many) for many in counts.T]
         named, of_named = _named(ids, frames)
-        at = Places.concat(
-            [places_of(self.cameras, pixels, named), *(f.groups.places for f in found)]
-        )
+        at = Groups.concat([Groups.of(self.model, views, named), *(f.groups for f in found)])
         starts = np.cumsum(counts, axis=0) - counts
         rows = [np.where(named >= 0, named - starts[of_named], -1)]
         rows += [one.groups.rows for one in found]
@@ -189,11 +183,6 @@ class RowMaker:
         self._take_final(result)
         enough = self._waiting >= _BUBBLES_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
         return self._flush(FRAMES_AFTER) if enough else None
-
-    @property
-    def _wander(self) -> float:
-        """Sd of the shift of an outline's centre by a bubble's shape, as a share of its radius."""
-        return WANDER * self.shapes.third
 
     def finish(self) -> Linked | None:
         """Return the remaining rows at the end of the run; None if there are none."""
@@ -357,14 +346,6 @@ def grouped_frame(
     single = rays.given == NO_PARTICLE
     single[at[at >= 0]] = False
     return Bubbles.concat([bubbles, rays.take(single)]), rays, offset
-
-
-def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
-    """Return centres (N, 2) and covariances (N, 2, 2), the unknown shape's share included."""
-    covariance = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
-    radius = np.nan_to_num(table["d_eq_px"].to_numpy(float)) / 2
-    shape = (wander * radius)[:, None, None] ** 2 * np.eye(2)
-    return table[["u_px", "v_px"]].to_numpy(float), covariance.reshape(-1, 2, 2) + shape
 
 
 def _detections(frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.matching import Finding, LogRatioModel, PairModel
+from telerig.estimator.bubbles.pairing.model import Finding, LogRatioModel, PairModel
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.tracking.filter import NO_PARTICLE, TrackEvent
 from telerig.estimator.tracking.frames_to_rows import Linked

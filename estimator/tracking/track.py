@@ -18,8 +18,9 @@ from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
-from telerig.estimator.bubbles.pairing.groups import RigModel, candidates_of, match
+from telerig.estimator.bubbles.pairing.groups import candidates_of, match
 from telerig.estimator.bubbles.pairing.learning import learn_rig
+from telerig.estimator.bubbles.pairing.model import RigModel
 from telerig.estimator.bubbles.shape.lasting import LastingShare
 from telerig.estimator.bubbles.shape.learning import learn_shapes
 from telerig.estimator.bubbles.shape.shapes import Shapes

@@ -10,14 +10,17 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing.evidence import Prediction
-from telerig.estimator.bubbles.pairing.groups import Matches, RigModel, candidates_of, match
-from telerig.estimator.bubbles.pairing.matching import (
-    PairModel,
+from telerig.estimator.bubbles.pairing.groups import (
+    Groups,
+    Matches,
     View,
+    candidates_of,
     compared,
-    shared_axis,
-    view_of,
+    match,
+    views_of,
 )
+from telerig.estimator.bubbles.pairing.learning import default_model
+from telerig.estimator.bubbles.pairing.model import RigModel
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -47,8 +50,8 @@ def table(uv: Any, semi_axes: Any = 16.0, sigma: Any = 0.1, angle: Any = 0.0) ->
 def views(
     first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
 ) -> tuple[View, View]:
-    axis = shared_axis(cameras)
-    return view_of(first, cameras[0], axis), view_of(second, cameras[1], axis)
+    one, two = views_of((first, second), default_model(cameras))
+    return one, two
 
 
 def geometry(first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]) -> Any:
@@ -65,12 +68,9 @@ def match_tables(
     return match(found, model, predicted)
 
 
-def match_pairs(
-    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera], model: PairModel,
-    *, predicted: Prediction | None = None,
-) -> Matches:  # fmt: skip
-    """The pairs of two cameras."""
-    return match_tables((first, second), RigModel.of(cameras, {(0, 1): model}), predicted)
+def groups_of(tables: Sequence[pd.DataFrame], model: RigModel, rows: NDArray[np.int64]) -> Groups:
+    """Groups of given rows of all cameras' tables."""
+    return Groups.of(model, views_of(tables, model), rows)
 
 
 def frame(

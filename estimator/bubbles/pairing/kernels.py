@@ -8,43 +8,11 @@ import numpy as np
 from telerig.arrays import Array, Bools, Ints
 from telerig.compiled import compiled
 
-GAP_GATE2 = 25.0
-"""Largest square of a true pair's gap, in variances of its wide part: wider than the gate of
-predictions, because what disturbs an outline is no Gaussian noise."""
-
-NEVER = -1e6
-"""Log odds of what is impossible."""
-
-TAIL, LEAST_TAIL_PX2, MOST_TAIL_PX2 = 0.02, 0.25, 1.0
-"""Share of outlines that are disturbed, and limits of the variance that this adds to a gap."""
-
 _EXACT_SIDE = 11
 """Columns of a component with exact probabilities: 2**11 subsets."""
 
 _LARGEST_EXPONENT = 600.0
 """Of the product of all rows' odds to have no partner: exp(-745) is 0."""
-
-SHIFT_PASSES = 4
-"""Turns of probabilities and the shift that all gaps of a frame share."""
-
-
-def gap_log_odds(
-    gap: Array, variance: Array, shift: float, uncertainty: float, span_px: float, out: Array
-) -> None:
-    """Write into ``out`` (E,) log odds from gaps (px), less their shift (px), and variances
-    (px^2), to which the shift's is added.
-
-    The density of a true pair's gap is normal with wider tails (for disturbed outlines), and 0
-    beyond a limit. It is compared with a uniform density over the span that both images cover.
-    """
-    own = variance + uncertainty
-    square = (gap - shift) ** 2
-    wide = own + np.clip(3.0 * own, LEAST_TAIL_PX2, MOST_TAIL_PX2)
-    core = np.exp(-0.5 * square / own)
-    tail = np.exp(-0.5 * square / wide) * np.sqrt(own / wide)
-    density = ((1.0 - TAIL) * core + TAIL * tail) / np.sqrt(2.0 * np.pi * own)
-    odds = np.log(np.maximum(density * span_px, 1e-300))
-    out[:] = np.where(square < GAP_GATE2 * wide, odds, NEVER)
 
 
 @compiled
@@ -218,36 +186,3 @@ def marginals(log_odds: Array, rows: Ints, counts: Ints, negligible: float) -> A
     places = np.ascontiguousarray(np.where(rows < 0, -1, rows + first), np.int64)
     _marginals(np.ascontiguousarray(log_odds), places, int(counts.sum()), negligible, out)
     return out
-
-
-def common_shift(
-    gap: Array,
-    variance: Array,
-    appearance: Array,
-    rows: Ints,
-    counts: Ints,
-    frame_px: float,
-    span_px: float,
-    least: float,
-) -> tuple[Array, float, float]:
-    """Estimate the shift that all gaps of a frame share; see `groups.match`.
-
-    gap, variance : (E,) gaps less their bias (px), and variances (px^2).
-    appearance : (E,) log odds from everything but the gaps
-    rows, counts, least : see `marginals`.
-
-    Returns the log odds (E,) of all pairs, the shift (px) and its variance (px^2).
-    """
-    shift, uncertainty = 0.0, frame_px * frame_px
-    odds = np.empty(gap.shape)
-    gap_log_odds(gap, variance, shift, uncertainty, span_px, odds)
-    odds += appearance
-    for _ in range(SHIFT_PASSES if frame_px > 0.0 else 0):
-        probability = marginals(odds, rows, counts, least)
-        off = (gap - shift) ** 2
-        weight = probability / variance / (1.0 + off / (4.0 * (variance + uncertainty)))
-        uncertainty = 1.0 / (1.0 / (frame_px * frame_px) + float(weight.sum()))
-        shift = float(weight @ gap) * uncertainty
-        gap_log_odds(gap, variance, shift, uncertainty, span_px, odds)
-        odds += appearance
-    return odds, shift, uncertainty

@@ -6,11 +6,12 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
-from matching_scenes import Array, geometry, rig, table, views
+from matching_scenes import Array, geometry, groups_of, rig, table, views
 
 from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONIC_COLUMNS, HARMONICS
 from telerig.estimator.bubbles.pairing import kernels
-from telerig.estimator.bubbles.pairing.matching import NEGLIGIBLE, outline_extent
+from telerig.estimator.bubbles.pairing.groups import NEGLIGIBLE, outline_extent
+from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.rig.pose import Pose
 
 # Geometry
@@ -42,9 +43,27 @@ def test_variance_of_the_gap_is_its_spread() -> None:
     covariance = np.array([[0.05, 0.02], [0.02, 0.03]])
     uv = [c.project(point) + rng.multivariate_normal([0, 0], covariance, 900) for c in cameras]
     tables = [table(p, 1e-6).assign(suu_px2=0.05, suv_px2=0.02, svv_px2=0.03) for p in uv]
-    found = geometry(tables[0], tables[1], cameras)
-    spread = np.var(np.diag(found.gap_px))
-    assert spread == pytest.approx(found.variance_px2[0, 0], rel=0.15)
+    rows = np.tile(np.arange(900)[:, None], 2)
+    found = groups_of(tables, default_model(cameras), rows)
+    spread = np.var(found.innovation_px)
+    assert spread == pytest.approx(found.noise_px2[0, 0, 0], rel=0.15)
+
+
+@pytest.mark.parametrize("angle_deg", [50.0, 90.0, 130.0])
+def test_images_anywhere_have_gaps_anywhere_in_the_span(angle_deg: float) -> None:
+    cameras = rig(angle_deg)
+    model = default_model(cameras)
+    points = np.random.default_rng(2).uniform(-15, 15, (9, 3))
+    tables = [table(c.project(points)) for c in cameras]
+    found = groups_of(tables, model, np.tile(np.arange(9)[:, None], 2))
+    # the innovation is the gap over sqrt(2), and its density that of a normal distribution
+    span = model.pairs[0, 1].span_px / 2**0.5
+    np.testing.assert_allclose(found.constant, np.log(span) - np.log(2 * np.pi) / 2, atol=1e-6)
+    gap = np.diag(geometry(*tables, cameras).gap_px)
+    moved = tables[0].assign(v_px=tables[0]["v_px"] + 1.0)
+    more = groups_of([moved, tables[1]], model, np.tile(np.arange(9)[:, None], 2))
+    change = np.diag(geometry(moved, tables[1], cameras).gap_px) - gap
+    np.testing.assert_allclose(change**2, 2 * more.innovation_px[:, 0] ** 2, rtol=1e-3)
 
 
 @pytest.mark.parametrize("angle_deg", [50.0, 90.0, 130.0])
@@ -65,7 +84,7 @@ def test_an_ellipsoid_has_one_height_in_both_views(angle_deg: float) -> None:
         found = geometry(*tables, cameras)
         assert found.size[0, 0, 0] == pytest.approx(0, abs=1e-12)
         assert found.gap_px[0, 0] == pytest.approx(0, abs=1e-9)
-        half = np.exp(views(*tables, cameras)[0].log_size[0, 0])
+        half = np.exp(views(*tables, cameras)[0].log_size[0, 0, 0])
         assert half == pytest.approx(np.sqrt(body[1, 1]), rel=1e-12)
 
 

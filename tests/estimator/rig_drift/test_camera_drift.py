@@ -14,7 +14,7 @@ import telerig
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator import rig_drift
 from telerig.estimator.bubbles.pairing.learning import default_model
-from telerig.estimator.bubbles.pairing.matching import Finding
+from telerig.estimator.bubbles.pairing.model import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift import (
     DriftPrior,
@@ -319,7 +319,7 @@ def test_words_say_it_once() -> None:
     pairs.add(Run().tracks(cameras, moved(cameras, along_perpendicular(cameras, 0.08, 0, 0)), rng))
     still.add(Run().tracks(cameras, cameras, rng))
     findings = (Finding.CALIBRATION_OFFSET, Finding.UNCLEAR_OFFSET)
-    model = replace(default_model(cameras), findings=findings)
+    model = replace(default_model(cameras).pairs[0, 1], findings=findings)
     models = {(0, 1): model}
     said = with_change(models, pairs.found(), known)
     assert said["calibration_problem"]
@@ -327,7 +327,8 @@ def test_words_say_it_once() -> None:
     assert "'right'" in said["words"][-1] and "--refine-rig" in said["words"][-1]
     assert with_change(models, still.found(), known)["words"] == model.sentences()
     assert PairCollector(known).found() is None
-    off = with_change(models | {(0, 1): default_model(cameras)}, None, known, (1, 7.0, -4.0))
+    plain = default_model(cameras).pairs
+    off = with_change(models | plain, None, known, (1, 7.0, -4.0))
     assert off["calibration_problem"] and "+7.00 px" in off["words"][-1]
 
 

@@ -13,7 +13,6 @@ from seeds import few_or_many
 
 import telerig
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
-from telerig.estimator.bubbles.pairing.groups import RigModel
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
@@ -28,8 +27,9 @@ Array = NDArray[np.float64]
 CAMERAS = tuple(true_cameras(run_preset("swarm").calibration).values())
 FRAMES, DT_S, NOISE_PX, SHAKE_PX = 28, 0.002, 0.05, 1.0
 FRONT, BACK = 0, 1
-PAIR = replace(default_model(CAMERAS), frame_px=SHAKE_PX * 2**0.5)
-MODEL = RigModel.of(CAMERAS, {(0, 1): PAIR})
+PLAIN = default_model(CAMERAS)
+PAIR = replace(PLAIN.pairs[0, 1], frame_px=SHAKE_PX * 2**0.5)
+MODEL = replace(PLAIN, pairs={(0, 1): PAIR})
 DIAMETERS_MM = np.array([3.6, 2.0, 2.4, 1.8, 2.8, 3.1])
 START_MM = np.array(
     [[0.0, 9.0, 0.0], [3.2, 9.4, 0.3], [-12, 3, 8], [14, -4, -9], [-9, -8, -12], [10, 12, 12]]

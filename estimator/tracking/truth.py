@@ -20,6 +20,11 @@ NEAR_PX = 3.0
 bubble that it is said to show.
 """
 
+NEAR_SD = 3.0
+"""A point also shows a bubble that an image's edge cuts if no pixel is off by more of the standard
+deviations that the point states: the centre of a cut outline can be uncertain by several px.
+"""
+
 
 @dataclass(frozen=True)
 class Score:
@@ -84,13 +89,18 @@ def matched(
     """
     rows_of = truth.groupby("frame").indices
     at, true = (pixels(t, cameras, "{c}_{x}_px").reshape(len(t), -1, 2) for t in (table, truth))
+    sd = np.sqrt(pixels(table, cameras, "{c}_s{x}{x}_px2")).reshape(at.shape)
+    known = truth.assign(row=np.arange(len(truth)), whole=whole(truth, cameras))
+    cut = ~known["whole"].to_numpy()
     chosen = np.full(len(table), np.nan)
     for i, frame in enumerate(table["frame"]):
         rows = rows_of.get(frame, np.zeros(0, int))
-        off = np.linalg.norm(true[rows] - at[i], axis=-1).max(axis=1)
-        if len(rows) and off.min() < NEAR_PX:
-            chosen[i] = rows[off.argmin()]
-    known = truth.assign(row=np.arange(len(truth)), whole=whole(truth, cameras))
+        off = true[rows] - at[i]
+        away = np.linalg.norm(off, axis=-1).max(axis=1)
+        agrees = cut[rows] & (np.abs(off) <= NEAR_SD * sd[i]).all(axis=(1, 2))
+        away[~(agrees | (away < NEAR_PX))] = np.inf
+        if np.isfinite(away).any():
+            chosen[i] = rows[away.argmin()]
     bubble = known.reset_index(drop=True).reindex(chosen).reset_index(drop=True)
     first = bubble["row"].notna() & ~bubble["row"].duplicated()
     return bubble, (first & bubble["whole"].eq(True)).to_numpy(bool)

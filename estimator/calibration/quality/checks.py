@@ -337,11 +337,8 @@ def refuse_wrong_pairs(problem: Problem) -> None:
     A camera may have missed a trigger, or its first image was lost.
     """
     offsets = [s * n for n in range(1, FARTHEST + 1) for s in (1, -1)]
-    seen = np.zeros((len(problem.cameras), len(problem.views)))
-    seen[problem.camera, problem.view] = 1
-    for c in range(1, len(problem.cameras)):
-        other = int(np.argmax(seen[:c] @ seen[c]))
-        own, *shifted = (epipolar_misfits(problem, (other, c), s) for s in (0, *offsets))
+    for pair in combinations(range(len(problem.cameras)), 2):
+        own, *shifted = (epipolar_misfits(problem, pair, s) for s in (0, *offsets))
         least = np.min(shifted, axis=0)
         far = np.isfinite(own) & (own > UNPAIRED) & (least < FAR_BETTER * own)
         if not far.any():
@@ -349,7 +346,7 @@ def refuse_wrong_pairs(problem: Problem) -> None:
         best = np.argmin(shifted, axis=0)
         chosen = int(np.bincount(best[far]).argmax())
         first = int(np.flatnonzero(far & (best == chosen))[0])
-        camera, offset = problem.cameras[c].name, offsets[chosen]
+        camera, offset = problem.cameras[pair[1]].name, offsets[chosen]
         own_view, right_view = problem.views[first], problem.views[first + offset]
         side = "later" if offset > 0 else "earlier"
         raise CalibrationError(

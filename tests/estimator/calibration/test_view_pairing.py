@@ -70,6 +70,17 @@ def test_only_images_of_one_moment_have_one_epipolar_geometry(
     assert checks.epipolar_misfits(right, (0, 1), by).min() > 10 * UNPAIRED
 
 
+@pytest.mark.parametrize("camera", ["middle", "right"])
+@pytest.mark.parametrize("by", [1, -2])
+def test_wrong_images_of_one_of_three_cameras_are_named(camera: str, by: int, scene: Any) -> None:
+    """The images of the third may share more views with the first than those that belong to it."""
+    three = scene("three", 0)
+    checks.refuse_wrong_pairs(problem_from_dots(three.dots, three.cameras, three.target))
+    wrong = problem_from_dots(offset(three.dots, camera, 0, by), three.cameras, three.target)
+    with pytest.raises(CalibrationError, match=f"images of camera '{camera}' do not belong"):
+        checks.refuse_wrong_pairs(wrong)
+
+
 def test_a_target_that_is_not_tilted_shows_nothing_of_the_pairs(paper: Any) -> None:
     """Moved without a turn, a flat target fits all pairs: the refusal is that of parallel views."""
     views = sorted(paper.dots["view"].unique())

@@ -17,7 +17,7 @@ _SEEN = 0.3
 """Share of gravity along an axis from which on it matters that the axis does not show it."""
 _FIT = 1.5
 _PARTS, _CLEAR_SIGMAS = 8, 4.0
-"""A record determines gravity to 4 times the standard error that the medians of 8 parts give."""
+"""A record determines gravity to 4 times the standard error that the means of 8 parts give."""
 
 _TILTED_DEG = 20.0
 _FITS_DEG = 15.0
@@ -41,18 +41,19 @@ def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> l
 
 
 def gravity_of(reading: ArrayLike) -> tuple[Array, float]:
-    """Return the median (3,) of readings (N, 3), and how far off it can be.
+    """Return the mean (3,) of readings (N, 3), and how far off it can be.
 
-    The median is gravity plus bias. In a short record a hard shake moves it.
+    The mean is gravity plus bias, up to the change of velocity over the record. A median is not: a
+    pump whose harmonic is strong moves it by several m/s^2.
     """
     readings = np.asarray(reading, float)
-    parts = np.array([np.median(p, axis=0) for p in np.array_split(readings, _PARTS) if len(p)])
+    parts = np.array([p.mean(axis=0) for p in np.array_split(readings, _PARTS) if len(p)])
     spread = np.linalg.norm(parts.std(axis=0, ddof=1)) if len(parts) > 1 else np.inf
-    return np.median(readings, axis=0), float(_CLEAR_SIGMAS * spread / np.sqrt(len(parts)))
+    return readings.mean(axis=0), float(_CLEAR_SIGMAS * spread / np.sqrt(len(parts)))
 
 
 def _check_gravity(sensor: Sensor, up: Array, gravity_m_s2: float) -> list[Finding]:
-    """Return a finding if the size of the median reading is not gravity."""
+    """Return a finding if the size of the mean reading is not gravity."""
     where, name = sensor.where, sensor.name
     stated = ACCELERATION_UNITS[sensor.unit]
     gravity, off = gravity_of(sensor.reading_m_s2)

@@ -87,7 +87,7 @@ def mounting(
     ones agree with gravity.
 
     axes : (3, 3) stated direction of each of the sensor's axes.
-    at_rest : (3,) median reading, which has to point along up (3,).
+    at_rest : (3,) mean reading, which has to point along up (3,).
     x : (n, 3) readings on the time grid of the expected accelerations.
     known : (n,) whether there is a reading.
     expected : the accelerations that the sensor should measure.

@@ -49,7 +49,11 @@ class Response:
 
     @classmethod
     def of(cls, output: Array, motion: Array, known: Bools) -> Response:
-        """Return the response of an output (N,) to a motion (N,); known : (N,) which samples."""
+        """Return the response of an output (N,) to a motion (N,); known : (N,) which samples.
+
+        How many independent frequencies a band has follows from what the coherence of these
+        spectra would be with random phases: a single line is always coherent, and shows nothing.
+        """
         taper = np.hanning(len(known)) * known
         both = [np.fft.rfft(taper * (v - v[known].mean())) for v in (output, motion)]
         band, gains, coherences, variances = [], [], [], []
@@ -58,9 +62,10 @@ class Response:
             y, x = (spectrum[low:high] for spectrum in both)
             cross, power = complex(np.vdot(x, y)), float(np.vdot(x, x).real)
             whole = power * float(np.vdot(y, y).real)
-            count = (high - low) / _TAPERED
+            by_chance = float((np.abs(x) ** 2) @ (np.abs(y) ** 2)) * _TAPERED
             coherence = min(abs(cross) ** 2 / whole, 1 - 1e-9) if whole > 0 else 0.0
-            if (1 - coherence) ** (count - 1) < FALSE_ALARMS:
+            count = whole / by_chance if by_chance > 0 else 1.0
+            if count > 1 and (1 - coherence) ** (count - 1) < FALSE_ALARMS:
                 band.append(int(np.log2(high)))
                 gains.append(np.log(cross / power))
                 coherences.append(coherence)

@@ -637,7 +637,7 @@ def _mountings(
     def judge() -> dict[str, Mounting]:
         return {
             s.name: mounting(
-                s.axes, np.median(s.reading_mm_s2, axis=0), problem.up, *read[s.name],
+                s.axes, s.reading_mm_s2.mean(0), problem.up, *read[s.name],
                 _expected(problem, images, s, axes, read),
             )
             for s in sensors

@@ -115,13 +115,12 @@ def test_a_scale_that_is_roughly_known_is_taken_for_the_nearest_unit(
     assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": proposed}]
 
 
-@pytest.mark.parametrize("seed", [906, *long((907,))])
-def test_a_turned_encoder_is_told_from_one_that_is_right_by_four_standard_deviations(
-    seed: int,
-) -> None:
-    _, said = placed(seed, "one", scenario="S2", encoder=-1.0)
+@pytest.mark.parametrize(("scenario", "information"), [("S1", "one"), *long(("S2", "references"))])
+def test_a_turned_encoder_is_told_from_one_that_is_right(scenario: str, information: str) -> None:
+    """By the images in three octaves, or by marks. The single line of S2 could be a resonance."""
+    _, said = placed(905, information, scenario=scenario, encoder=-1.0)
     assert [f.code for f in said if f.code is not None] == ["ENCODER_SIGN"]
-    _, said = placed(seed, "one", scenario="S2")
+    _, said = placed(905, information, scenario=scenario)
     assert all(f.code is None for f in said)
 
 
@@ -183,10 +182,11 @@ def test_a_short_sound_run_is_no_fault(scenario: str, seed: int, around_s: float
     assert all(f.code is None for f in said)
 
 
-@pytest.mark.parametrize("number", [12, 30, 21, 45, *long((0,), (6,), (24,))])
+@pytest.mark.parametrize("number", [12, 30, 45, 620, 643, *long((0,), (6,), (21,), (24,), (650,))])
 def test_a_sound_run_of_an_unusual_rig_is_no_fault(number: int) -> None:
     """Arms that resonate beside a servo that hunts; 20 frames a second, whose straight lines make
-    the motion in the images smaller."""
+    the motion in the images smaller; a pump whose harmonic moves the median of the readings by
+    6 m/s^2; an encoder that shows nothing but its noise beside a bubble."""
     problem, _, _, known = problem_of(**drawn(number).inputs)
     assert all(f.code is None for f in with_sensors_aligned(problem, known)[1])
 

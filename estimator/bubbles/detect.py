@@ -242,12 +242,10 @@ def _found(
     if found:
         every = Rims.concat(found)
         own_start = start_outlines(every.ellipse, every.blur_px, every.inner)
-        both = Outlines.concat([start.take(known), own_start])
-        fit = fit_outlines(ratio, both, noise, shadows=True)
-        last = np.arange(np.count_nonzero(known), len(fit))
+        fit = fit_outlines(ratio, own_start, noise, beside=outlines.take(known), shadows=True)
         start = Outlines.concat([start.take(kept), own_start])
-        outlines = Outlines.concat([outlines.take(kept), settled(fit.take(last), every)])
-        merged = np.concatenate([merged[kept], np.zeros(len(last), np.bool_)])
+        outlines = Outlines.concat([outlines.take(kept), settled(fit, every)])
+        merged = np.concatenate([merged[kept], np.zeros(len(fit), np.bool_)])
     elif whole:
         start, outlines = start.take(kept), outlines.take(kept)
         merged = merged[kept]

@@ -245,26 +245,34 @@ def learnt_prior(outlines: Outlines, inner: Array, partial: Bools) -> Array:
 
 
 def fit_outlines(
-    ratio: Float32, start: Outlines, noise: Array, *, shadows: bool = False
+    ratio: Float32,
+    start: Outlines,
+    noise: Array,
+    *,
+    beside: Outlines | None = None,
+    shadows: bool = False,
 ) -> Outlines:
     """Fit the outlines of B bubbles to an image.
 
     ratio : (rows, columns) grey levels divided by the background.
     start : see `start_outlines`.
     noise : (2,) standard deviation of a pixel outside and inside, as shares of the background.
+    beside : outlines of the image that are fitted already and stay.
     shadows : whether the image has shadows of bubbles out of focus or behind others, so that the
         covariance of whole outlines has that, too.
 
-    Pixels inside or near another bubble of ``start`` are left out, and so are glare, dirt and other
-    pixels that do not look like a rim. A first fit to some of the pixels yields blur and levels.
-    The fit to all pixels is repeated for outlines that moved far or are partly hidden. The
-    covariance of the latter has what their residuals show of neighbours that mislead them.
+    Pixels inside or near another bubble are left out, and so are glare, dirt and other pixels that
+    do not look like a rim. A first fit to some of the pixels yields blur and levels. The fit to all
+    pixels is repeated for outlines that moved far or are partly hidden. The covariance of the
+    latter has what their residuals show of neighbours that mislead them.
     """
     image, below = np.ascontiguousarray(ratio, np.float32), 2.0 if shadows else _WHOLE
 
+    others = start.take(slice(0, 0)) if beside is None else beside
     def fitted(outlines: Outlines, own: Index, prior: Array, steps: int) -> Outlines:
         fit = Outlines(outlines.parameters[own], _nothing_shown(len(own)))
-        rims = np.ascontiguousarray(outlines.parameters[:, : kernels.BLUR + 1])
+        every = Outlines.concat([outlines, others]).parameters
+        rims = np.ascontiguousarray(every[:, : kernels.BLUR + 1])
         kernels.fitted(
             image, profile_table(), noise, rims, own, prior[own], fit.parameters, fit.shown,
             steps, below,
@@ -279,7 +287,8 @@ def fit_outlines(
         own = np.flatnonzero(again)
         if own.size == 0:
             break
-        prior = learnt_prior(fit, start.inner, fit.coverage < _WHOLE)
+        known = Outlines.concat([fit, others])
+        prior = learnt_prior(known, start.inner, fit.coverage < _WHOLE)
         fit = fit.updated(own, fitted(fit, own, prior, _STEPS))
         again = fit.shift_px > _FAR_SHIFT_PX
     return fit

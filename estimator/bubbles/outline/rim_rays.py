@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from telerig.arrays import Array, Bools, Float32, Ints
+from telerig.compiled import compiled
 from telerig.estimator.bubbles.outline.ellipse_geometry import rough_distance
 
 RAYS = 32
@@ -94,61 +95,91 @@ def closed_rims(
     Returns the path's points (N, RAYS, 2) in px, interpolated to the steepest place, and their
     strengths (N, RAYS).
     """
-    some = range(0, max(len(ellipse), 1), _AT_ONCE)
-    parts = [_closed(image, ellipse[k : k + _AT_ONCE], window, floor, stiffness) for k in some]
-    points, strength = zip(*parts, strict=True)
-    return np.concatenate(points), np.concatenate(strength)
+    points, strength = np.empty((len(ellipse), RAYS, 2)), np.empty((len(ellipse), RAYS))
+    reach = np.maximum(window * np.sqrt(ellipse[:, 2] * ellipse[:, 3]), _LEAST_WINDOW_PX)
+    places, normals = (np.moveaxis(part, 0, -1).astype(np.float64) for part in _normals(ellipse))
+    _closed(image, places, normals, reach, floor, stiffness, points, strength)
+    return points, strength
 
 
+@compiled
+def _level(image: Float32, u: float, v: float) -> float:
+    """Grey level at a place (px), by bilinear interpolation; beyond the image that of its edge."""
+    rows, columns = image.shape
+    u, v = min(max(u, 0.0), columns - 1.0), min(max(v, 0.0), rows - 1.0)
+    column, row = min(int(u), columns - 2), min(int(v), rows - 2)
+    x, y = u - column, v - row
+    above = image[row, column] + x * (image[row, column + 1] - image[row, column])
+    below = image[row + 1, column] + x * (image[row + 1, column + 1] - image[row + 1, column])
+    return float(above + y * (below - above))
+
+
+@compiled
 def _closed(
-    image: Float32, ellipse: Array, window: float, floor: float, stiffness: float
-) -> tuple[Array, Array]:
-    places, normals = _normals(ellipse)
-    radius = np.sqrt(ellipse[:, 2:3] * ellipse[:, 3:4])
-    reach: Float32 = np.maximum(window * radius, _LEAST_WINDOW_PX).astype(np.float32)
-    step: Float32 = np.asarray(2.0 * reach / (_STEPS - 1), np.float32)
-    base = np.maximum(step, np.float32(_LEAST_BASE_PX))
-    away: Float32 = np.arange(_STEPS, dtype=np.float32) * step - reach
-    far, near = (
-        _levels(image, places[..., None] + normals[..., None] * at[:, None, :])
-        for at in (away + base, away - base)
-    )
-    slope = np.maximum(far - near, 0.0) / (2.0 * base[..., None])
-    half = 0.5 * np.median(slope.max(axis=2), axis=1) + np.float32(floor)
-    strength = slope / (slope + half[:, None, None])
-    chosen = _strongest_paths(strength, stiffness)
-    before, here, after = (_at(slope, chosen + side) for side in (-1, 0, 1))
-    bend = before - 2.0 * here + after
-    peak = (chosen > 0) & (chosen < _STEPS - 1) & (bend < 0.0)
-    shift = np.clip(0.5 * (before - after) / np.where(peak, bend, -1.0), -0.5, 0.5)
-    offset = (chosen + np.where(peak, shift, 0.0)) * step - reach
-    points = np.moveaxis(places + offset * normals, 0, -1)
-    return points.astype(np.float64), _at(strength, chosen).astype(np.float64)
+    image: Float32, places: Array, normals: Array, reach: Array, floor: float, stiffness: float,
+    points: Array, strengths: Array,
+) -> None:  # fmt: skip
+    """Write the points (N, RAYS, 2) and strengths (N, RAYS) of `closed_rims`.
+
+    places, normals : (N, RAYS, 2) of the ellipses. reach : (N,) of the rays to both sides (px).
+    """
+    slope, strength = np.empty((RAYS, _STEPS)), np.empty((RAYS, _STEPS))
+    steepest, moves = np.empty(RAYS), np.empty((2 * RAYS, _STEPS), np.int8)
+    total, ahead = np.empty(_STEPS + 2), np.empty(_STEPS + 2)
+    path = np.empty(2 * RAYS, np.int64)
+    for n in range(reach.size):
+        step = 2.0 * reach[n] / (_STEPS - 1)
+        base = max(step, _LEAST_BASE_PX)
+        for k in range(RAYS):
+            steepest[k] = 0.0
+            for i in range(_STEPS):
+                far, near = i * step - reach[n] + base, i * step - reach[n] - base
+                change = _level(
+                    image, places[n, k, 0] + far * normals[n, k, 0],
+                    places[n, k, 1] + far * normals[n, k, 1],
+                ) - _level(
+                    image, places[n, k, 0] + near * normals[n, k, 0],
+                    places[n, k, 1] + near * normals[n, k, 1],
+                )  # fmt: skip
+                slope[k, i] = max(change, 0.0) / (2.0 * base)
+                steepest[k] = max(steepest[k], slope[k, i])
+        half = 0.5 * np.median(steepest) + floor
+        for i in range(_STEPS + 2):
+            total[i] = 0.0 if 0 < i <= _STEPS else -np.inf
+            ahead[i] = -np.inf
+        for k in range(2 * RAYS):
+            for i in range(_STEPS):
+                inside, outside = total[i], total[i + 2]
+                aside = max(inside, outside) - stiffness
+                if k < RAYS:
+                    strength[k, i] = slope[k, i] / (slope[k, i] + half)
+                moves[k, i] = 0
+                if total[i + 1] < aside:
+                    moves[k, i] = -1 if inside >= outside else 1
+                ahead[i + 1] = max(total[i + 1], aside) + strength[k % RAYS, i]
+            total, ahead = ahead, total
+        at = int(np.argmax(total)) - 1
+        for k in range(2 * RAYS - 1, -1, -1):
+            path[k] = at
+            at += moves[k, at]
+        for k in range(RAYS):
+            at = path[k + RAYS if k < RAYS // 2 else k]
+            shift = 0.0
+            if 0 < at < _STEPS - 1:
+                before, after = slope[k, at - 1], slope[k, at + 1]
+                bend = before - 2.0 * slope[k, at] + after
+                if bend < 0.0:
+                    shift = min(max(0.5 * (before - after) / bend, -0.5), 0.5)
+            offset = (at + shift) * step - reach[n]
+            points[n, k, 0] = places[n, k, 0] + offset * normals[n, k, 0]
+            points[n, k, 1] = places[n, k, 1] + offset * normals[n, k, 1]
+            strengths[n, k] = strength[k, at]
 
 
 def _at(values: Float32, index: Ints) -> Float32:
     """Return the elements (N, RAYS) of (N, RAYS, n) at an index, the nearest one beyond the end."""
     near = np.clip(index, 0, values.shape[2] - 1)[..., None]
     return np.take_along_axis(values, near, axis=2)[..., 0]
-
-
-def _strongest_paths(strength: Float32, stiffness: float) -> Ints:
-    """Return the steps (N, RAYS) of closed paths of the largest sum of strengths (N, RAYS, n)."""
-    many, _, steps = strength.shape
-    total = np.full((many, steps + 2), -np.inf, np.float32)
-    inside, outside = total[:, :-2], total[:, 2:]
-    middle = total[:, 1:-1]
-    middle[:] = 0.0
-    moves = np.empty((2 * RAYS, many, steps), np.int8)
-    for k in range(2 * RAYS):
-        aside = np.maximum(inside, outside) - np.float32(stiffness)
-        moves[k] = np.where(middle >= aside, 0, np.where(inside >= outside, -1, 1))
-        middle[:] = np.maximum(middle, aside) + strength[:, k % RAYS]
-    path, at = np.empty((2 * RAYS, many), np.int64), middle.argmax(axis=1)
-    for k in range(2 * RAYS - 1, -1, -1):
-        path[k] = at
-        at = at + moves[k, np.arange(many), at]
-    return np.roll(path[RAYS // 2 : RAYS // 2 + RAYS], RAYS // 2, axis=0).T
 
 
 def judged(image: Float32, ellipse: Array, floor: float) -> Judged:

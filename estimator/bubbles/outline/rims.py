@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import fft, ndimage, special
+from scipy import fft, special
 
 from telerig.arrays import Array, Bools, Float32, Rows
 from telerig.estimator.bubbles.outline import rim_rays
@@ -154,10 +154,10 @@ def _voted(image: Float32, floor: float, least_radius: float) -> Array:
             for r in radii.tolist()
         ]
     )
-    peak = (votes > _LEAST_VOTES) & (votes == ndimage.maximum_filter(votes, size=(3, 5, 5)))
-    peak[0] = peak[-1] = False
-    k, v, u = np.nonzero(peak)
-    return np.column_stack([u, v, radii[k]]).astype(np.float64)
+    best = np.stack([cv2.dilate(one, np.ones((5, 5), np.uint8)) for one in votes])
+    best = np.maximum(np.maximum(best[:-2], best[2:]), best[1:-1])
+    k, v, u = np.nonzero((votes[1:-1] > _LEAST_VOTES) & (votes[1:-1] == best))
+    return np.column_stack([u, v, radii[k + 1]]).astype(np.float64)
 
 
 def _followed(

@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS, HARMONICS
+from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.shape.body import Bodies, fit_bodies
 from telerig.estimator.bubbles.shape.learning import learn_shapes
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.rig.camera import Camera
+from telerig.rig.outline import HARMONICS, waves
 from telerig.rig.pose import Pose
 
 Array = NDArray[np.float64]
@@ -213,7 +214,7 @@ def _outline_residuals(
     c, s = np.cos(phi), np.sin(phi)
     g = np.hypot(b * c, a * s)
     nx, ny = b * c / g, a * s / g
-    basis = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)], -1)
+    basis = waves(phi).T
     rest = (local[:, 0] - a * c) * nx + (local[:, 1] - b * s) * ny
     ellipse = [nx, ny, nx * a * c, ny * b * s, nx * b * s + ny * a * c]
     return rest, np.concatenate([np.stack(ellipse, -1), basis], -1)

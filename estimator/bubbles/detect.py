@@ -40,7 +40,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     outline_centroid,
     outline_moments,
     outline_points,
-    points_on,
     rough_distance,
 )
 from telerig.estimator.bubbles.outline.outline_fit import (
@@ -51,6 +50,7 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     start_outlines,
 )
 from telerig.estimator.bubbles.outline.rims import Rims, rims_along
+from telerig.rig.outline import points_on
 
 __all__ = [
     "Bubbles",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
+from telerig.rig.outline import HARMONICS, points_on
 from telerig.short_text import counted
 
 Picture = NDArray[np.uint8]
@@ -266,12 +267,9 @@ def _legend(lines: list[str], width_px: int) -> Picture:
 
 def _ellipses(table: pd.DataFrame, least_px: float) -> list[Array]:
     """Return the ellipse (N, 2) px of each row; no points where it is not finite."""
-    outlines = []
-    for u, v, a, b, angle in table[_ELLIPSE].to_numpy(float):
-        x, y = max(a, least_px) * np.cos(_TURN), max(b, least_px) * np.sin(_TURN)
-        cos, sin = np.cos(angle), np.sin(angle)
-        outlines.append(np.stack([u + cos * x - sin * y, v + sin * x + cos * y], -1))
-    return outlines
+    ellipse = table[_ELLIPSE].to_numpy(float, copy=True)
+    ellipse[:, 2:4] = np.maximum(ellipse[:, 2:4], least_px)
+    return list(points_on(ellipse, np.zeros((len(ellipse), 2 * len(HARMONICS))), _TURN))
 
 
 def _scaled(outline: Array, factor: float) -> Array:

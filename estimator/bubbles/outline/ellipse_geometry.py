@@ -1,9 +1,7 @@
-"""Ellipses with harmonics: nearest points, displacements, area, curvature; and the table of them.
+"""Distances from outlines, the areas and centroids of what they enclose, and the table of them.
 
-An ellipse is a row of five numbers: centre u and v (px), semi-axes a >= b (px), and the angle from
-+u to the major axis (rad, towards +v). Points belong to ellipses through an index array, so that
-outlines of different length need no padding. Outlines leave this folder as the rows of a detection
-table, whose columns are named here.
+Ellipses and harmonics are those of `telerig.rig.outline`. Outlines leave this folder as the rows of
+a detection table, whose columns are named here.
 """
 
 from __future__ import annotations
@@ -15,12 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
+from telerig.rig.outline import HARMONICS, points_on
 
 Floats = NDArray[np.floating[Any]]
 Index = NDArray[np.intp]
-
-HARMONICS = (3, 4, 5, 6)
-"""Orders of an outline's normal displacement about its ellipse, see `outline_fit`."""
 
 _SAMPLES = 64
 
@@ -45,39 +41,6 @@ def axis_distance(a: Any, b: Any, x: Any, y: Any) -> Any:
     level = np.sqrt(x * x + y * y) + 1e-12
     x, y = x / a, y / b
     return (level - 1.0) * level / (np.sqrt(x * x + y * y) + 1e-12)
-
-
-def harmonic_basis(cos: Floats, sin: Floats) -> Floats:
-    """Return cos(k phi) and sin(k phi) for the orders k in HARMONICS.
-
-    cos, sin : (N,) cosine and sine of phi.
-
-    Returns (8, N): cosine and sine of order 3, then of orders 4, 5 and 6.
-    """
-    turns = (cos + 1j * sin) ** np.array(HARMONICS)[:, None]
-    return np.stack([turns.real, turns.imag], axis=1).reshape(-1, cos.size)
-
-
-def points_on(ellipse: Array, harmonics: Array, phi: Array) -> Array:
-    """Return points on outlines.
-
-    ellipse : (B, 5) ellipses.
-    harmonics : (B, 8) coefficients (px) of the displacement along the ellipse's normal, in the
-        order of `harmonic_basis`.
-    phi : (n,) eccentric anomalies (rad).
-
-    Returns (B, n, 2) pixels (u, v).
-    """
-    cos, sin = np.cos(phi), np.sin(phi)
-    a, b = ellipse[:, 2:3], ellipse[:, 3:4]
-    speed = np.sqrt((a * sin) ** 2 + (b * cos) ** 2)
-    bump = harmonics @ harmonic_basis(cos, sin)
-    x = a * cos + bump * b * cos / speed
-    y = b * sin + bump * a * sin / speed
-    turn_cos, turn_sin = np.cos(ellipse[:, 4:5]), np.sin(ellipse[:, 4:5])
-    u = ellipse[:, 0:1] + turn_cos * x - turn_sin * y
-    v = ellipse[:, 1:2] + turn_sin * x + turn_cos * y
-    return np.stack([u, v], axis=-1)
 
 
 def outline_moments(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:

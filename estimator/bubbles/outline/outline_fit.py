@@ -22,7 +22,8 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Float32, Ints, Rows
 from telerig.estimator.bubbles.outline import kernels
-from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS, Index
+from telerig.estimator.bubbles.outline.ellipse_geometry import Index
+from telerig.rig.outline import HARMONICS
 from telerig.statistics import robust_sd
 
 _NODES = 96
@@ -267,8 +268,8 @@ def fit_outlines(
     latter has what their residuals show of neighbours that mislead them.
     """
     image, below = np.ascontiguousarray(ratio, np.float32), 2.0 if shadows else _WHOLE
-
     others = start.take(slice(0, 0)) if beside is None else beside
+
     def fitted(outlines: Outlines, own: Index, prior: Array, steps: int) -> Outlines:
         fit = Outlines(outlines.parameters[own], _nothing_shown(len(own)))
         every = Outlines.concat([outlines, others]).parameters

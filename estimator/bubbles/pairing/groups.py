@@ -36,7 +36,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     CENTRE_COLUMNS,
     COVARIANCE_COLUMNS,
     HARMONIC_COLUMNS,
-    HARMONICS,
     centre_covariances,
     columns,
     flag_words,
@@ -56,6 +55,7 @@ from telerig.estimator.bubbles.pairing.model import (
 )
 from telerig.rig import projection
 from telerig.rig.camera import Camera
+from telerig.rig.outline import waves
 from telerig.rig.triangulation import (
     UNKNOWN_MM,
     midpoint,
@@ -273,8 +273,8 @@ def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
         cosine, sine = np.cos(phi), np.sin(phi)
         a, b, along, beside = (v[shaped, None] for v in (a, b, along, beside))
         normal = (b * cosine * along + a * sine * beside) / np.hypot(b * cosine, a * sine)
-        waves = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)])
-        profile = a * cosine * along + b * sine * beside + normal * (harmonics[shaped] @ waves)
+        bump = harmonics[shaped] @ waves(phi)
+        profile = a * cosine * along + b * sine * beside + normal * bump
         top, bottom = _peak(profile), -_peak(-profile)
         middle[shaped], half[shaped] = (top + bottom) / 2, (top - bottom) / 2
     return middle, half

@@ -13,12 +13,12 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     AXES_COLUMNS,
     CENTRE_COLUMNS,
     HARMONIC_COLUMNS,
-    HARMONICS,
     centre_covariances,
     columns,
     flag_words,
 )
 from telerig.rig.camera import Camera
+from telerig.rig.outline import waves
 
 _SAMPLES = 32
 _LEAST_PX2 = 1e-12
@@ -121,8 +121,7 @@ def _trace_from_displacement(a_px: Array, b_px: Array) -> Array:
     (a b) along the radius of the circle.
     """
     phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
-    inward = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)])
-    outward = np.stack([f(k * phi) for k in _TRACE_ORDERS for f in (np.cos, np.sin)])
+    inward, outward = waves(phi), waves(phi, _TRACE_ORDERS)
     weights = (2 / _SAMPLES * outward[:, None] * inward[None]).reshape(-1, _SAMPLES)
     speed = np.hypot(np.outer(b_px, np.cos(phi)), np.outer(a_px, np.sin(phi)))
     factor = speed / (a_px * b_px)[:, None]

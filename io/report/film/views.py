@@ -20,6 +20,7 @@ from telerig.io.report.film.path import font
 from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
 from telerig.io.results.manifest import reading
 from telerig.io.tables.run import DETECTIONS
+from telerig.rig.outline import HARMONICS, points_on
 
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
@@ -35,9 +36,11 @@ _COLOURS: tuple[Colour, ...] = (
     (20, 110, 255), (235, 70, 0), (15, 165, 60), (205, 40, 200), (225, 25, 60), (0, 165, 175),
     (150, 120, 0), (120, 70, 240),
 )  # fmt: skip
-_SHAPE = [f"{part}{k}_px" for k in range(3, 7) for part in "cs"]
+_SHAPE = [f"{part}{k}_px" for k in HARMONICS for part in "cs"]
 _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 _LOOKED_AT = 5
+_BARE_PX = 6.0
+"""Radius of the circle round a bubble without semi-axes."""
 
 
 @dataclass(frozen=True)
@@ -106,18 +109,10 @@ def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
 
 def outlines_px(table: pd.DataFrame, points: int = 72) -> Array:
     """Return outlines (N, points, 2) as docs/files.md defines them; circles without semi-axes."""
+    ellipse = table[_ELLIPSE].to_numpy(float, copy=True)
+    ellipse[~np.isfinite(ellipse).all(axis=1), 2:] = [_BARE_PX, _BARE_PX, 0.0]
     phi = np.linspace(0, 2 * np.pi, points, endpoint=False)
-    u, v, a, b, angle = table[_ELLIPSE].to_numpy(float).T[:, :, None]
-    bare = ~np.isfinite(a * b * angle)
-    a, b, angle = (np.where(bare, x, y) for x, y in ((6.0, a), (6.0, b), (0.0, angle)))
-    normal = np.stack([b * np.cos(phi), a * np.sin(phi)], -1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    shape = table[_SHAPE].to_numpy(float)
-    waves = np.array([wave(k * phi) for k in range(3, 7) for wave in (np.cos, np.sin)])
-    local = np.stack([a * np.cos(phi), b * np.sin(phi)], -1) + (shape @ waves)[..., None] * normal
-    x, y = local[..., 0], local[..., 1]
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([u + cos * x - sin * y, v + sin * x + cos * y], -1)
+    return points_on(ellipse, table[_SHAPE].to_numpy(float), phi)
 
 
 def view_frames(

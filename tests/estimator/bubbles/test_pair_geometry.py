@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from matching_scenes import Array, geometry, groups_of, rig, table, views
 
-from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONIC_COLUMNS, HARMONICS
+from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONIC_COLUMNS
 from telerig.estimator.bubbles.pairing import kernels
 from telerig.estimator.bubbles.pairing.groups import NEGLIGIBLE, outline_extent
 from telerig.estimator.bubbles.pairing.learning import default_model
+from telerig.rig.outline import HARMONICS
 from telerig.rig.pose import Pose
 
 # Geometry

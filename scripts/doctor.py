@@ -31,6 +31,8 @@ def doctor(
         typer.Option("--seconds", help="How long the planned run is [as long as this one]."),
     ] = None,
     calibration: options.CalibrationFiles = None,
+    out: options.RunFolder = None,
+    report: options.Report = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for other programs.")] = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -38,10 +40,11 @@ def doctor(
 
     Of each run of a dataset it estimates how long tracking and smoothing will take. A run that is
     given itself is taken for a trial recording: light, focus, frames, synchrony, sensors and shake
-    are measured, and the verdict that a run of --seconds may expect.
+    are measured, and the verdict that a run of --seconds may expect; trial.html shows it.
 
     Exit code 0: nothing prevents the work, though there may be warnings. 1: there is a failure.
     """
+    from telerig.estimator.batch.work import default_folder
     from telerig.estimator.doctor.checks import check_dataset, check_installation, check_ports
 
     checks = [*check_installation(), *check_ports()]
@@ -50,7 +53,8 @@ def doctor(
         if dataset.resolve().parent.name == "runs":
             sensors = f"run {dataset.resolve().name} sensors"  # the trial says more of them
             checks = [c for c in checks if c.what != sensors or c.status == "ok"]
-            checks += _recording(dataset, frames, seconds, calibration, quiet or as_json)
+            folder = (out or default_folder(dataset)) if report else None
+            checks += _recording(dataset, frames, seconds, calibration, folder, quiet or as_json)
     if as_json:
         say(json.dumps([asdict(check) for check in checks], indent=1, ensure_ascii=False))
     else:
@@ -64,14 +68,16 @@ def doctor(
 
 
 def _recording(
-    run: Path, frames: str, seconds: float | None, files: list[Path] | None, quiet: bool
-) -> tuple[Check, ...]:
-    """Check a run as a trial recording."""
+    run: Path, frames: str, seconds: float | None, files: list[Path] | None, folder: Path | None,
+    quiet: bool,
+) -> tuple[Check, ...]:  # fmt: skip
+    """Check a run as a trial recording, and write its page into a folder."""
     from telerig.errors import TelerigError
     from telerig.estimator.batch.work import load_with
     from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.doctor.checks import Check
     from telerig.estimator.doctor.recording import check_recording
+    from telerig.io.report.trial import write_trial_report
 
     count = TrackingOptions(frames=frames).first_frames
     try:
@@ -81,11 +87,18 @@ def _recording(
     try:
         found = (run / "detections.csv").is_file()
         recorded = load_with(run, calibration, "detections" if found else None)
+        part = recorded.first(count or recorded.frame_count)
         with progress(quiet) as stage:
-            return check_recording(
-                recorded.first(count or recorded.frame_count), calibration, seconds=seconds,
-                progress=stage,
-            ).checks  # fmt: skip
+            trial = check_recording(part, calibration, seconds=seconds, progress=stage)
+        if folder is not None:
+            rows = [(c.what, c.status, c.words, c.todo) for c in trial.checks]
+            detections = None if trial.tracks is None else trial.tracks.detections
+            shake = None if trial.smoothing is None else trial.smoothing.shake
+            page = folder / "trial.html"
+            write_trial_report(page, part, rows, detections, shake)
+            if not quiet:
+                say(f"written: {page}")
+        return trial.checks
     except TelerigError as error:
         words = f"{error.where}: {error.what}" if error.where else error.what
         return (Check("trial recording", "failure", words, error.todo),)

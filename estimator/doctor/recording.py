@@ -114,9 +114,10 @@ def check_recording(
         checks += _sensor_shake(run, calibration)
     else:
         checks += _shake(smoothing, calibration, run.cameras)
-        planned = _planned(run, tracks, smoothing, calibration, seconds)
+        length = float(np.ptp(run.t_s)) if seconds is None else seconds
+        planned = _planned(run, tracks, smoothing, length)
         expected = expect(_recorded_rig(run, smoothing), calibration, planned)
-        checks.append(_verdict(expected, planned, smoothing))
+        checks.append(_verdict(expected, planned, length, smoothing))
     return Recording(run, tuple(checks), tracks, smoothing, expected)
 
 
@@ -232,7 +233,7 @@ def _exposure(speed: float) -> Check:
     return Check(
         "motion",
         "ok",
-        f"bubbles move by up to {speed:.3g} px/s in the images, so the longest exposure without "
+        f"bubbles move by up to {speed:.0f} px/s in the images, so the longest exposure without "
         f"smeared outlines is {longest:.2g} ms",
     )
 
@@ -362,7 +363,7 @@ def _shake(
         yield _judged(
             f"shake of {camera.name}",
             f"{size:.2g} mm RMS (at most {MOST_SHAKE * field:.2g} mm), most of it at {hz:.3g} Hz; "
-            + ", ".join(f"{a} {1e3 * v:.2g} µm" for a, v in zip(AXES, one)),
+            + ", ".join(f"{a} {1e3 * v:.0f} µm" for a, v in zip(AXES, one)),
             size <= MOST_SHAKE * field,
             f"stiffen or damp what resonates at {hz:.3g} Hz",
         )
@@ -392,18 +393,11 @@ def _recorded_rig(run: RunData, smoothing: Smoothing) -> Any:
     return replace(rig, accelerometers=kept, stage=rig.stage if run.stage is not None else None)
 
 
-def _planned(
-    run: RunData,
-    tracks: Tracks,
-    smoothing: Smoothing,
-    calibration: Calibration,
-    seconds: float | None,
-) -> Experiment:
+def _planned(run: RunData, tracks: Tracks, smoothing: Smoothing, seconds: float) -> Experiment:
     """Return the planned run, with the recording's bubbles and shake."""
     table = tracks.table
     rate = 1 / float(np.median(np.diff(run.t_s)))
     in_sight = max(1, round(float(table.groupby("frame").size().median())))
-    length = float(np.ptp(run.t_s)) if seconds is None else seconds
     most = min(MOST_STATES, _MOST_PLANNED) / in_sight / rate
     rms, hz = shake_line(smoothing, run.cameras)
     variances = [table[f"{c}_s{a}{a}_px2"] for c in run.cameras for a in "uv"]
@@ -413,7 +407,7 @@ def _planned(
         marks = round(float(tracks.references.groupby(["frame", "camera"]).size().median()))
     vertical = "xyz".index(str(smoothing.verdict.get("vertical", "y")))
     return Experiment(
-        rate_hz=rate, seconds=min(length, most), bubbles=in_sight,
+        rate_hz=rate, seconds=min(seconds, most), bubbles=in_sight,
         diameter_mm=float(np.nanmedian(table["d_eq_mm"])) if "d_eq_mm" in table else 3.0,
         sigma_px=float(np.sqrt(pd.concat(variances).median())),
         rise_mm_s=max(0.0, float(np.nanmedian(rise))),
@@ -421,11 +415,14 @@ def _planned(
     )  # fmt: skip
 
 
-def _verdict(expected: Expected, planned: Experiment, smoothing: Smoothing) -> Check:
+def _verdict(
+    expected: Expected, planned: Experiment, seconds: float, smoothing: Smoothing
+) -> Check:
     """Check which verdict the planned run may expect."""
+    first = f", by its first {planned.seconds:.2g} s" if planned.seconds < seconds else ""
     return _judged(
         "expected verdict",
-        f"{planned.seconds:.3g} s with {counted(planned.bubbles, 'bubble')}: {expected.verdict}, "
+        f"{seconds:.3g} s with {counted(planned.bubbles, 'bubble')}{first}: {expected.verdict}, "
         f"{number_words(expected.axes, expected.vertical)}; this recording: "
         f"{smoothing.verdict.get('verdict')}",
         expected.verdict is Verdict.RESOLVED,

@@ -9,7 +9,7 @@ import numpy as np
 
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.page.figures import CAMERA_COLOURS, Curve, Picture, draw_curves, drawing
-from telerig.io.report.page.page import Figure, Row, render_page
+from telerig.io.report.page.page import Figure, Row, Section, render_sections
 from telerig.io.results.validation import (
     HEAD,
     LARGEST_NEES,
@@ -35,25 +35,32 @@ def write_validation_report(folder: Path, out: Path | None = None) -> Path:
 def render(content: ValidationFile) -> str:
     """Return the page as text."""
     passed = content.verdict is Stillness.PASSED
-    context = {
-        "name": content.run,
-        "stale": (),
-        "verdict": {
-            "colour": "good" if passed else "rejected",
-            "headline": str(content.verdict),
-            "sentences": validation_words(content),
-            "warnings": content.warnings,
-        },
-        "figures": list(_figures(content)),
-        "head": HEAD,
-        "rows": [
-            Row(cells, strong=mark.verdict is Stillness.FAILED)
-            for cells, mark in zip(table_rows(content), content.marks)
-        ],
-        "pictures": [_picture(mark) for mark in content.marks[:_MOST_DRAWN]],
-        "largest": f"{LARGEST_NEES:g}",
+    verdict = {
+        "colour": "good" if passed else "rejected",
+        "headline": str(content.verdict),
+        "sentences": validation_words(content),
+        "warnings": content.warnings,
     }
-    return render_page("template_validation.html", context, "")
+    rows = tuple(
+        Row(cells, strong=mark.verdict is Stillness.FAILED)
+        for cells, mark in zip(table_rows(content), content.marks)
+    )
+    lead = (
+        "Each mark is withheld in turn and smoothed as a bubble, after a known motion, as of a "
+        "bubble, has been added to its pixels. Once this motion is subtracted, its path must stand "
+        "still in the laboratory. A mark fails if the NEES of its position or of its velocity is "
+        f"above {LARGEST_NEES:g}, or if the smoothing finds its measurements CONTRADICTED."
+    )
+    pictures = tuple(_picture(mark) for mark in content.marks[:_MOST_DRAWN])
+    return render_sections(
+        "telerig validation of a run with marks", "Validation", content.run, verdict,
+        [
+            Section(tiles=tuple(_figures(content))),
+            Section("Mark by mark", lead, head=HEAD, rows=rows, numbers=(3, 10)),
+            Section("In time", pictures=pictures),
+        ],
+        ["Marks", "NEES", "Covariance, standard deviation (sd)", "Verdict"],
+    )  # fmt: skip
 
 
 def _figures(content: ValidationFile) -> Iterator[Figure]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.io.machine.parallel import keep_freed_memory, ordered_map, quick_workers
-from telerig.io.report.page.figures import MUTED, prepare_drawing
+from telerig.io.report.page.figures import MUTED, Picture, prepare_drawing
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -42,6 +42,36 @@ class Row:
     cells: tuple[str, ...]
     strong: bool = False
     faint: bool = False
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page: heading, a sentence, key numbers, a table and pictures, where given.
+
+    numbers : first column of the table that holds numbers, and the first one that does not.
+    """
+
+    title: str = ""
+    lead: str = ""
+    tiles: tuple[Figure, ...] = ()
+    head: tuple[str, ...] = ()
+    rows: tuple[Row, ...] = ()
+    numbers: tuple[int, int] = (1, 99)
+    pictures: tuple[Picture, ...] = ()
+
+
+def render_sections(
+    kind: str, title: str, name: str, verdict: Mapping[str, Any], contents: Sequence[Section],
+    terms: Sequence[str],
+) -> str:  # fmt: skip
+    """Return a page that is a verdict and sections.
+
+    kind, title, name : what the page is, for its head, and of what. verdict : colour, headline,
+    sentences and warnings. terms : those of the glossary that it explains.
+    """
+    context = {"kind": kind, "title": title, "name": name, "stale": (), "verdict": verdict,
+               "contents": contents, "terms": terms}  # fmt: skip
+    return render_page("template_sections.html", context, "")
 
 
 def link_to(target: Path, page_folder: Path) -> str:

@@ -194,6 +194,9 @@ def test_the_command_looks_at_a_calibrated_run_and_ends_with_1_for_a_trouble(
     checks = {c["what"]: c["status"] for c in json.loads(result.output)}
     assert checks["times of the frames"] == "failure" and checks["motion"] == "ok"
     assert {"shake of left", "expected verdict"} <= set(checks)
+    page = (tank_copy / "results" / "rise" / "trial.html").read_text(encoding="utf-8")
+    assert 'class="verdict rejected"' in page and "Spectrum of the shake of camera" not in page
+    assert page.count("data:image/svg+xml") == 2
 
 
 def test_a_run_without_a_calibration_is_told_so(tank_copy: Path) -> None:

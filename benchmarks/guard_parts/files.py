@@ -21,6 +21,7 @@ import telerig
 from guard_parts.inputs import digest
 from guard_parts.metrics import Metric, count, cpu_ratio, size, word
 from guard_parts.product import run_preset
+from telerig.io.report.page.contradictions import contradictions
 
 SCENARIO, FRAMES = "S2", 200
 PEER = "import matplotlib.pyplot, numpy, pandas, scipy.optimize, scipy.signal"
@@ -74,6 +75,8 @@ def commands() -> list[Metric]:
             size(f"{page.replace('/', ' ')}, text", words_of(results / page), "characters")
             for page in PAGES
         ]
+        found = [contradictions((results / page).read_text(encoding="utf-8")) for page in PAGES]
+        out.append(count("contradictions on pages", sum(map(len, found)), "same"))
         tracks = pd.read_csv(results / SCENARIO / "tracks.csv", nrows=1)
         out.append(count("columns of tracks.csv", len(tracks.columns), "same"))
         return [*out, word("inputs", given)]

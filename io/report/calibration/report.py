@@ -86,6 +86,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "name": file.name or "calibration",
         "status": file.verdict.status,
         "colour": _COLOURS[file.verdict.status],
+        "precise": tables.precision_words(results),
         "reasons": file.verdict.reasons,
         "lenses": [sentence(words) for words in telecentricity_words(results.statistics)],
         "cameras": results.camera_names,

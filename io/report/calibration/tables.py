@@ -11,6 +11,7 @@ from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.results.calibration import CameraRecord
+from telerig.io.results.findings import Status
 from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.rig import projection
 from telerig.rig.camera import Camera
@@ -40,6 +41,14 @@ def key_numbers(results: CalibrationResults) -> list[Figure]:
         ),
     ]
     return figures + _space_numbers(results, s)
+
+
+def precision_words(results: CalibrationResults) -> str:
+    """Return how well a point is placed, to follow the status; "" if that is not to be used."""
+    sd_um = results.statistics.get("space_sd_um")
+    if len(results.cameras) < 2 or sd_um is None or results.file.verdict.status == Status.REJECTED:
+        return ""
+    return f": points in space are good to {number(sd_um)} µm (1 sd per axis)"
 
 
 def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Figure]:

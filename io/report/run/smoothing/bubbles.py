@@ -31,12 +31,10 @@ def size_picture(results: SmoothingResults) -> Picture | None:
         return None
     with drawing(2.6, legend="above") as sheet:
         plot.sizes(results.bubble_summary, axes=sheet.axes)
-    d = d[np.isfinite(d)]
-    sauter = float((d**3).sum() / (d**2).sum())
     caption = (
         "Every bubble once, also those that the border cuts; blue by number, orange by volume. "
-        f"Mean {number(float(d.mean()), 3)} mm, Sauter mean {number(sauter, 3)} mm, "
-        f"{len(d)} bubbles."
+        f"Dashed: the means of these {np.isfinite(d).sum()} bubbles, which are not corrected for "
+        "the border."
     )
     return Picture("Sizes of the bubbles", sheet.source, caption)
 

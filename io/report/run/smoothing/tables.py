@@ -153,7 +153,8 @@ def smoothing_figures(results: SmoothingResults) -> list[Figure]:
     worst = max(shake, key=lambda key: shake[key], default=None)
     where = "the estimate, about its mean" if worst is None else f"camera {worst[0]}, {worst[1]}"
     return [
-        Figure("Position, 1 sd", f"{_largest(place, 1e3)} µm", "smoothed, median, worst axis"),
+        Figure("Position, 1 sd", f"{_largest(place, 1e3)} µm",
+               f"smoothed, median, worst axis{_with_encoder(results)}"),
         Figure("Velocity, 1 sd", f"{_largest(speed)} mm/s", "smoothed, median, worst axis"),
         Figure("Taken from positions", f"{_largest(away, 1e3)} µm",
                "RMS of unsmoothed (triangulated plus encoder) less smoothed, worst axis"),
@@ -162,6 +163,16 @@ def smoothing_figures(results: SmoothingResults) -> list[Figure]:
         Figure("Shake", f"{number(None if worst is None else shake[worst], 3)} µm",
                f"RMS, largest: {where}"),
     ]  # fmt: skip
+
+
+def _with_encoder(results: SmoothingResults) -> str:
+    """Return what the sd of trajectories.csv holds beside that of the verdict; "" for nothing."""
+    added: list[Any] = [
+        axis.content().get("sigma_encoder_mm") for axis in results.file.axes.values()
+    ]
+    if not any(is_number(value) and value > 0 for value in added):
+        return ""
+    return "; with what the encoder's scale and the travel axis add to all bubbles alike"
 
 
 def _largest(values: list[float | None], factor: float = 1.0) -> str:

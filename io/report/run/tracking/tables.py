@@ -164,7 +164,7 @@ def key_numbers(results: TrackResults) -> list[Figure]:
         Figure("Bubbles in a frame", number(each, 3), f"in space, mean of {number(frames)} frames"),
         Figure("Matched", share(*matched),
                f"{number(matched[0])} of {number(matched[1])} bubbles in single images"),
-        Figure("Position, 1 sd", f"{number(median(results.sd_um.max(axis=1)), 2)} µm",
+        Figure("Measured position, 1 sd", f"{number(median(results.sd_um.max(axis=1)), 2)} µm",
                "along each point's worst axis, median over points; calibration's share left out"),
         Figure("Ray miss", f"{number(median(np.abs(miss)), 2)} µm",
                f"median; {of_noise}RMS {number(rms(miss), 2)} µm"),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
+from telerig.io.report import plot
 from telerig.io.report.calibration.rig import common_plane
 from telerig.io.report.page.figures import (
     LEFT_OUT,
@@ -21,6 +22,7 @@ from telerig.io.report.page.figures import (
     image_axes,
     image_height_in,
 )
+from telerig.io.report.plot.rig import in_plane, sd_in_plane
 from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.short_text import nice_below, number, short_names
 
@@ -207,14 +209,15 @@ def tilts(results: CalibrationResults) -> Picture:
     return Picture("Tilts of the target", sheet.source, caption)
 
 
-_LEVELS = 8
+Share = Literal["calibration", "measurement"]
+_SIDES: tuple[Literal["x", "y"], ...] = ("x", "y")
 
 
 def trust_pictures(results: CalibrationResults) -> list[Picture]:
     """Return the pictures of which the folder has data; a single camera has none."""
     found = []
     if results.uncertainty:
-        maps = [_map(results, *what) for what in (_CALIBRATION, _MEASUREMENT)]
+        maps = [_map(results, of, *words) for of, words in _SHARES.items()]
         found += [picture for picture in maps if picture is not None]
     halves = results.file.diagnostics.halves
     if "points_mm" in halves:
@@ -222,20 +225,21 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
     return found
 
 
-_CALIBRATION = (
-    "calibration_mm2",
-    "Uncertainty: the calibration's share",
-    "Standard deviation in µm of a point's position in the rig frame due to the calibration alone, "
-    "√(sx² + sy² + sz²), for points in the plane of the rig frame nearest to both optical axes. "
-    "Points of a run that lie near each other share this error: it cancels in their differences.",
-)
-_MEASUREMENT = (
-    "measurement_mm2",
-    "Uncertainty: the pixels' share",
-    "Standard deviation in µm of a point triangulated from both cameras, √(sx² + sy² + sz²), if "
-    "its pixel noise is that of this calibration's dots ({sigma} px). These errors are independent "
-    "from point to point, and proportional to the pixel noise.",
-)
+_SHARES: dict[Share, tuple[str, str]] = {
+    "calibration": (
+        "Uncertainty: the calibration's share",
+        "Standard deviation in µm of a point's position in the rig frame due to the calibration "
+        "alone, √(sx² + sy² + sz²), for points in the plane of the rig frame nearest to both "
+        "optical axes. Points of a run that lie near each other share this error: it cancels in "
+        "their differences.",
+    ),
+    "measurement": (
+        "Uncertainty: the pixels' share",
+        "Standard deviation in µm of a point triangulated from both cameras, √(sx² + sy² + sz²), "
+        "if its pixel noise is that of this calibration's dots ({sigma} px). These errors are "
+        "independent from point to point, and proportional to the pixel noise.",
+    ),
+}
 
 
 def _across(results: CalibrationResults) -> int:
@@ -243,36 +247,18 @@ def _across(results: CalibrationResults) -> int:
     return int(np.argmax(np.abs(common_plane(results)[0, :2])))
 
 
-def in_plane(points_mm: Array, across: int) -> Array:
-    """Return which points (N, 3) of a grid lie in the plane of ``across`` and z, (N,)."""
-    level = np.abs(points_mm[:, 1 - across])
-    return np.asarray(level <= level.min() + 1e-6)
-
-
-def _plane(results: CalibrationResults, name: str) -> tuple[Array, Array, Array]:
-    """Return coordinates (mm) of a grid near the optical axes, across and z, and its sd (µm)."""
-    arrays, across = results.uncertainty, _across(results)
-    points = arrays["points_mm"]
-    sd_um = 1e3 * np.sqrt(np.trace(arrays[name], axis1=-2, axis2=-1))
-    flat = in_plane(points, across)
-    side, z = (np.unique(points[flat, i]) for i in (across, 2))
-    return side, z, sd_um[flat].reshape(len(side), len(z))
-
-
 def _is_flat(grid: Array) -> bool:
     return bool(np.ptp(grid) <= 1e-3 * grid.max())
 
 
-def _map(results: CalibrationResults, name: str, title: str, caption: str) -> Picture | None:
+def _map(results: CalibrationResults, of: Share, title: str, caption: str) -> Picture | None:
     """Draw a map; None for a uniform one, which `same_everywhere` states in words."""
-    side, z, grid = _plane(results, name)
+    across = _across(results)
+    grid = sd_in_plane(results.uncertainty, f"{of}_mm2", across)[2]
     if _is_flat(grid):
         return None
-    limits: dict[str, Any] = {"xlim": (side[0], side[-1]), "ylim": (z[0], z[-1])}
-    label = f"{'xy'[_across(results)]} / mm"
-    with drawing(3.6, xlabel=label, ylabel="z / mm", aspect="equal", **limits) as sheet:
-        filled = sheet.axes.contourf(side, z, grid.T, levels=_LEVELS, cmap="viridis")
-        sheet.figure.colorbar(filled, ax=sheet.axes, label="µm")
+    with drawing(3.6) as sheet:
+        plot.uncertainty(results.uncertainty, of, across=_SIDES[across], axes=sheet.axes)
     caption = caption.format(sigma=number(float(results.uncertainty["sigma_px"]), 3))
     caption += f" {number(grid.min(), 3)} to {number(grid.max(), 3)} µm."
     return Picture(title, sheet.source, caption)
@@ -281,7 +267,7 @@ def _map(results: CalibrationResults, name: str, title: str, caption: str) -> Pi
 def same_everywhere(results: CalibrationResults) -> str:
     """Return a sentence on a pixels' share that is uniform; "" if it has a picture."""
     arrays = results.uncertainty
-    grid = _plane(results, _MEASUREMENT[0])[2] if arrays else np.zeros(0)
+    grid = sd_in_plane(arrays, "measurement_mm2", _across(results))[2] if arrays else np.zeros(0)
     if not grid.size or not _is_flat(grid):
         return ""
     sigma = number(float(arrays["sigma_px"]), 3)

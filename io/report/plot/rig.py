@@ -17,6 +17,7 @@ from telerig.short_text import no_formula
 
 _RESIDUALS = "results/calibration/residuals.csv"
 _LEAST_WEIGHT = 0.5
+_LEVELS = 8
 
 
 def residuals(
@@ -73,28 +74,45 @@ def uncertainty(
     source: str | PathLike[str] | Mapping[str, Array],
     share: Literal["calibration", "measurement"] = "calibration",
     *,
+    across: Literal["x", "y"] = "x",
     axes: Any = None,
 ) -> Any:
-    """Draw one standard deviation of a point's position over the plane y = 0 of the rig, in µm.
+    """Draw one standard deviation of a point's position over a plane of the rig, in µm.
 
-    It is √(sx² + sy² + sz²). Where the cameras stand side by side, both optical axes are near this
-    plane. source : uncertainty.npz of a calibration, or its arrays points_mm (N, 3) and
-    <share>_mm2 (N, 3, 3). share : the calibration's, or that of the pixels. Returns axes.
-    Raises InputError for a file that is not one.
+    It is √(sx² + sy² + sz²). source : uncertainty.npz of a calibration, or its arrays points_mm
+    (N, 3), a regular grid, and <share>_mm2 (N, 3, 3). share : the calibration's, or that of the
+    pixels. across : the plane is that of this axis and z, nearest to the origin; both optical axes
+    are near that of x where the cameras stand side by side, and near that of y where one stands
+    above the other. Returns axes. Raises InputError for a file that is not one.
     """
     arrays = source if isinstance(source, Mapping) else _npz(source)
     name = f"{share}_mm2"
     if "points_mm" not in arrays or name not in arrays:
         what = f"holds no {name}"
         raise InputError(what, where="telerig.plot.uncertainty", todo="give uncertainty.npz")
-    points = arrays["points_mm"]
-    sd_um = 1e3 * np.sqrt(np.trace(arrays[name], axis1=-2, axis2=-1))
-    level = np.abs(points[:, 1])
-    flat = level <= level.min() + 1e-6
-    axes = axes_of(axes, xlabel="x / mm", ylabel="z / mm", aspect="equal")
-    drawn = axes.tricontourf(points[flat, 0], points[flat, 2], sd_um[flat], levels=8)
+    side, z, sd_um = sd_in_plane(arrays, name, "xy".index(across))
+    axes = axes_of(axes, xlabel=f"{across} / mm", ylabel="z / mm", aspect="equal")
+    drawn = axes.contourf(side, z, sd_um.T, levels=_LEVELS, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label=f"1 sd / µm, share of the {share}")
     return axes
+
+
+def sd_in_plane(arrays: Mapping[str, Array], name: str, across: int) -> tuple[Array, Array, Array]:
+    """Return a grid's coordinates across (S,) and along z (Z,) in mm, and sds (S, Z) in µm.
+
+    name : of covariances (N, 3, 3) in ``arrays``. across : 0 for x, 1 for y.
+    """
+    points = arrays["points_mm"]
+    sd_um = 1e3 * np.sqrt(np.trace(arrays[name], axis1=-2, axis2=-1))
+    flat = in_plane(points, across)
+    side, z = (np.unique(points[flat, i]) for i in (across, 2))
+    return side, z, sd_um[flat].reshape(len(side), len(z))
+
+
+def in_plane(points_mm: Array, across: int) -> Array:
+    """Return which points (N, 3) of a grid lie in the plane of ``across`` and z, (N,)."""
+    level = np.abs(points_mm[:, 1 - across])
+    return np.asarray(level <= level.min() + 1e-6)
 
 
 def shake(

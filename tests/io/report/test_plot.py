@@ -151,6 +151,12 @@ def test_pictures_of_the_rig(tmp_path: Path) -> None:
         "calibration_mm2": (1 + grid[:, 0] ** 2)[:, None, None] * np.eye(3),
     }
     assert telerig.plot.uncertainty(arrays).get_xlabel() == "x / mm"
+    upright = {
+        "points_mm": grid[:, [1, 0, 2]],
+        "calibration_mm2": arrays["calibration_mm2"],
+    }
+    above = telerig.plot.uncertainty(upright, across="y")
+    assert above.get_xlabel() == "y / mm" and above.get_xlim() == (-1, 1)
     with pytest.raises(InputError, match="measurement_mm2"):
         telerig.plot.uncertainty(arrays, "measurement")
     with pytest.raises(InputError, match="cannot be read"):

@@ -96,9 +96,10 @@ def pieces_of(
 
 
 def with_clock_numbers(problem: SmoothingProblem) -> SmoothingProblem:
-    """Return the problem with sensors that share a clock in every piece if they do in the run.
+    """Return the problem with sensors that share a clock in every part if they do in the run.
 
-    Within a piece two records may have the same times although one of them lacks samples elsewhere.
+    Within a piece two records may have the same times although one of them lacks samples elsewhere;
+    thinned records differ where samples of one are masked.
     """
     numbered = zip(problem.accelerometers, clocks_of(problem).tolist())
     return replace(

@@ -205,8 +205,7 @@ def smooth(
             learned, more = learning_record(problem, chosen)
             warnings = [*warnings, *more]
     given, pieces = isinstance(model, ShakeModel), pieces_of(problem, chosen, options.frames)
-    if len(pieces) > 1:
-        problem = with_clock_numbers(problem)
+    problem = with_clock_numbers(problem)
     run = _Run(problem, calibration, tracks, tracked, chosen, given, options, phases)
     if len(pieces) == 1:
         done = run.smoothed()

@@ -1,12 +1,15 @@
 """What the second pass of a default smoothing takes from the first: the shake's spectrum."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from seeds import first_or_all
 from shake_learning_data import SWING_HZ, run, with_comings_and_goings
+from shake_runs import run_of
 
+import telerig
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.learning.default_priors import (
     DEFAULT_FLOOR,
@@ -145,3 +148,16 @@ def test_short_tracks_set_the_size_of_the_guessed_modes(seed):
     nees = off**2 / ((rows @ found.bubbles) * rows).sum(-1)
     assert nees.mean() < 1.25
     assert np.sqrt((off[:, [0, 2]] ** 2).mean()) < 0.03
+
+
+def test_sensors_that_are_sampled_together_have_one_delay_although_a_sample_of_one_is_masked() -> (
+    None
+):
+    given: dict[str, Any] = run_of("S1", 905, 150, around_s=0.05).inputs("arms")
+    table = given["accelerometers"].copy()
+    spike = (table["sensor"] == "arm_left") & (table["t_s"].sub(0.15).abs() < 3e-4)
+    assert spike.any()
+    table.loc[spike, ["ax_m_s2", "ay_m_s2", "az_m_s2"]] += 300.0
+    sensors = telerig.smooth(**given | {"accelerometers": table}).summary["accelerometers"]
+    assert sensors["arm_left"]["masked_samples"] > 0 == sensors["arm_right"]["masked_samples"]
+    assert sensors["arm_left"]["delay_s"] == sensors["arm_right"]["delay_s"]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from telerig.arrays import Array, Ints
+from telerig.io.dataset.run import RunData
 from telerig.io.report.film.views import outlines_px
 from telerig.io.report.page.figures import CAMERA_COLOURS, MUTED, NAIVE, SMOOTHED
 from telerig.io.report.plot.axes import colour_of
@@ -25,6 +26,7 @@ Images = Callable[[str, int], NDArray[Any] | None]
 _RAY_MM = 8.0
 """Half of the part of a ray that is drawn, about the bubble."""
 _MOST_SERIES = 12
+_MOST_READINGS = 20_000
 _NO_TRACK = "#fabe14"
 
 
@@ -198,6 +200,38 @@ def _log_shake(stream: Any, smoothing: SmoothingResults) -> None:
                 stream.log(path("spectra", name), bars, static=True)
 
 
+def log_sensors(stream: Any, run: RunData, smoothing: SmoothingResults | None) -> None:
+    """Log encoder and accelerometers of a recording; of many readings every k-th.
+
+    Of a smoothed run it is what the encoder reads beyond the carriage's position, else the position
+    itself.
+    """
+    if run.stage is not None:
+        t_s, position = (run.stage[c].to_numpy(float) for c in ("t_s", "position_mm"))
+        if smoothing is not None and "position_mm" in smoothing.shake:
+            there, smooth = (smoothing.shake[c].to_numpy(float) for c in ("t_s", "position_mm"))
+            inside = (t_s >= there[0]) & (t_s <= there[-1])
+            t_s, position = t_s[inside], position[inside]
+            off = 1e3 * (position - np.interp(t_s, there, smooth))
+            _readings(stream, run, "encoder_residual_um", "encoder", t_s, off, MUTED)
+        else:
+            _readings(stream, run, "encoder_mm", "encoder", t_s, position, MUTED)
+    for name, rows in [] if run.accelerometers is None else run.accelerometers.groupby("sensor"):
+        t_s = rows["t_s"].to_numpy(float)
+        for axis, colour in zip(AXES, CAMERA_COLOURS):
+            values = rows[f"a{axis}_m_s2"].to_numpy(float)
+            _readings(stream, run, "accelerometers_m_s2", f"{name} {axis}", t_s, values, colour)
+
+
+def _readings(
+    stream: Any, run: RunData, plot: str, name: str, t_s: Array, values: Array, colour: str
+) -> None:
+    """Log readings at times of their own beside the frames in which they were taken."""
+    some = slice(None, None, max(1, len(t_s) // _MOST_READINGS))
+    frames = np.searchsorted(run.t_s, t_s[some], side="right").clip(1) - 1
+    log_series(stream, plot, frames, t_s[some], {name: values[some]}, {name: colour})
+
+
 def _series(
     stream: Any, rows: pd.DataFrame, plot: str, name: str, values: Array, colour: str
 ) -> None:
@@ -216,7 +250,9 @@ def layout(tracks: TrackResults, smoothing: SmoothingResults | None) -> Any:
     names = {"ray_miss_um": "ray miss / µm"}
     if smoothing is not None:
         names |= {"height_less_line_mm": "height less a straight line / mm",
-                  "shake_um": "shake / µm", "speed_mm_s": "speed / (mm/s)"}  # fmt: skip
+                  "shake_um": "shake / µm", "speed_mm_s": "speed / (mm/s)",
+                  "encoder_residual_um": "encoder less the carriage / µm"}  # fmt: skip
+    names |= {"accelerometers_m_s2": "accelerometers / (m/s²)"}
     plots = [rrb.TimeSeriesView(origin=f"plots/{key}", name=name) for key, name in names.items()]
     return rrb.Blueprint(
         rrb.Horizontal(

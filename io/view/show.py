@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
-from telerig.io.dataset.run import load_run, recordings
+from telerig.io.dataset.run import RunData, RunSource, load_run, recordings
 from telerig.io.files.atomic import atomic_path
 from telerig.io.report.film.views import read_outlines
 from telerig.io.results.folders.calibration import read_results
@@ -40,8 +40,9 @@ def view(
     """Show the results of a calibration or a run in the viewer of rerun; return its recording.
 
     Both views' images with outlines, ids and the rays of the other view, paths and bodies in space,
-    shake, height, speed and ray miss over time, on one time line; of a calibration every view's
-    dots and residuals, and the rig with all poses. In a notebook the last line of a cell shows it.
+    shake, height, speed, ray miss, encoder and accelerometers over time, on one time line; of a
+    calibration every view's dots and residuals, and the rig with all poses. In a notebook the last
+    line of a cell shows it.
 
     folder : results of `telerig calibrate`, `track` or `smooth`.
     save : an .rrd file to write instead of opening a window.
@@ -98,12 +99,15 @@ def _log(stream: Any, place: Path, frames: tuple[int, int] | None, recording: Pa
     tracks = read_track_results(place)
     smoothing = read_smoothing_results(place, tracks.up)
     cameras, _ = run_cameras(place, tracks)
-    image, count = _frames_of(place, recording, tracks)
+    data = _recording_of(place, recording, tracks)
+    image, count = _frames_of(data, tracks)
     every = range(count)[slice(*frames)] if frames else range(count)
     shown = every[:: -(-len(every) * len(tracks.cameras) // MOST_IMAGES) or 1]
     stream.send_blueprint(of_run.layout(tracks, smoothing))
     found = read_outlines(place / "detections.csv", tracks.cameras)
     of_run.log_run(stream, tracks, smoothing, cameras or (), found, image, list(shown))
+    if data is not None:
+        of_run.log_sensors(stream, data, smoothing)
 
 
 def _views_of(place: Path) -> Callable[[str, str], NDArray[Any] | None]:
@@ -125,19 +129,26 @@ def _views_of(place: Path) -> Callable[[str, str], NDArray[Any] | None]:
     return image
 
 
+def _recording_of(place: Path, recording: Path | None, tracks: TrackResults) -> RunData | None:
+    """Return the recording of a results folder; None where it is not there."""
+    folder = place.resolve()
+    run = recording or folder.parent.parent / "runs" / folder.name
+    if not (run.is_dir() and (recordings(run) or (run / "detections.csv").is_file())):
+        return None
+    sizes = {c: s for c in tracks.cameras if (s := tracks.image_size_px(c)) is not None}
+    source: RunSource = "images" if recordings(run) else "detections"
+    data = load_run(run, source=source, cameras=tracks.cameras, image_sizes_px=sizes)
+    return replace(data, skip_unreadable=True)
+
+
 def _frames_of(
-    place: Path, recording: Path | None, tracks: TrackResults
+    data: RunData | None, tracks: TrackResults
 ) -> tuple[Callable[[str, int], NDArray[Any] | None], int]:
     """Return the function that reads a run's images, and the number of its frames."""
     last = int(tracks.tracks["frame"].to_numpy().max(initial=-1)) + 1
     count = tracks.file.frames or last
-    folder = place.resolve()
-    run = recording or folder.parent.parent / "runs" / folder.name
-    if not run.is_dir() or not recordings(run):
+    if data is None or data.source != "images":
         return (lambda _camera, _frame: None), count
-    sizes = {c: s for c in tracks.cameras if (s := tracks.image_size_px(c)) is not None}
-    data = load_run(run, source="images", cameras=tracks.cameras, image_sizes_px=sizes)
-    data = replace(data, skip_unreadable=True)
     return data.image, min(count, data.frame_count)
 
 

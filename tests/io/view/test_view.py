@@ -80,7 +80,13 @@ def test_a_calibration_and_a_run_have_everything_on_one_time_line(
     found = entities(tmp_path / "r.rrd")
     assert {"/space/bubbles", "/space/paths/smoothed", "/space/paths/triangulated"} <= set(found)
     assert {"/images/left/outlines", "/images/right/rays"} <= set(found)
-    for plot in ("ray_miss_um", "speed_mm_s", "height_less_line_mm", "shake_um"):
+    for plot in (
+        "ray_miss_um",
+        "speed_mm_s",
+        "height_less_line_mm",
+        "shake_um",
+        "encoder_residual_um",
+    ):
         assert any(path.startswith(f"/plots/{plot}/") for path in found), plot
 
 

@@ -44,11 +44,15 @@ def key_numbers(results: CalibrationResults) -> list[Figure]:
 
 
 def precision_words(results: CalibrationResults) -> str:
-    """Return how well a point is placed, to follow the status; "" if that is not to be used."""
-    sd_um = results.statistics.get("space_sd_um")
-    if len(results.cameras) < 2 or sd_um is None or results.file.verdict.status == Status.REJECTED:
+    """Return how well a point is placed, to follow the status; "" if that is not to be used.
+
+    Only of a good calibration it is certain that errors are what is stated.
+    """
+    sd_um, status = results.statistics.get("space_sd_um"), results.file.verdict.status
+    if len(results.cameras) < 2 or sd_um is None or status == Status.REJECTED:
         return ""
-    return f": points in space are good to {number(sd_um)} µm (1 sd per axis)"
+    words = "points in space are good to" if status == Status.GOOD else "points in space state"
+    return f": {words} {number(sd_um)} µm (1 sd per axis)"
 
 
 def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Figure]:

@@ -123,15 +123,18 @@ def of_positions(grid: Grid, t_s: ArrayLike, positions_mm: ArrayLike) -> Acceler
     return Accelerations(grid, np.where(known[:, None], second, 0.0), known)
 
 
-def of_readings(grid: Grid, t_s: ArrayLike, readings_mm_s2: ArrayLike) -> Accelerations:
+def of_readings(
+    grid: Grid, t_s: ArrayLike, readings_mm_s2: ArrayLike, covered_s: Array | None = None
+) -> Accelerations:
     """Return the smoothed readings of an accelerometer, minus their median over the whole record.
 
     t_s : (N,) increasing times. readings_mm_s2 : (N, 3).
+    covered_s : (M,) times that the result covers, those of masked samples included; t_s by default.
     """
     from scipy.signal import fftconvolve
 
     t, reading = np.asarray(t_s, float), np.asarray(readings_mm_s2, float)
-    own = grid.covering(t)
+    own = grid.covering(t if covered_s is None else covered_s)
     even = _averaged(t, reading - np.median(reading, axis=0), own)
     bridge = _bridge(grid, t)
     known = _eroded(_bridged(own.t_s, t), 2 * grid.knots - 1 + len(bridge) // 2)

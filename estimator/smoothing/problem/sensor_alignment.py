@@ -358,7 +358,7 @@ def _readings(grid: Grid, sensor: Accelerometer) -> Accelerations:
     used = sensor if sensor.kept is None else sensor.of(sensor.kept)
     readings = used.reading_mm_s2.copy()
     readings[:, list(used.unused_axes)] = 0.0
-    return of_readings(grid, used.t_s, readings)
+    return of_readings(grid, used.t_s, readings, sensor.t_s)
 
 
 def _of_images(

@@ -198,3 +198,15 @@ def test_a_sensor_without_a_sample_in_the_middle_of_a_run_is_left_out_of_its_lik
     first, *others = problem.accelerometers
     gone = replace(problem, accelerometers=(first.of(first.t_s < -1.0), *others))
     assert _log_evidence(gone) == _log_evidence(replace(problem, accelerometers=tuple(others)))
+
+
+def test_samples_that_are_masked_at_the_end_of_one_record_leave_two_sensors_comparable() -> None:
+    """The left arm's logger stops at the last frame; the right one's goes on."""
+
+    def frozen(name: str, t: Any, reading: Any) -> Any:
+        if name == "arm_left":
+            reading[slice(*np.searchsorted(t, [0.6, 0.7]))] = reading[np.searchsorted(t, 0.6)]
+        return t, reading
+
+    sensors, _ = placed(900, "one", frozen, scenario="S3", frames=300, clock="frames")
+    assert all(s.confirmed for s in sensors.values()) and len(sensors) == 2

@@ -25,6 +25,7 @@ from telerig.io.report.page.page import Row, Section, render_sections
 from telerig.io.report.plot.spectrum import shake_spectrum
 from telerig.short_text import counted
 
+TERMS = ("Verdict", "Covariance, standard deviation (sd)")
 _SIGNS = {"ok": "", "note": "note", "warning": "look", "failure": "mend"}
 _WIDTH_PX = 480
 
@@ -61,7 +62,7 @@ def write_trial_report(
             Section("What was looked at", head=("check", "", "found", "to do"), rows=rows,
                     numbers=(99, 99)),
         ],
-        ["Verdict", "Covariance, standard deviation (sd)"],
+        TERMS,
     )  # fmt: skip
     file.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(file, page)

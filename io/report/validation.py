@@ -21,6 +21,7 @@ from telerig.io.results.validation import (
 )
 
 NAME = "validation.html"
+TERMS = ("Marks", "NEES", "Covariance, standard deviation (sd)", "Verdict")
 _MOST_DRAWN = 12
 
 
@@ -59,7 +60,7 @@ def render(content: ValidationFile) -> str:
             Section("Mark by mark", lead, head=HEAD, rows=rows, numbers=(3, 10)),
             Section("In time", pictures=pictures),
         ],
-        ["Marks", "NEES", "Covariance, standard deviation (sd)", "Verdict"],
+        TERMS,
     )  # fmt: skip
 
 

@@ -85,7 +85,10 @@ def test_sets_and_probabilities_are_those_of_an_enumeration(seed: int) -> None:
     np.testing.assert_allclose(found, np.array(expected) / weights.sum(), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("count", "step_deg"), [(3, 50.0), (4, 45.0), (4, 60.0)])
+@pytest.mark.parametrize(
+    ("count", "step_deg"),
+    [(3, 50.0), pytest.param(4, 45.0, marks=pytest.mark.slow), (4, 60.0)],
+)
 def test_bubbles_of_one_size_are_found_by_all_cameras(count: int, step_deg: float) -> None:
     """Of cameras at 0, 60, 120 and 180 degrees the first and the last look along one line."""
     cameras, rng = rig(count, step_deg), np.random.default_rng(2)

@@ -135,6 +135,7 @@ def failed(found: Recording) -> list[str]:
     return [check.what for check in found.checks if check.status == "failure"]
 
 
+@pytest.mark.slow
 def test_a_sound_recording_passes_and_expects_its_verdict(
     trial: tuple[RunData, telerig.Calibration],
 ) -> None:

@@ -130,6 +130,7 @@ def swarm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]:
     return next((data.path / "runs").iterdir()), replace(known, findings=())
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_gone_for_a_while_loses_no_track(
     swarm: tuple[Path, Calibration], tmp_path: Path
 ) -> None:

@@ -104,15 +104,13 @@ def test_a_sensor_slower_than_the_frames_is_told() -> None:
     assert len(words) == 2 and "above 125 Hz" in words[0]
 
 
-@pytest.mark.parametrize(
-    ("encoder", "proposed"), [(1e-3, 1e3), *long((1 / 25.4, 25.4), (-1.0, -1.0))]
-)
-def test_a_scale_that_is_roughly_known_is_taken_for_the_nearest_unit(
-    encoder: float, proposed: float
-) -> None:
-    """One bubble shows 1,355 ± 200 times the motion of an encoder in metres."""
-    _, said = placed(905, "one", scenario="S2", encoder=encoder)
-    assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": proposed}]
+def test_a_scale_that_is_roughly_known_is_taken_for_the_nearest_unit() -> None:
+    """One bubble shows 1,355 ± 200 times the motion of an encoder in metres.
+
+    25 times could be a resonance of the arms at the single line of S2.
+    """
+    _, said = placed(905, "one", scenario="S2", encoder=1e-3)
+    assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": 1e3}]
 
 
 @pytest.mark.parametrize(("scenario", "information"), [("S1", "one"), *long(("S2", "references"))])
@@ -130,30 +128,28 @@ def test_marks_show_the_unit_of_an_encoder_that_seems_to_stand() -> None:
     assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": 1e3}]
 
 
-@pytest.mark.parametrize(("information", "known"), [("references", True), *long(("one", False))])
-def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
-    information: str, known: bool
-) -> None:
-    _, said = placed(906, information, scenario="S2", encoder=1 / 4, around_s=10.0)
+def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known() -> None:
+    """By marks. Beside one bubble 4 times could be a resonance of the arms."""
+    _, said = placed(906, "references", scenario="S2", encoder=1 / 4, around_s=10.0)
     (finding,) = [f for f in said if f.code is not None]
     assert finding.code == "ENCODER_SCALE"
-    assert finding.fix == ({"encoder_factor": pytest.approx(4.0, rel=2e-3)} if known else {})
+    assert finding.fix == {"encoder_factor": pytest.approx(4.0, rel=2e-3)}
 
 
 @pytest.mark.parametrize(
     ("scenario", "seed", "information", "blamed", "frames"),
     [
         ("S2", 908, "references", "accelerometer arm_left", 300),
-        *long(("S1", 907, "one", "accelerometers", None)),
         *long(("S3", 907, "one", "accelerometer arm_left", None)),
     ],
 )
 def test_an_arm_is_blamed_only_where_all_measurements_tell_it_from_the_other(
     scenario: str, seed: int, information: str, blamed: str, frames: int | None
 ) -> None:
-    """In S1 one bubble tells too little of the left arm's motion along x: both arms are named.
+    """Marks that contradict the arm are no outliers.
 
-    Marks that contradict the arm are no outliers.
+    In S1 one bubble tells too little of the left arm's motion along x, and what the other arm and
+    the encoder do tells nothing: arms with resonances move apart in sound rigs, too.
     """
 
     def turned(name: str, t: Any, reading: Any) -> Any:

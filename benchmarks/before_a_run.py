@@ -63,7 +63,7 @@ def main() -> int:
         half = check_recording(run.first(FRAMES // 2), calibration, seconds=seconds)
         tracks = telerig.track(run, calibration)
         whole = telerig.smooth(tracks, calibration, stage=run).verdict["verdict"]
-        expected = "" if half.expected is None else str(half.expected.verdict)
+        expected = "" if half.expected is None else str(half.expected)
         agreed += expected == whole
         print(f"{name:32}expected {expected:12} of the whole {whole}", flush=True)
     print(f"{wrong} wrong; {agreed} of {len(SENSORS)} expected verdicts are those of the whole")

@@ -20,7 +20,7 @@ from telerig.estimator.bubbles.background.screen import screen_level
 from telerig.estimator.bubbles.flat_field import full_scale
 from telerig.estimator.calibration.result.calibration import Calibration, of_run
 from telerig.estimator.doctor.checks import Check
-from telerig.estimator.plan import MOST_STATES, Expected, Experiment, expect
+from telerig.estimator.plan import MOST_STATES, Experiment, expect
 from telerig.estimator.rig_drift import LATE_SIGMAS, with_speeds
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.sensors.findings import Finding, SensorError
@@ -30,7 +30,7 @@ from telerig.estimator.tracking.detect_run import described_fields
 from telerig.estimator.tracking.track import track
 from telerig.estimator.tracking.tracks import Tracks
 from telerig.io.dataset.run import RunData
-from telerig.io.results.smoothing import Verdict
+from telerig.io.results.smoothing import SmoothingFile, Verdict
 from telerig.io.results.verdict_words import number_words
 from telerig.io.tables.smoothing import AXES
 from telerig.short_text import counted, share
@@ -63,22 +63,22 @@ _LEAST_HZ = 3.0
 _MOST_REFUSED = 4
 _GAP = 1.5
 _MOST_PLANNED = 4000
-"""Bubbles times frames of the plan; a longer run is at least as good as one of that length."""
+"""Bubbles times frames of the planned run; a longer one is at least as good."""
 
 
 @dataclass(frozen=True)
 class Recording:
     """Hold what was found in a short recording.
 
-    checks : the answers. tracks, smoothing, expected : what tracking, smoothing and the plan gave;
-    None where they could not be made.
+    checks : the answers. tracks, smoothing : what tracking and smoothing gave; None where they
+    could not be made. expected : the verdict to expect of the planned run.
     """
 
     run: RunData
     checks: tuple[Check, ...]
     tracks: Tracks | None = None
     smoothing: Smoothing | None = None
-    expected: Expected | None = None
+    expected: Verdict | None = None
 
 
 def check_recording(
@@ -115,9 +115,8 @@ def check_recording(
     else:
         checks += _shake(smoothing, calibration, run.cameras)
         length = float(np.ptp(run.t_s)) if seconds is None else seconds
-        planned = _planned(run, tracks, smoothing, length)
-        expected = expect(_recorded_rig(run, smoothing), calibration, planned)
-        checks.append(_verdict(expected, planned, length, smoothing))
+        expected = _expected(run, tracks, smoothing, calibration, length)
+        checks.append(_verdict(expected, length, smoothing))
     return Recording(run, tuple(checks), tracks, smoothing, expected)
 
 
@@ -393,21 +392,43 @@ def _recorded_rig(run: RunData, smoothing: Smoothing) -> Any:
     return replace(rig, accelerometers=kept, stage=rig.stage if run.stage is not None else None)
 
 
-def _planned(run: RunData, tracks: Tracks, smoothing: Smoothing, seconds: float) -> Experiment:
-    """Return the planned run, with the recording's bubbles and shake."""
+def _expected(
+    run: RunData, tracks: Tracks, smoothing: Smoothing, calibration: Calibration, seconds: float
+) -> Verdict:
+    """Return the verdict to expect of a run of so many seconds.
+
+    It is the recording's own, better by as many steps as the plan of the longer run is better than
+    that of the recording; the plan alone does not know how the rig shakes.
+    """
+    own = Verdict(smoothing.verdict["verdict"])
+    short = _planned(run, tracks, smoothing)
+    most = max(short.seconds, min(MOST_STATES, _MOST_PLANNED) / short.bubbles / short.rate_hz)
+    if own not in (Verdict.PARTIAL, Verdict.UNRESOLVED) or seconds <= short.seconds:
+        return own
+    rig, order = _recorded_rig(run, smoothing), list(Verdict)
+    before, after = (
+        order.index(expect(rig, calibration, plan).verdict)
+        for plan in (short, replace(short, seconds=min(seconds, most)))
+    )
+    return order[max(0, order.index(own) - max(0, before - after))]
+
+
+def _planned(run: RunData, tracks: Tracks, smoothing: Smoothing) -> Experiment:
+    """Return the plan of a run like the recording, of at most `MOST_STATES`."""
     table = tracks.table
     rate = 1 / float(np.median(np.diff(run.t_s)))
     in_sight = max(1, round(float(table.groupby("frame").size().median())))
-    most = min(MOST_STATES, _MOST_PLANNED) / in_sight / rate
     rms, hz = shake_line(smoothing, run.cameras)
     variances = [table[f"{c}_s{a}{a}_px2"] for c in run.cameras for a in "uv"]
     rise = np.zeros(1) if run.position_mm is None else np.diff(run.position_mm) * rate
+    marked = run.references if tracks.references is None else tracks.references
     marks = 0
-    if tracks.references is not None and len(tracks.references):
-        marks = round(float(tracks.references.groupby(["frame", "camera"]).size().median()))
+    if marked is not None and len(marked):
+        marks = round(float(marked.groupby(["frame", "camera"]).size().median()))
     vertical = "xyz".index(str(smoothing.verdict.get("vertical", "y")))
     return Experiment(
-        rate_hz=rate, seconds=min(seconds, most), bubbles=in_sight,
+        rate_hz=rate, seconds=min(float(np.ptp(run.t_s)), MOST_STATES / in_sight / rate),
+        bubbles=in_sight,
         diameter_mm=float(np.nanmedian(table["d_eq_mm"])) if "d_eq_mm" in table else 3.0,
         sigma_px=float(np.sqrt(pd.concat(variances).median())),
         rise_mm_s=max(0.0, float(np.nanmedian(rise))),
@@ -415,16 +436,13 @@ def _planned(run: RunData, tracks: Tracks, smoothing: Smoothing, seconds: float)
     )  # fmt: skip
 
 
-def _verdict(
-    expected: Expected, planned: Experiment, seconds: float, smoothing: Smoothing
-) -> Check:
+def _verdict(expected: Verdict, seconds: float, smoothing: Smoothing) -> Check:
     """Check which verdict the planned run may expect."""
-    first = f", by its first {planned.seconds:.2g} s" if planned.seconds < seconds else ""
+    file = SmoothingFile.model_validate(smoothing.verdict)
     return _judged(
         "expected verdict",
-        f"{seconds:.3g} s with {counted(planned.bubbles, 'bubble')}{first}: {expected.verdict}, "
-        f"{number_words(expected.axes, expected.vertical)}; this recording: "
-        f"{smoothing.verdict.get('verdict')}",
-        expected.verdict is Verdict.RESOLVED,
+        f"{expected} of a run of {seconds:.3g} s; of this recording {file.verdict}: "
+        f"{number_words(file.axes, file.vertical)}",
+        expected is Verdict.RESOLVED,
         "add an accelerometer to each arm or marks fixed to the tank; `telerig plan` compares them",
     )

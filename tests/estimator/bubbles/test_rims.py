@@ -54,6 +54,7 @@ def misses(found: Array, bubbles: list[Drawn]) -> Array:
     return np.asarray(np.linalg.norm(found[:, None] - truth, axis=2).min(axis=0))
 
 
+@pytest.mark.slow
 def test_images_are_searched_by_rims_where_bubbles_crowd() -> None:
     """By dark regions alone 60 % of these bubbles are found at 35 % covered."""
     image, truth = swarm(0.35, True, np.random.default_rng(70))

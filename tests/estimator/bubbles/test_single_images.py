@@ -123,6 +123,7 @@ def test_a_crowded_image_is_warned_about(tmp_path: Path) -> None:
     assert "beyond 20% more than one in five is missed" in words
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real images are not here")
 def test_real_bubbles_behind_a_window() -> None:
     """1,014 labelled bubbles; before, the frame around the window was taken for the only one."""

@@ -210,6 +210,7 @@ def test_planted_troubles_are_named(
     assert named in failed(check_recording(plant(run), calibration))
 
 
+@pytest.mark.slow
 def test_the_command_looks_at_a_calibrated_run_and_ends_with_1_for_a_trouble(
     tank_copy: Path,
 ) -> None:

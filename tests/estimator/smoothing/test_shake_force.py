@@ -25,6 +25,7 @@ from telerig.estimator.smoothing.learning.parameters import (
 )
 
 
+@pytest.mark.slow
 def test_a_force_with_a_corner_is_told_from_a_white_one() -> None:
     problem, _, _ = run(
         np.random.default_rng(12), bubbles=1, still=True, seconds=1.0, rate_hz=500.0,

@@ -24,6 +24,7 @@ from telerig.io.simulation.presets import run_preset
 pytestmark = pytest.mark.usefixtures("known_low_passes")
 
 
+@pytest.mark.slow
 def test_a_run_is_tracked_and_smoothed_from_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

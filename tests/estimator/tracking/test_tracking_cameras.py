@@ -62,6 +62,7 @@ def with_third(rise: Path, place: Path, tracking: str) -> Path:
     return run
 
 
+@pytest.mark.slow
 def test_a_run_takes_the_two_cameras_that_tracking_names(rise: Path, tmp_path: Path) -> None:
     two, three = calibrations(rise)
     plain = next((rise / "runs").iterdir())

@@ -973,7 +973,7 @@ def with_change(
         late = _rounded(1e3 * change.late_s, 1e3 * change.slate_s)
         words.append(
             f"Camera {change.camera!r} exposes {late} ms after {change.against!r}: positions of "
-            "moving bubbles are off by half the way that they move in this time, and ray misses "
+            "moving bubbles are off by up to the way that they move in this time, and ray misses "
             "are larger. Trigger both cameras by one signal, and compare their delays."
         )
     if change is not None and change.culprit:

@@ -9,17 +9,16 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
-from telerig.errors import InputError, TelerigError
+from telerig.errors import TelerigError
 from telerig.estimator.bubbles.background.screen import screen_level
 from telerig.estimator.bubbles.flat_field import full_scale
 from telerig.estimator.calibration.result.calibration import Calibration, of_run
-from telerig.estimator.doctor.checks import Check
+from telerig.estimator.doctor.checks import Check, Status
 from telerig.estimator.plan import MOST_STATES, Experiment, expect
 from telerig.estimator.rig_drift import LATE_SIGMAS, with_speeds
 from telerig.estimator.sensors.checks import check_sensors
@@ -32,6 +31,7 @@ from telerig.estimator.tracking.tracks import Tracks
 from telerig.io.dataset.run import RunData
 from telerig.io.results.smoothing import SmoothingFile, Verdict
 from telerig.io.results.verdict_words import number_words
+from telerig.io.rig_file.description import RigDescription
 from telerig.io.tables.smoothing import AXES
 from telerig.short_text import counted, share
 
@@ -94,7 +94,7 @@ def check_recording(
     seconds : duration of the run that is planned; None for that of the recording.
     progress : as for `telerig.smooth`.
 
-    Raises InputError for a recording that cannot be read, or without any bubble.
+    Raises InputError for a recording that cannot be read.
     """
     checks: list[Check] = []
     if run.source == "images":
@@ -156,14 +156,14 @@ def _images(run: RunData, camera: str) -> Iterator[Check]:
         f"the backlight is at {share(level, scale)} of full scale (at least "
         f"{share(LEAST_LEVEL, 1)})",
         level >= LEAST_LEVEL * scale,
-        "more light, a wider aperture, or a longer exposure if the motion permits it",
+        "give more light, open the aperture, or expose for longer if the motion permits it",
     )
     worst = float(np.median(saturated))
     yield _judged(
         f"saturation of {camera}",
         f"{share(worst, 1)} of the pixels are at full scale (at most {share(MOST_SATURATED, 1)})",
         worst <= MOST_SATURATED,
-        "less light, a shorter exposure, or a lower gain",
+        "give less light, expose for less time, or lower the gain",
     )
     yield _judged(
         f"evenness of {camera}",
@@ -173,7 +173,7 @@ def _images(run: RunData, camera: str) -> Iterator[Check]:
         "centre the light behind the tank, or move it away from the diffuser",
     )
     for kind, frames, todo in (
-        ("missing", missing, "record to a faster disk, or with less frames per second"),
+        ("missing", missing, "record to a faster disk, or with fewer frames per second"),
         ("doubled", doubled, "look at the trigger and at the camera's driver: an image is stored "
          "again where a new one was not there in time"),
     ):  # fmt: skip
@@ -194,10 +194,10 @@ def _steps(run: RunData) -> Iterator[Check]:
         lost = round(float((steps[steps > _GAP * step] / step - 1).sum()))
         yield _judged(
             "times of the frames",
-            f"{counted(lost, 'frame')} of {run.frame_count + lost} lacking by the times in "
+            f"{counted(lost, 'frame')} of {run.frame_count + lost} missing by the times in "
             f"frames.csv (at most {share(MOST_MISSING, 1)})",
             lost <= MOST_MISSING * (run.frame_count + lost),
-            "record to a faster disk, or with less frames per second",
+            "record to a faster disk, or with fewer frames per second",
         )
 
 
@@ -220,14 +220,21 @@ def _outlines(tracks: Tracks, cameras: Sequence[str]) -> Iterator[Check]:
 
 
 def _speed_px_s(tracks: Tracks, cameras: Sequence[str]) -> float:
-    """Return the speed in px/s below which the images of bubbles move in 95 % of the frames."""
+    """Return the speed in px/s below which the images of bubbles move in 95 % of the frames.
+
+    It is nan if no bubble was seen in three frames one after the other.
+    """
     moving = with_speeds(tracks.table, cameras)
     each = [np.hypot(moving[f"{c}_u_px_s"], moving[f"{c}_v_px_s"]) for c in cameras]
     known = np.concatenate(each)
-    return float(np.quantile(known[known > 0], 0.95))
+    known = known[known > 0]
+    return float(np.quantile(known, 0.95)) if len(known) else float("nan")
 
 
 def _exposure(speed: float) -> Check:
+    if not np.isfinite(speed):
+        words = "no bubble was seen in three frames one after the other"
+        return Check("motion", "note", words, "record for longer")
     longest = 1e3 * MOST_SMEAR_PX / speed
     return Check(
         "motion",
@@ -287,7 +294,7 @@ def _smoothed(
     warnings = [] if smoothing is None else smoothing.summary.get("warnings", ())
     known = [finding.warning for finding in said]
     checks += [Check("sensors", "warning", str(w)) for w in warnings if str(w) not in known]
-    if not checks:
+    if all(check.status == "note" for check in checks):
         present = run.stage is not None or run.accelerometers is not None
         words = "encoder and accelerometers agree with the images" if present else "none"
         checks.append(Check("sensors", "ok" if present else "note", words))
@@ -295,7 +302,8 @@ def _smoothed(
 
 
 def _of_sensor(finding: Finding) -> Check:
-    return Check("sensors", "failure", f"{finding.where}: {finding.words}", finding.todo)
+    status: Status = "failure" if finding.is_fault else "note"
+    return Check("sensors", status, f"{finding.where}: {finding.words}", finding.todo)
 
 
 def _without_refused(run: RunData, findings: Sequence[Finding]) -> RunData:
@@ -305,7 +313,7 @@ def _without_refused(run: RunData, findings: Sequence[Finding]) -> RunData:
         refused = [
             name
             for name in table["sensor"].unique()
-            if any(f.fix.get("sensor") == name or f.where.endswith(str(name)) for f in findings)
+            if any(f.fix.get("sensor") == name or f.where.endswith(f" {name}") for f in findings)
         ]
         if refused:
             kept = table[~table["sensor"].isin(refused)].reset_index(drop=True)
@@ -382,12 +390,11 @@ def _sensor_shake(run: RunData, calibration: Calibration) -> Iterator[Check]:
         )
 
 
-def _recorded_rig(run: RunData, smoothing: Smoothing) -> Any:
+def _recorded_rig(run: RunData, smoothing: Smoothing) -> RigDescription:
     """Return the rig with the sensors that the smoothing used."""
     used = set(smoothing.summary.get("accelerometers", ()))
     rig = run.rig
-    if rig is None:
-        raise InputError("the run belongs to no rig.toml", where=str(run.path))
+    assert rig is not None
     kept = {name: one for name, one in rig.accelerometers.items() if name in used}
     return replace(rig, accelerometers=kept, stage=rig.stage if run.stage is not None else None)
 
@@ -401,6 +408,8 @@ def _expected(
     that of the recording; the plan alone does not know how the rig shakes.
     """
     own = Verdict(smoothing.verdict["verdict"])
+    if run.rig is None:  # nothing says which sensors a longer run would have
+        return own
     short = _planned(run, tracks, smoothing)
     most = max(short.seconds, min(MOST_STATES, _MOST_PLANNED) / short.bubbles / short.rate_hz)
     if own not in (Verdict.PARTIAL, Verdict.UNRESOLVED) or seconds <= short.seconds:

@@ -48,6 +48,7 @@ class Finding:
         two records. For the encoder it is {"encoder_factor": -1.0}, {"encoder_offset_s": s}, or
         {"encoder_jumps": [[t_s, mm], ...]}, lengths that are subtracted from t_s on. For the frames
         it is {"frame_time_factor": 0.001}.
+    is_fault : False for what was assumed because it is not stated.
     """
 
     words: str
@@ -55,6 +56,7 @@ class Finding:
     todo: str = ""
     code: Code | None = None
     fix: Mapping[str, Any] = field(default_factory=dict)
+    is_fault: bool = True
 
     @property
     def warning(self) -> str:

@@ -102,7 +102,7 @@ def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
         density = noise_density(t, reading)
         words = f"no noise density is given; {density:.3g} ug/sqrt(Hz) are estimated"
         todo = "give noise_density_ug_sqrt_hz from the data sheet"
-        findings.append(Finding(words, where, todo))
+        findings.append(Finding(words, where, todo, is_fault=False))
     sigma = density * _MICRO_G_M_S2 * np.sqrt(sampling_rate(t) / 2)
     frozen = frozen_samples(reading, sigma) & ~clipped
     if frozen.any():

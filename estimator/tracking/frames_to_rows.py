@@ -51,6 +51,9 @@ from telerig.rig.camera import Camera
 _BUBBLES_AT_ONCE = 512
 """Bubbles whose bodies are fitted and whose rows are written together."""
 
+_LIKELY = 0.1
+"""Probability without tracks of groups whose bodies are fitted beforehand, together."""
+
 _LEAST_FOR_OFFSET = 3
 """Bubbles that tell the shift of all pixels of a frame by a median."""
 
@@ -143,7 +146,7 @@ class RowMaker:
         )
         likely = [np.arange(len(named))]
         first = len(named) + np.cumsum([0, *map(len, found)])
-        likely += [match(f, self.model).candidate + s for f, s in zip(found, first)]
+        likely += [np.flatnonzero(f.probability > _LIKELY) + s for f, s in zip(found, first)]
         self._fit(bubbles, np.concatenate(likely), tables, starts[frame])
         order = np.argsort(frame, kind="stable")
         cuts = [

@@ -18,7 +18,7 @@ from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
-from telerig.estimator.bubbles.pairing.groups import candidates_of, match
+from telerig.estimator.bubbles.pairing.groups import candidates_of
 from telerig.estimator.bubbles.pairing.learning import learn_rig
 from telerig.estimator.bubbles.pairing.model import RigModel
 from telerig.estimator.bubbles.shape.lasting import LastingShare
@@ -506,8 +506,7 @@ def _shapes(sample: list[Tables], model: RigModel, up: Array) -> Shapes:
     starts = np.cumsum(counts, axis=0) - counts
     seen = []
     for first, one in zip(starts, found):
-        matches = match(one, model)
-        rows = matches.rows[matches.confidence > _RELIABLE]
+        rows = one.groups.rows[one.probability > _RELIABLE]
         seen.append(np.where(rows >= 0, rows + first, -1))
     sightings = [sightings_from_table(t, c, model.cameras) for c, t in enumerate(tables)]
     many = counts.sum(0)

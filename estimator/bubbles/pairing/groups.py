@@ -14,8 +14,9 @@ them; half the distance of top and bottom, the *height*, is compared, too, and s
 contrast, by the mean of the pairs' evidence over all trees that connect the views. (Blur is not
 used: views at an angle are out of focus at different depths.)
 
-The best set of disjoint groups is exact. The probability of a set is proportional to the product of
-exp(log odds) of its groups, and each group has a posterior probability.
+The probability of a set of disjoint groups is proportional to the product of exp(log odds) of its
+groups, and each group has an exact posterior probability. Groups that are more probable than not
+are disjoint, and they are the result: where no group is, none is guessed.
 """
 
 from __future__ import annotations
@@ -364,7 +365,8 @@ class Groups(Rows):
     """G groups of the detections of one frame, or of several, in C cameras; D is 2 C - 3.
 
     rows : (G, C) row of the detection of each camera, -1 for none.
-    log_odds : (G,) log odds from everything but the innovation and the tracks.
+    log_odds : (G,) log odds from everything but the tracks, and of `possible_groups` but the
+        innovation.
     log_radius : (G,) mean logarithm of the radius in all views (mm); NaN if unknown.
     points_mm, covariance_mm2 : (G, 3), (G, 3, 3) triangulated from all detections of a group.
     left_px : (G, C, 2) centres of the outlines less the pixels of the points; NaN without one.
@@ -515,10 +517,13 @@ class Candidates:
     """The possible groups of one frame, and all its detections by camera.
 
     rays : the detections of each camera by themselves, as `on_rays` returns them.
+    groups : their log odds hold everything but the tracks.
+    probability : (G,) posterior probabilities of the groups without tracks.
     """
 
     rays: tuple[tuple[Array, Array, Array], ...]
     groups: Groups
+    probability: Array
 
     def __len__(self) -> int:
         return len(self.groups)
@@ -526,7 +531,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Matches:
-    """Hold the M groups of one frame that are the most probable ones as a whole.
+    """Hold the M groups of one frame that are more probable than not; they are disjoint.
 
     candidate : (M,) positions of the groups among the frame's `Candidates`.
     rows : (M, C) row in the table of each camera, -1 for none.
@@ -560,7 +565,30 @@ def candidates_of(
 def candidates(
     views: Sequence[View], counts: Ints, model: RigModel, barred: Sequence[Bools] | None = None
 ) -> list[Candidates]:
-    """Return the possible groups of F frames.
+    """Return the possible groups of F frames, each with the shift that its groups share.
+
+    The arguments are those of `possible_groups`.
+    """
+    groups, frame = possible_groups(views, counts, model, barred)
+    total, _, probability = with_innovations(groups, groups.log_odds, frame, counts, model)
+    groups = replace(groups, log_odds=total)
+    cuts = np.searchsorted(frame, np.arange(len(counts) + 1)).tolist()
+    rays = [on_rays(c, v.uv_px, v.covariance_px2) for c, v in zip(model.cameras, views)]
+    ends = np.cumsum(counts, axis=0)
+    of_frame = [
+        tuple((x[i:j], p[i:j], by[i:j]) for (x, p, by), i, j in zip(rays, first, last))
+        for first, last in zip((ends - counts).tolist(), ends.tolist())
+    ]
+    return [
+        Candidates(own, groups.take(slice(*ends)), probability[slice(*ends)])
+        for own, ends in zip(of_frame, pairwise(cuts))
+    ]
+
+
+def possible_groups(
+    views: Sequence[View], counts: Ints, model: RigModel, barred: Sequence[Bools] | None = None
+) -> tuple[Groups, Ints]:
+    """Return the possible groups (G,) of F frames, and their frames (G,), ascending.
 
     views : of all detections, which follow each other frame by frame.
     counts : (F, C) number of detections in each frame and camera.
@@ -581,20 +609,10 @@ def candidates(
     alike, log_radius = (total / pairs).T
     odds = alike * (many - 1) + prior_log_odds(groups, counts[frame], model)
     groups = replace(groups, log_odds=odds, log_radius=log_radius)
-    starts = ends - counts
     order = np.argsort(frame, kind="stable")
     groups, frame = groups.take(order), frame[order]
-    groups.rows[:] = np.where(groups.rows >= 0, groups.rows - starts[frame], -1)
-    cuts = np.searchsorted(frame, np.arange(len(counts) + 1)).tolist()
-    rays = [on_rays(c, v.uv_px, v.covariance_px2) for c, v in zip(model.cameras, views)]
-    of_frame = [
-        tuple((x[i:j], p[i:j], by[i:j]) for (x, p, by), i, j in zip(rays, first, last))
-        for first, last in zip(starts.tolist(), ends.tolist())
-    ]
-    return [
-        Candidates(own, groups.take(slice(low, high)))
-        for own, (low, high) in zip(of_frame, pairwise(cuts))
-    ]
+    groups.rows[:] = np.where(groups.rows >= 0, groups.rows - (ends - counts)[frame], -1)
+    return groups, frame
 
 
 @dataclass(frozen=True)
@@ -714,67 +732,21 @@ def prior_log_odds(groups: Groups, counts: Ints, model: RigModel) -> Array:
 
 
 def match(found: Candidates, model: RigModel, predicted: Prediction | None = None) -> Matches:
-    """Find the most probable groups among the possible ones of a frame.
+    """Find the groups of a frame that are more probable than not.
 
     predicted : where tracks are expected; None if there are no tracks.
     """
-    groups = found.groups
-    counts = np.array([len(points) for points, *_ in found.rays])
-    odds = groups.log_odds
+    from telerig.estimator.bubbles.pairing import kernels
+
+    rows, probability = found.groups.rows, found.probability
     if predicted is not None and len(predicted.ids) and len(found):
-        odds = odds + track_log_odds(found, model, predicted)
-    frame = np.zeros(len(groups), np.int64)
-    total, _, probability = with_innovations(groups, odds, frame, counts[None], model)
-    chosen = best_groups(total, groups.rows)
+        odds = found.groups.log_odds + track_log_odds(found, model, predicted)
+        counts = np.array([len(points) for points, *_ in found.rays])
+        probability = kernels.marginals(odds, rows, counts, NEGLIGIBLE)
+    chosen = np.flatnonzero(probability > 0.5)
     confidence = probability[chosen]
     ambiguous = confidence < (1 - confidence) * np.exp(SAFE_LOG_ODDS)
-    return Matches(chosen, groups.rows[chosen], confidence, ambiguous)
-
-
-def best_groups(log_odds: Array, rows: Ints) -> Ints:
-    """Find the most probable set of disjoint groups.
-
-    log_odds : (G,) log odds of the groups. rows : (G, C) their detections, -1 for none.
-
-    Returns the positions of the groups of the set. Of two cameras they are ordered by the rows of
-    the first.
-    """
-    good = np.flatnonzero(log_odds > 0)
-    if not len(good):
-        return good
-    if rows.shape[1] == 2:
-        from scipy.optimize import linear_sum_assignment
-
-        gain = np.zeros(rows[good].max(0) + 1)
-        where = np.full(gain.shape, -1)
-        gain[tuple(rows[good].T)], where[tuple(rows[good].T)] = log_odds[good], good
-        found = where[linear_sum_assignment(gain, maximize=True)]
-        return np.asarray(found[found >= 0])
-    return np.sort(_packed(log_odds, rows, good))
-
-
-def _packed(log_odds: Array, rows: Ints, good: Ints) -> Ints:
-    """Return the best set of disjoint groups among ``good``.
-
-    A group that no other one contests belongs to it; the rest is a set packing, solved by SciPy's
-    mixed-integer solver.
-    """
-    from scipy.optimize import Bounds, LinearConstraint, milp
-    from scipy.sparse import coo_array
-
-    wide = np.cumsum([0, *(rows.max(0) + 1)])
-    group, camera = np.nonzero(rows[good] >= 0)
-    used = rows[good][group, camera] + wide[camera]
-    contested = np.zeros(len(good), bool)
-    contested[group[np.bincount(used)[used] > 1]] = True
-    if not contested.any():
-        return good
-    shape = (int(wide[-1]), len(good))
-    packing = LinearConstraint(coo_array((np.ones(len(used)), (used, group)), shape), ub=1.0)
-    found = milp(
-        -log_odds[good], integrality=contested.astype(int), bounds=Bounds(0, 1), constraints=packing
-    )
-    return np.asarray(good[found.x > 0.5])
+    return Matches(chosen, rows[chosen], confidence, ambiguous)
 
 
 def track_log_odds(found: Candidates, model: RigModel, predicted: Prediction) -> Array:

@@ -26,8 +26,8 @@ from telerig.estimator.bubbles.pairing.groups import (
     Cameras,
     Groups,
     View,
-    candidates,
     near_pairs,
+    possible_groups,
     prior_log_odds,
     shared_axis,
     views_of,
@@ -165,10 +165,7 @@ def _of_groups(model: RigModel, views: Sequence[View], counts: Ints) -> RigModel
         pull += axis * gap / variance
     covariance = np.asarray(np.linalg.inv(information))
     model = replace(model, offset_px=(covariance @ pull)[:, None], offset_covariance_px2=covariance)
-    found = candidates(views, counts, model)
-    frame = np.repeat(np.arange(len(found)), [*map(len, found)])
-    groups = Groups.concat([f.groups for f in found])
-    best = _learned(model, _Sample(groups, frame, counts))
+    best = _learned(model, _Sample(*possible_groups(views, counts, model), counts))
     return replace(best, misplaced=_misplaced(best, len(counts)))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing import kernels
 from telerig.estimator.bubbles.pairing.evidence import Prediction
-from telerig.estimator.bubbles.pairing.groups import NEGLIGIBLE, best_groups
+from telerig.estimator.bubbles.pairing.groups import NEGLIGIBLE
 from telerig.estimator.bubbles.pairing.learning import default_model, learn_rig
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -74,12 +74,10 @@ def disjoint_sets(rows: NDArray[np.int64]) -> list[list[int]]:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_sets_and_probabilities_are_those_of_an_enumeration(seed: int) -> None:
+def test_probabilities_are_those_of_an_enumeration(seed: int) -> None:
     odds, rows = random_groups(np.random.default_rng(seed))
     sets = disjoint_sets(rows)
     weights = np.array([np.exp(odds[one].sum()) for one in sets])
-    best = sets[int(weights.argmax())]
-    assert odds[best_groups(odds, rows)].sum() == pytest.approx(odds[best].sum())
     expected = [sum(w for w, one in zip(weights, sets) if g in one) for g in range(len(rows))]
     found = kernels.marginals(odds, rows, np.array([3, 3, 3]), NEGLIGIBLE)
     np.testing.assert_allclose(found, np.array(expected) / weights.sum(), rtol=1e-9)

@@ -18,18 +18,10 @@ from places import REAL
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.evidence import Prediction
-from telerig.estimator.bubbles.pairing.groups import best_groups
 from telerig.estimator.bubbles.pairing.learning import default_model, learn_rig
 from telerig.estimator.bubbles.pairing.model import Finding
 
 PAIR = REAL / "bubble_pair"
-
-
-def test_what_has_no_good_partner_is_left_out() -> None:
-    rows = np.array([[0, 0], [0, 1], [1, 0], [1, 1], [2, 0], [2, 1]])
-    found = best_groups(np.array([3.0, 2.9, 2.8, -4.0, -1.0, -2.0]), rows)
-    assert rows[found].tolist() == [[0, 1], [1, 0]]
-    assert len(best_groups(-np.ones(6), rows)) == 0
 
 
 # Pairs
@@ -128,14 +120,13 @@ def test_cameras_that_shake_against_each_other() -> None:
     assert min(recall_and_precision(frames, pairs)) >= 0.98
 
 
-def test_two_alike_at_one_height_are_never_a_silent_guess() -> None:
+def test_two_alike_at_one_height_are_never_a_guess() -> None:
     cameras = rig()
     points = np.array([[-5.0, 3.0, 8.0], [9.0, 3.0, -4.0], [0.0, -9.0, 0.0]])
     tables = [table(c.project(points)) for c in cameras]
     pairs = match_tables(tables, default_model(cameras))
-    assert pairs.rows[:, 0].tolist() == [0, 1, 2] and pairs.rows[:, 1][2] == 2
-    assert ((pairs.confidence[:2] > 0.4) & (pairs.confidence[:2] < 0.51)).all()
-    assert pairs.ambiguous.tolist() == [True, True, False] and pairs.confidence[2] > 0.95
+    assert pairs.rows.tolist() == [[2, 2]], "each pair of the two is as probable as not"
+    assert pairs.confidence[0] > 0.95 and not pairs.ambiguous[0]
     track = Prediction(
         np.array([7, 8]), points[:2], np.tile(0.04 * np.eye(3), (2, 1, 1)), np.full(2, 1.6)
     )

@@ -210,6 +210,19 @@ def test_noise_and_short_records_have_no_oscillation() -> None:
     assert dominant_oscillation(t, holes).frequency_hz == pytest.approx(6.0, abs=0.05)
 
 
+def test_few_wrong_fringes_of_a_gap_of_half_the_record_are_believed() -> None:
+    off, rng = [], np.random.default_rng(11)
+    for _ in range(120):
+        f = rng.uniform(5, 12)
+        t, values = series(rng, f, 30.0, 10.0)
+        t, values = t[:300], values[:300]
+        seen = np.abs(t - t.mean()) > t.mean() / 2
+        found = dominant_oscillation(t[seen], values[seen], significant=4.5)
+        if found is not None:
+            off.append((found.frequency_hz - f) / found.s_frequency_hz)
+    assert len(off) > 70 and np.mean(np.abs(off) > 6) < 0.05
+
+
 def test_an_oscillation_at_unequal_times() -> None:
     even = np.arange(400) / 200
     pairs = np.repeat(np.arange(100) / 50, 2)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,8 @@ SLOW = {"trackpy NearestVelocity", "laptrack"}
 
 
 def linkers() -> dict[str, Linker]:
-    return {
+    """All trackers; laptrack, which telerig does not install, where it is."""
+    every = {
         "telerig": telerig(),
         "telerig, no encoder": telerig(encoder=False),
         "trackpy.link": trackpy_link,
@@ -38,6 +40,7 @@ def linkers() -> dict[str, Linker]:
         "laptrack": laptrack_link,
         "plain prediction": plain_prediction,
     }
+    return every if find_spec("laptrack") else {k: v for k, v in every.items() if k != "laptrack"}
 
 
 def outcome(scene: Scene, ids: Ids) -> str:

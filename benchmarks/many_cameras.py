@@ -1,11 +1,11 @@
 """Tracking with three and four cameras, beside the best two of them.
 
-Usage: python benchmarks/many_cameras.py [--only NAME ...] [--out FOLDER]
+Usage: python benchmarks/many_cameras.py [--only NAME ...] [--out FILE.md]
 
 Simulated swarms with rendered images (presets `three` and `four`, exact calibrations): bubbles are
 detected once, and the same detections are tracked by all cameras and by the pair whose lines of
 sight are nearest to a right angle. Both are scored by the bubbles that two cameras or more see
-whole. `results/many_cameras.json` keeps each scene, `results/many_cameras.md` has the tables.
+whole.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from telerig.estimator.bubbles.detect import outline_centroid
 from telerig.rig.triangulation import stacked_jacobian
 
 Array = NDArray[np.float64]
-RESULTS = Path(__file__).parent / "results"
 NEAR_PX, NEAR_SIGMAS = 3.0, 3.0
 """A row is that of a bubble if every pixel is nearer than this, or than so many of its standard
 deviations: of four outlines one may be hidden, and say so."""
@@ -218,7 +217,7 @@ def pixels(table: pd.DataFrame, names: list[str], pattern: str = "{c}_{x}_px") -
 
 def page(records: dict[str, list[dict[str, Any]]]) -> str:
     lines = [
-        "# Three and four cameras", "", "Made by `python benchmarks/many_cameras.py`.", "",
+        "# Three and four cameras", "",
         "Rendered images (a table in the last scene), exact calibrations. Recall is of the bubbles",
         "that two of all cameras or more see whole, so a pair is charged with those that others",
         "see; the next column is of those that the cameras of the row see. Errors in space are per",
@@ -259,10 +258,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    kept = options.out / "many_cameras.json"
-    records = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
+    records: dict[str, list[dict[str, Any]]] = {}
     for name, given in SCENES.items():
         if options.only and not any(word in name for word in options.only):
             continue
@@ -270,8 +268,9 @@ def main() -> None:
             records[name] = scene(Path(folder), given)
         for record in records[name]:
             print(name, record, flush=True)
-        kept.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
-        (options.out / "many_cameras.md").write_text(page(records), encoding="utf-8")
+    print(page(records))
+    if options.out:
+        options.out.write_text(page(records), encoding="utf-8")
 
 
 if __name__ == "__main__":

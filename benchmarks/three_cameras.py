@@ -205,7 +205,7 @@ def outcome(seed: int) -> Outcome:
     settings = preset("three")
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "data"
-        data = telerig.simulate("three", rng=np.random.default_rng(seed), out=folder)
+        data = telerig.simulate(settings, rng=np.random.default_rng(seed), out=folder)
         # the same draws again: what the files hold as numbers, as objects
         scene_rng, *_ = np.random.default_rng(seed).spawn(3)
         cameras = true_cameras(settings)

@@ -151,7 +151,7 @@ def bubbles() -> str:
     t = table("bubbles", "Rendered")
     pair = table("bubble_pair", "The real pair").query("method == 'telerig'").iloc[-1]
     (listed,) = said("bubble_pair", r"\| 1 \| (\d+ of \d+) \|")
-    (offset,) = said("bubble_pair", r"both cameras share is off by \+?(-?[\d.]+) px")
+    (offset,) = said("bubble_pair", r"cameras differ by \+?(-?[\d.]+) px")
     off = np.abs(numbers(t["cov"]) - 1).max()
     return (
         f"Bubbles: outline centres at {span(numbers(t['rms']), 2)} times the Cramer-Rao bound, "
@@ -238,9 +238,10 @@ def physics() -> str:
              "slip velocity": "slip_mm_s", "drag": "drag"}  # fmt: skip
     listed = ", ".join(f"{words} {number(bubble.loc[n]['NEES']):.2f}" for words, n in means.items())
     return (
-        "Sizes and forces of bubbles: simulated bubbles that obey Clift's drag law in a shaking rig "
-        f"have their drag coefficient back with a bias of {abs(number(drag['bias, %'])):.2f} %. "
-        f"NEES in a frame: {span(numbers(given['NEES']), 2)} where the motion is given, "
+        "Sizes and forces of bubbles: simulated bubbles that obey Clift's drag law in a shaking "
+        "rig have their drag coefficient back with a bias of "
+        f"{abs(number(drag['bias, %'])):.2f} %. NEES in a frame: "
+        f"{span(numbers(given['NEES']), 2)} where the motion is given, "
         f"{span(velocity, 2)} for smoothed velocities and accelerations, "
         f"{number(drag['NEES']):.2f} for drag. Of means over a bubble: {listed} "
         f"(above 1: stated too well; {link('bubble_physics')})."
@@ -272,14 +273,14 @@ def cameras() -> str:
     bound = numbers(every["over the bound"])
     return (
         "Three cameras at 0, 60 and 120 degrees, from images: points at "
-        f"{ratio} times their Cramer-Rao bound, {pair} times as good as from the best pair of them, "
-        f"NEES {nees} ({seeds} seeds: {link('three_cameras')}). Swarms of 20 and 60 bubbles tracked "
-        f"with three and four cameras: {span(numbers(every['recall']), 3)} of the bubbles that two "
-        f"cameras see whole have their point (the best pair alone: "
+        f"{ratio} times their Cramer-Rao bound, {pair} times as good as from the best pair of "
+        f"them, NEES {nees} ({seeds} seeds: {link('three_cameras')}). Swarms of 20 and 60 bubbles "
+        f"tracked with three and four cameras: {span(numbers(every['recall']), 3)} of the bubbles "
+        f"that two cameras see whole have their point (the best pair alone: "
         f"{span(numbers(pairs['recall']), 2)}), {numbers(every['swaps']).sum():.0f} identities are "
         f"swapped. Without shake they place a bubble to {span(np.array(error), 2)} µm where two of "
-        f"them do to {span(np.array([number(w.split(',')[1]) for w in two]), 1)} (medians); outlines "
-        f"alone are at {span(bound[np.isfinite(bound)], 1)} times their Cramér-Rao bound "
+        f"them do to {span(np.array([number(w.split(',')[1]) for w in two]), 1)} (medians); "
+        f"outlines alone are at {span(bound[np.isfinite(bound)], 1)} times their Cramér-Rao bound "
         f"({link('many_cameras')})."
     )
 
@@ -288,16 +289,14 @@ def solvers() -> str:
     t = table("solvers").set_index("views x dots")
     seconds = {k: number(t.loc[k]["gtsam"]) for k in ("12x15", "12x100")}
     large = t.loc["200x400"]["numpy"]
-    faster = table("solvers").iloc[:, 1:]
     scipy = [number(r["scipy"]) / number(r[ours]) for _, r in t.iterrows()
              for ours in ("gtsam", "numpy") if np.isfinite(number(r["scipy"]))]  # fmt: skip
-    del faster
     return (
         f"GTSAM solves 12 views of 15 dots in two cameras in {1e3 * seconds['12x15']:.0f} ms of "
         f"CPU, 12 of 100 in {1e3 * seconds['12x100']:.0f} ms; from 5,000 measured dots on they are "
         f"eliminated before it: 200 views of 400 dots in {number(large):.1f} s. SciPy's sparse "
-        f"least squares with the same derivatives takes {span(np.array(scipy), 0)} times as long to "
-        f"the same cost ({link('solvers')})."
+        f"least squares with the same derivatives takes {span(np.array(scipy), 0)} times as long "
+        f"to the same cost ({link('solvers')})."
     )
 
 
@@ -323,9 +322,9 @@ def real_images() -> str:
     t = table("real_images")
     free = t[t["dots"] == "3d"].iloc[0]
     return (
-        "Real images (14 stereo pairs of a printed target, lenses that are *not* telecentric): dots "
-        f"agree with the model to {number(free['RMS px']):.3f} px RMS, and the report finds that "
-        f"the print is out of plane by {number(free['out of plane µm']):.0f} µm "
+        "Real images (14 stereo pairs of a printed target, lenses that are *not* telecentric): "
+        f"dots agree with the model to {number(free['RMS px']):.3f} px RMS, and the report finds "
+        f"that the print is out of plane by {number(free['out of plane µm']):.0f} µm "
         f"({link('real_images')})."
     )
 

@@ -133,12 +133,12 @@ def _fitted(t: Array, y: Array, f: float) -> tuple[Array, Array]:
     """Coefficients (4, K) of 1, t, cos, sin by least squares, and what they leave (N, K)."""
     basis = _basis(t, f)
     found = np.linalg.lstsq(basis, y, rcond=None)[0]
-    return found, y - basis @ found
+    return np.asarray(found), np.asarray(y - basis @ found)
 
 
 def _basis(t: Array, f: float) -> Array:
     phase = 2 * np.pi * f * t
-    return np.stack([np.ones(len(t)), t - t.mean(), np.cos(phase), np.sin(phase)], -1)
+    return np.asarray(np.stack([np.ones(len(t)), t - t.mean(), np.cos(phase), np.sin(phase)], -1))
 
 
 def _refined(t: Array, y: Array, f: float, around: float) -> float:
@@ -157,10 +157,11 @@ def _density(t: Array, left: Array, f: float, duration: float) -> float:
     """Return the one-sided density at f by component, as it enters a variance.
 
     From the periodogram within 5 periods of the record, over the share that the fit leaves of white
-    noise there: it empties the bins about f, and others where the record has a gap. It is taken to fall with the power 2.5 of the frequency, as a velocity does between the
-    square under a white force and the fourth power under a force that is correlated in time: few
-    periods of a slow oscillation look like such noise. The density is known from k squares alone:
-    the square of an error over it has the mean k / (k - 2).
+    noise there: it empties the bins about f, and others where the record has a gap. It is taken to
+    fall with the power 2.5 of the frequency, as a velocity does between the square under a white
+    force and the fourth power under a force that is correlated in time: few periods of a slow
+    oscillation look like such noise. The density is known from k squares alone: the square of an
+    error over it has the mean k / (k - 2).
     """
     periods = np.arange(1, np.ceil(f * duration + _NEAR_PERIODS))
     frequency = periods[np.abs(periods - f * duration) < _NEAR_PERIODS] / duration

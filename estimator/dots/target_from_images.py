@@ -13,11 +13,11 @@ import numpy as np
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.fit.candidates import Polarity
 from telerig.estimator.dots.grid.seen_target import (
-    SeenHexagon,
+    SeenPoints,
     SeenTarget,
-    agreed_hexagon,
+    agreed_points,
     agreed_target,
-    seen_hexagon,
+    seen_points,
     seen_target,
 )
 from telerig.estimator.dots.locate import measure_dots
@@ -72,7 +72,7 @@ def target_from_images(
             image = read_image(path)
             measured = measure_dots(image)
             try:
-                seen = seen_hexagon(measured.dots, image.shape) or seen_target(
+                seen = seen_points(measured.dots, image.shape) or seen_target(
                     measured.dots, image.shape
                 )
             except DetectionError as error:
@@ -90,15 +90,15 @@ def target_from_images(
         for *_, path, p, _ in found if p != polarity
     ]  # fmt: skip
     found = [one for one in found if one[3] == polarity]
-    hexagonal = 2 * sum(isinstance(seen, SeenHexagon) for *_, seen in found) > len(found)
+    pointwise = 2 * sum(isinstance(seen, SeenPoints) for *_, seen in found) > len(found)
     failures += [
         f"{path}: its grid is of another kind than in most images; it is not used"
-        for *_, path, _, seen in found if isinstance(seen, SeenHexagon) != hexagonal
+        for *_, path, _, seen in found if isinstance(seen, SeenPoints) != pointwise
     ]  # fmt: skip
-    found = [one for one in found if isinstance(one[4], SeenHexagon) == hexagonal]
-    hexagons = [seen for *_, seen in found if isinstance(seen, SeenHexagon)]
+    found = [one for one in found if isinstance(one[4], SeenPoints) == pointwise]
+    pointed = [seen for *_, seen in found if isinstance(seen, SeenPoints)]
     grids = [seen for *_, seen in found if isinstance(seen, SeenTarget)]
-    agreed = agreed_hexagon(hexagons) if hexagonal else agreed_target(grids)
+    agreed = agreed_points(pointed) if pointwise else agreed_target(grids)
     diameter_px = {
         name: float(np.median([seen.diameter_px for n, *_, seen in found if n == name]))
         for name in dict.fromkeys(n for n, *_ in found)
@@ -175,10 +175,10 @@ def _refuse_several_cameras(folder: Path, names: Sequence[str]) -> None:
             )
 
 
-def _lines(seen: SeenTarget | SeenHexagon, polarity: Polarity, pitch_mm: float) -> str:
+def _lines(seen: SeenTarget | SeenPoints, polarity: Polarity, pitch_mm: float) -> str:
     """Return the lines of [target]."""
     dot_mm = round(pitch_mm / seen.pitch[0], 4)
-    if isinstance(seen, SeenHexagon):
+    if isinstance(seen, SeenPoints):
         (*shape,), rest, counted = seen.lines(pitch_mm), [], "in points_mm from 0"
     else:
         across_mm = round(pitch_mm * seen.pitch[1] / seen.pitch[0], 4)
@@ -202,16 +202,17 @@ def _lines(seen: SeenTarget | SeenHexagon, polarity: Polarity, pitch_mm: float) 
 
 
 def _words(
-    seen: SeenTarget | SeenHexagon,
+    seen: SeenTarget | SeenPoints,
     polarity: Polarity,
     images: int,
     diameter_px: float,
     pitch_px: float,
 ) -> Sequence[str]:
     """Return what was found as sentences. diameter_px, pitch_px : in the first camera."""
-    kind, size = "a hexagonal grid", f"of {len(getattr(seen, 'points', ()))} dots"
     if isinstance(seen, SeenTarget):
         kind, size = "a grid", f"{seen.rows} rows, {seen.columns} columns"
+    else:
+        kind, size = seen.kind, f"of {len(seen.points)} dots"
     whole = kind if seen.whole else f"{kind} that goes on beyond the images; seen at once:"
     marks = f"{len(seen.marks)} marks of the style {seen.mark_style}" if seen.marks else "no marks"
     words = [
@@ -219,7 +220,7 @@ def _words(
         f"{polarity.replace('_', ' ')}, {marks}, dots {diameter_px:.1f} px across, "
         f"{pitch_px:.1f} px apart"
     ]
-    if isinstance(seen, SeenHexagon) and not seen.whole:
+    if isinstance(seen, SeenPoints) and not seen.whole:
         words.append("add to points_mm the dots that no image shows, or photograph the whole plate")
     if not seen.marks:
         words.append(

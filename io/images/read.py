@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Float32
-from telerig.errors import InputError
+from telerig.errors import InputError, TelerigWarning
 from telerig.io.files.text import read_bytes
 
 Image = NDArray[np.uint8] | NDArray[np.uint16] | Float32
@@ -32,6 +32,10 @@ _FORMATS = "telerig reads TIFF, PNG, BMP and JPEG"
 MOST_BYTES = 400_000_000
 """The largest size of a decoded image: 400 million pixels of 8 bits, 200 million of 16 bits."""
 _COPY = "copy or record it again, or leave it out (in a run with skip_unreadable)"
+_COLOUR = (
+    "images are in colour: their green channel is used, of which a colour sensor has most pixels; "
+    "a mono camera, or a mono mode, resolves better"
+)
 _MONO = "save it with one grey channel; set a colour camera to a mono mode"
 
 
@@ -42,10 +46,11 @@ def read_image(
 
     expected_size_px : (width, height) that the image must have; None accepts any size.
     Returns the pixels (height, width) as the file holds them: uint8, uint16, or float32. Three
-    equal channels count as grey and an opaque alpha channel is removed. There is no EXIF rotation,
-    no gamma and no scaling.
+    equal channels count as grey and an opaque alpha channel is removed. Of a colour image the green
+    channel is taken, with a `TelerigWarning`: the others have another magnification behind most
+    lenses. There is no EXIF rotation, no gamma and no scaling.
     Raises InputError for a file that is missing, truncated or of an unknown format, that holds
-    several pages, colour or values that are not finite, or has another size.
+    several pages or values that are not finite, or has another size.
     """
     file = Path(path)
     data = read_bytes(file)
@@ -254,8 +259,8 @@ def _grey(pixels: NDArray[Any], file: Path) -> NDArray[Any]:
             f"has the shape {pixels.shape}, not one of an image", where=str(file), todo=_MONO
         )
     if np.any(pixels != pixels[..., :1]):
-        raise InputError("is a colour image: its channels differ", where=str(file), todo=_MONO)
-    return pixels[..., 0]
+        warnings.warn(_COLOUR, TelerigWarning, stacklevel=2)
+    return pixels[..., pixels.shape[-1] // 2]
 
 
 def _native(pixels: NDArray[Any], file: Path) -> Image:

@@ -28,8 +28,14 @@ _ENOUGH = 0.8
 """Share of the dots on a grid above which no other ratio of the pitches is tried."""
 _OBLIQUE = 0.25
 """Cosine of the angle between rows and columns above which a grid is no rectangular one."""
-_SIXTY_DEGREES, _EQUAL_PITCHES = 0.08, 1.08
-"""Departures of the cosine from 1/2, and of the pitches' ratio, that measuring explains."""
+_SAME_COSINE, _EQUAL_PITCHES = 0.08, 1.08
+"""Departures of a lattice's cosine, and of its pitches' ratio, that measuring explains."""
+_FILLED = 0.8
+"""Share of its places that a grid seen as a whole has at least, of its own rows and columns."""
+_ON_ONE_GRID = 0.7
+"""Share of the dots that are on one grid at least; 1.00 on real plates, 0.5 with rows staggered by
+half a pitch or on two levels."""
+_POINTS = 'Describe such a plate by the places of its dots: layout = "points", points_mm = ...'
 _LARGER = 1.12
 _LARGER_SD = 6.0
 _MOST_MARKS = 12
@@ -94,15 +100,17 @@ class SeenTarget:
 
 
 @dataclass(frozen=True)
-class SeenHexagon:
-    """What an image shows of a target with a hexagonal grid of dots.
+class SeenPoints:
+    """What an image shows of a target with a hexagonal grid of dots, or with staggered rows.
 
-    points : (N, 2) places of the dots, row by row, in units of the pitch.
+    kind : "a hexagonal grid" or "a grid of staggered rows".
+    points : (N, 2) places of the dots, row by row, in units of the distance of neighbours.
     whole : whether the image would show all dots next to these if there were any.
     marks : positions of the marks in ``points``.
     mark_style, mark_diameter, pitch, diameter_px : see `SeenTarget`.
     """
 
+    kind: str
     points: Array
     whole: bool
     marks: tuple[int, ...]
@@ -159,33 +167,49 @@ def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
     )
 
 
-def seen_hexagon(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenHexagon | None:
-    """Describe the hexagonal grid of dots that an image shows; None if its grid is another one.
+def seen_points(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenPoints | None:
+    """Describe the hexagonal or staggered grid of dots that an image shows; None if it is another.
 
     The arguments and the error are those of `seen_target`.
     """
     points, lattice = _best_lattice(dots)
+    whole = not len(next_places(lattice, points, image_shape, float(dots["a_px"].median()))[1])
     shape = np.median(lattice.shape, axis=0)
-    diameter = 2.0 * np.sqrt(0.75 * np.diagonal(shape))
     cosine = -float(shape[0, 1] / np.sqrt(shape[0, 0] * shape[1, 1]))
-    if abs(abs(cosine) - 0.5) > _SIXTY_DEGREES or max(diameter) > _EQUAL_PITCHES * min(diameter):
+    diameter = 2.0 * np.sqrt((1.0 - cosine**2) * np.diagonal(shape))
+    if max(diameter) > _EQUAL_PITCHES * min(diameter):
         return None
-    steps = np.array([[1.0, 0.0], [np.copysign(0.5, cosine), np.sqrt(0.75)]])
+    if abs(abs(cosine) - 0.5) < _SAME_COSINE:
+        kind = "a hexagonal grid"
+        steps = np.array([[1.0, 0.0], [np.copysign(0.5, cosine), np.sqrt(0.75)]])
+    elif abs(cosine) < _SAME_COSINE and whole and _staggered(lattice.places):
+        kind = "a grid of staggered rows"
+        steps = np.sqrt(0.5) * np.array([[1.0, 1.0], [-1.0, 1.0]])
+    else:
+        return None
     places = lattice.places @ steps
     order = np.lexsort(np.round(places, 6).T)
     rings, large, size = _unusual(dots, lattice)
     style, which = _marks(np.arange(len(places)), rings, large, np.zeros(0, np.int64))
     marked = np.isin(order, which) if style else np.zeros(len(order), np.bool_)
     pitch = float(1.0 / np.mean(diameter))
-    return SeenHexagon(
+    return SeenPoints(
+        kind,
         (places - places.min(axis=0))[order],
-        not len(next_places(lattice, points, image_shape, float(dots["a_px"].median()))[1]),
+        whole,
         tuple(np.flatnonzero(marked).tolist()),
         style,
         float(np.median(size[large])) if style == "large" else float("nan"),
         (pitch, pitch),
         2.0 * float(np.median(dots["a_px"].to_numpy()[lattice.index[order[~marked]]])),
     )
+
+
+def _staggered(places: Ints) -> bool:
+    """Whether places (N, 2) on a square lattice fill a rectangle along its diagonals instead."""
+    diagonal = np.stack([places.sum(axis=1), places[:, 1] - places[:, 0]], -1)
+    own, theirs = (np.prod(np.ptp(some, axis=0) + 1) for some in (places, diagonal))
+    return bool(len(places) < _FILLED * own and len(places) > _FILLED * theirs / 2)
 
 
 def _unusual(dots: pd.DataFrame, lattice: Lattice) -> tuple[Bools, Bools, Array]:
@@ -215,7 +239,13 @@ def _best_lattice(dots: pd.DataFrame) -> tuple[Array, Lattice]:
     if not found:
         assert failure is not None
         raise failure
-    return points, max(found, key=lambda lattice: len(lattice.index))
+    best = max(found, key=lambda lattice: len(lattice.index))
+    if len(best.index) < _ON_ONE_GRID * len(points):
+        raise DetectionError(
+            f"only {len(best.index)} of {len(points)} dots are on one grid: are rows staggered, or "
+            f"dots on two levels? {_POINTS}"
+        )
+    return points, best
 
 
 def _refuse_oblique(lattice: Lattice) -> None:
@@ -224,8 +254,8 @@ def _refuse_oblique(lattice: Lattice) -> None:
     cosine = abs(float(shape[0, 1])) / np.sqrt(shape[0, 0] * shape[1, 1])
     if cosine > _OBLIQUE:
         raise DetectionError(
-            f"the rows of dots cross at {np.rad2deg(np.arccos(cosine)):.0f} degrees, not at 90; "
-            'describe such a plate by the places of its dots: layout = "points", points_mm = ...'
+            f"the rows of dots cross at {np.rad2deg(np.arccos(cosine)):.0f} degrees, not at 90. "
+            f"{_POINTS}"
         )
 
 
@@ -267,11 +297,12 @@ def agreed_target(seen: Sequence[SeenTarget]) -> SeenTarget:
     )  # fmt: skip
 
 
-def agreed_hexagon(seen: Sequence[SeenHexagon]) -> SeenHexagon:
-    """Return the hexagonal grid that most images show, of those that show it as a whole."""
+def agreed_points(seen: Sequence[SeenPoints]) -> SeenPoints:
+    """Return the description that most images share, of those that show the plate as a whole."""
     some = [one for one in seen if one.whole] or list(seen)
-    votes = Counter((len(one.points), len(one.marks)) for one in some)
-    return max(some, key=lambda one: (votes[len(one.points), len(one.marks)], len(one.points)))
+    votes = Counter((one.kind, len(one.points), len(one.marks)) for one in some)
+    count = {id(one): votes[one.kind, len(one.points), len(one.marks)] for one in some}
+    return max(some, key=lambda one: (count[id(one)], len(one.points)))
 
 
 def contradiction(seen: SeenTarget, target: Target) -> str:

@@ -204,3 +204,37 @@ def test_the_description_of_a_hexagonal_plate_numbers_its_images(
     np.testing.assert_allclose(near.min(axis=1), 7.0, atol=2e-4)
     for image in images:
         assert len(detect_target(image, found)) == len(places)
+
+
+def staggered(rows: int, columns: int, between: float) -> Target:
+    """Rows 7 mm long between dots, each second one shifted by half of it."""
+    places = [(7.0 * (c + r % 2 / 2), between * r) for r in range(rows) for c in range(columns)]
+    return Target(layout="points", points_mm=np.array(places), dot_diameter_mm=1.8)
+
+
+def test_staggered_rows_are_described_by_the_places_of_their_dots(tmp_path: Path) -> None:
+    """Seven by eleven once were "12 rows, 12 columns, no marks"."""
+    plate = staggered(11, 7, 3.5)
+    for k, pose in enumerate(((10.0, 8.0), (40.0, 170.0))):
+        image = draw(plate, pixel_from_mm(8.0, *pose, False), size_px=560, seed=k)[0]
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+    seen = target_from_images(tmp_path, pitch_mm=7.0 * np.sqrt(0.5), scale_px_per_mm=1.0)
+    assert "staggered rows" in seen.words[0] and "of 77 dots" in seen.words[0]
+    made = new_dataset(tmp_path / "new", [NewCamera(*c) for c in seen.cameras], target=seen.lines)
+    found = np.asarray(read_rig_toml(made[0]).target.points_mm)
+    apart = np.linalg.norm(found[:, None] - found, axis=-1)
+    true = np.linalg.norm(plate.points_mm[:, None] - plate.points_mm, axis=-1)
+    np.testing.assert_allclose(np.sort(apart.ravel()), np.sort(true.ravel()), atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["staggered", "two levels"])
+def test_dots_on_more_than_one_grid_are_no_grid(kind: str) -> None:
+    """Of either plate every second row was proposed as the whole."""
+    plate = staggered(7, 6, 7.0)
+    if kind == "two levels":
+        level = np.arange(81) % 2
+        places = 7.0 * np.mgrid[:9, :9].reshape(2, -1).T + level[:, None] * (1.2, 0.7)
+        plate = replace(plate, points_mm=places)
+    image = draw(plate, pixel_from_mm(6.5, 20.0, 8.0, False), size_px=480, seed=1)[0]
+    with pytest.raises(DetectionError, match=r"of .* dots are on one grid"):
+        seen_target(measure_dots(image).dots, image.shape)

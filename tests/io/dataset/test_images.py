@@ -12,7 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from telerig.errors import InputError
+from telerig.errors import InputError, TelerigWarning
 from telerig.io.images.read import list_images, natural, read_image
 
 RNG = np.random.default_rng(5)
@@ -130,15 +130,16 @@ def test_equal_channels_are_grey(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".png", ".bmp", ".jpg"])
-def test_a_colour_image_is_refused(suffix: str, tmp_path: Path) -> None:
+def test_of_a_colour_image_the_green_channel_is_taken_and_said(suffix: str, tmp_path: Path) -> None:
     file = tmp_path / f"a{suffix}"
-    colour = np.dstack([GREY8, GREY8, 255 - GREY8])
+    colour = np.dstack([255 - GREY8, GREY8, np.zeros_like(GREY8)])
     if suffix == ".tif":
         tifffile.imwrite(file, colour, photometric="rgb")
     else:
-        Pillow.fromarray(colour).save(file)
-    message = error_of(file)
-    assert "is a colour image" in message and "one grey channel" in message
+        Pillow.fromarray(colour).save(file, quality=100, subsampling=0)
+    with pytest.warns(TelerigWarning, match="green channel"):
+        green = read_image(file).astype(int)
+    np.testing.assert_allclose(green, GREY8, atol=5 if suffix == ".jpg" else 0)
 
 
 def test_transparency_is_refused(tmp_path: Path) -> None:

@@ -334,28 +334,46 @@ def refuse_copies(problem: Problem) -> None:
 def refuse_wrong_pairs(problem: Problem) -> None:
     """Raise CalibrationError if a camera's images fit the views before or after far better.
 
-    A camera may have missed a trigger, or its first image was lost.
+    A camera may have missed a trigger, or its first image was lost. Among more than two cameras the
+    wrong one is in more pairs that do not fit, and in fewer that fit, than the others.
     """
+    judged = {
+        pair: found
+        for pair in combinations(range(len(problem.cameras)), 2)
+        if (found := _better_pairing(problem, pair)) is not None
+    }
+    wrong = {pair: found for pair, found in judged.items() if found[1]}
+    if not wrong:
+        return
+    against = np.zeros(len(problem.cameras))
+    for pair in judged:
+        against[list(pair)] += 1 if pair in wrong else -1
+    # between two cameras nothing decides, and the second one is named
+    own = max(np.ravel(list(wrong)).tolist(), key=lambda camera: (against[camera], camera))
+    pair, (first, offset) = next(item for item in wrong.items() if own in item[0])
+    view, image = problem.views[first], problem.views[first + offset]
+    if own == pair[0]:
+        view, image, offset = image, view, -offset
+    camera, side = problem.cameras[own].name, "later" if offset > 0 else "earlier"
+    raise CalibrationError(
+        f"from view {problem.views[first]!r} on, the images of camera {camera!r} do not belong to "
+        f"the views whose names they have: those {abs(offset)} {side} fit (image {image!r} of "
+        f"camera {camera!r} shows view {view!r}), so an image of one camera was lost or added",
+        todo="give images that were taken at the same time the same file name",
+    )
+
+
+def _better_pairing(problem: Problem, pair: tuple[int, int]) -> tuple[int, int] | None:
+    """Return the first view from which images of the second camera fit better that are some views
+    later, and how many; 0 if those of the same view fit, and None if the views do not show it."""
     offsets = [s * n for n in range(1, FARTHEST + 1) for s in (1, -1)]
-    for pair in combinations(range(len(problem.cameras)), 2):
-        own, *shifted = (epipolar_misfits(problem, pair, s) for s in (0, *offsets))
-        least = np.min(shifted, axis=0)
-        far = np.isfinite(own) & (own > UNPAIRED) & (least < FAR_BETTER * own)
-        if not far.any():
-            continue
-        best = np.argmin(shifted, axis=0)
-        chosen = int(np.bincount(best[far]).argmax())
-        first = int(np.flatnonzero(far & (best == chosen))[0])
-        camera, offset = problem.cameras[pair[1]].name, offsets[chosen]
-        own_view, right_view = problem.views[first], problem.views[first + offset]
-        side = "later" if offset > 0 else "earlier"
-        raise CalibrationError(
-            f"from view {own_view!r} on, the images of camera {camera!r} do not belong to the "
-            f"views whose names they have: those {abs(offset)} {side} fit (image {right_view!r} of "
-            f"camera {camera!r} shows view {own_view!r}), so an image of one camera was lost or "
-            "added",
-            todo="give images that were taken at the same time the same file name",
-        )
+    own, *shifted = (epipolar_misfits(problem, pair, s) for s in (0, *offsets))
+    least, best = np.min(shifted, axis=0), np.argmin(shifted, axis=0)
+    far = np.isfinite(own) & (own > UNPAIRED) & (least < FAR_BETTER * own)
+    if not far.any():
+        return (0, 0) if np.isfinite(own).any() else None
+    chosen = int(np.bincount(best[far]).argmax())
+    return int(np.flatnonzero(far & (best == chosen))[0]), offsets[chosen]
 
 
 def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Array:

@@ -70,7 +70,7 @@ def test_only_images_of_one_moment_have_one_epipolar_geometry(
     assert checks.epipolar_misfits(right, (0, 1), by).min() > 10 * UNPAIRED
 
 
-@pytest.mark.parametrize("camera", ["middle", "right"])
+@pytest.mark.parametrize("camera", ["left", "middle", "right"])
 @pytest.mark.parametrize("by", [1, -2])
 def test_wrong_images_of_one_of_three_cameras_are_named(camera: str, by: int, scene: Any) -> None:
     """The images of the third may share more views with the first than those that belong to it."""

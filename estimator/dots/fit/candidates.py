@@ -39,7 +39,6 @@ _PIECE_SHARE = 0.6
 _PIECE_SEMI_AXIS_PX = 4.0
 _PIECE_GROWTH_PX = 0.5
 _LARGE_PIECE = 1.5
-_MIN_PIECE_PIXELS = 4
 
 
 @dataclass(frozen=True)
@@ -199,21 +198,14 @@ def _with_pieces(shown: list[_Look], above: Float32, min_diameter_px: float) -> 
     large = _LARGE_PIECE * float(np.median(good)) if good else 0.0
     result: list[_Look] = []
     for outline, look in shown:
-        pieces: list[NDArray[np.int32]] = []
+        pieces: list[_Look] = []
         if (
             look is not None
             and look.reason != Reason.TOO_SMALL
             and (look.reason or look.area_px2 > large)
         ):
-            pieces = _pieces(above, outline)
-        for piece in pieces:
-            smallest = min_diameter_px - 2.0 * _PIECE_GROWTH_PX
-            part = _first_look(piece, (), above.shape, smallest)
-            if part is not None:
-                grown = part.shape_px + _PIECE_GROWTH_PX * np.array([1.0, 0.0, 1.0])
-                result.append((piece, replace(part, shape_px=grown)))
-        if not pieces:
-            result.append((outline, look))
+            pieces = _pieces(above, outline, min_diameter_px - 2.0 * _PIECE_GROWTH_PX)
+        result += pieces or [(outline, look)]
     return result
 
 
@@ -241,8 +233,8 @@ def _outlines(
     return [(outlines[k], tuple(holes.get(int(k), ()))) for k in np.flatnonzero(parents < 0)]
 
 
-def _pieces(above: Float32, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
-    """Return the outlines of small dots whose blurs overlap, separated by a higher threshold.
+def _pieces(above: Float32, outline: NDArray[np.int32], min_diameter_px: float) -> list[_Look]:
+    """Return the small dots whose blurs overlap, separated by a higher threshold.
 
     Only blobs nowhere thicker than the blur are separated: larger dots touch in the world.
     """
@@ -251,31 +243,30 @@ def _pieces(above: Float32, outline: NDArray[np.int32]) -> list[NDArray[np.int32
     fill(filled, 1, outline - low + 1)
     if cv2.distanceTransform(filled, cv2.DIST_L2, 3).max() > _PIECE_SEMI_AXIS_PX + 1.0:
         return []
-    filled = filled[1:-1, 1:-1]
-    crop = np.where(filled > 0, above[low[1] : high[1], low[0] : high[0]], 0.0)
-    if np.count_nonzero(crop > 0) < 2 * _MIN_PIECE_PIXELS:
+    crop = np.where(filled[1:-1, 1:-1] > 0, above[low[1] : high[1], low[0] : high[0]], 0.0)
+    if not np.any(crop > 0):
         return []
     peak = float(np.quantile(crop[crop > 0], 0.95))
-    best: list[NDArray[np.int32]] = []
+    best: list[_Look] = []
     for level in _PIECE_LEVELS:
         inside = crop > level * peak
-        small = [p + low for p, _ in _outlines(inside) if _is_small_dot(p + low, above.shape)]
-        covered = sum(_filled_moments(piece)[0] for piece in small)
+        small: list[_Look] = []
+        for piece, _ in _outlines(inside):
+            look = _first_look(piece + low, (), above.shape, min_diameter_px)
+            if look is not None and _is_small_dot(look):
+                small.append((piece + low, look))
+        covered = sum(look.area_px2 for _, look in small if look is not None)
         if len(small) > max(1, len(best)) and covered > _PIECE_SHARE * np.count_nonzero(inside):
             best = small
-    return best
+    grown = _PIECE_GROWTH_PX * np.array([1.0, 0.0, 1.0])
+    return [(o, replace(look, shape_px=look.shape_px + grown)) for o, look in best if look]
 
 
-def _is_small_dot(outline: NDArray[np.int32], image_shape: tuple[int, ...]) -> bool:
-    if len(outline) < 4:
-        return False
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    if low.min() <= 0 or high[0] >= image_shape[1] - 1 or high[1] >= image_shape[0] - 1:
+def _is_small_dot(piece: Candidate) -> bool:
+    if piece.reason == Reason.TOUCHES_BORDER:
         return True
-    area, centre, shape = _filled_moments(outline)
-    small = semi_axes(shape)[1] <= _PIECE_SEMI_AXIS_PX
-    sound = _reason_against_outline(outline, centre, shape) is None
-    return bool(area >= _MIN_PIECE_PIXELS and small and sound)
+    sound = piece.reason in (None, Reason.TOO_SMALL)
+    return sound and semi_axes(piece.shape_px)[1] <= _PIECE_SEMI_AXIS_PX
 
 
 def _first_look(

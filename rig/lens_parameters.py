@@ -176,11 +176,11 @@ def rich_groups(*, mono: bool, strong: bool) -> frozenset[str]:
 
     mono : whether the rig has one camera only; kappa is then not tried.
     strong : whether the lens has strong perspective; kappa and the image centre are then tried, but
-    affine and s are not. With a free image centre, a tilted sensor (affine, s) gives the same image
-    as a rotated camera (docs/decisions/014).
+    s is not. With a free image centre, s and p give the image of a rotated camera
+    (docs/decisions/014).
     """
     if strong:
-        return frozenset(PLAIN_GROUPS) - {"affine", "s"} | {"centre"}
+        return frozenset(PLAIN_GROUPS) - {"s"} | {"centre"}
     return frozenset(PLAIN_GROUPS) - ({"kappa"} if mono else set())
 
 

@@ -54,7 +54,7 @@ from telerig.estimator.calibration.start import (
 from telerig.estimator.calibration.start.unknown_target import dots_from_images
 from telerig.estimator.calibration.thresholds import OUTLIER_SD, STRONG_PERSPECTIVE, SURE_SD
 from telerig.factors.calibration import State, whitened_error
-from telerig.io.results.findings import Code, Finding
+from telerig.io.results.findings import LENS_FAILS, Code, Finding
 from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import (
@@ -160,11 +160,11 @@ def _solved(
     found = calibration_from_fit(fit, joint, free, nominal_rotvec_deg=nominal, name=name)
     halves, compared = split_half_check(final, solution.state, structure["widening"])
     advice = next_view(replace(noisier, free=free), solution.state, joint)
+    misfit = [*misfits(fit, found.statistics), *unlike_noise, *compared]
+    misfit = _explained(misfit, problem, fit, progress)
     findings = (
         *known,
-        *misfits(fit, found.statistics),
-        *unlike_noise,
-        *compared,
+        *misfit,
         *checks.loose_offsets(problem, start),
         *checks.exchanged_cameras(final, solution.state),
         *mirror_ambiguity.far_rotations(solution.state, final, nominal),
@@ -181,6 +181,26 @@ def _solved(
         found, findings=findings, diagnostics={**found.diagnostics, **checked},
         statistics={**found.statistics, "telecentricity": scale_change},
     )  # fmt: skip
+
+
+def _explained(
+    findings: list[Finding], problem: Problem, fit: Fit, progress: Progress | None
+) -> list[Finding]:
+    """Return the findings; the first of `LENS_FAILS` names a lens model that fits better.
+
+    It names none if the model was chosen automatically, or if the best one frees no more.
+    """
+    first = next((k for k, finding in enumerate(findings) if finding.code in LENS_FAILS), None)
+    if first is None:
+        return findings
+    better, auto = list[str](), (AUTO,) * len(problem.cameras)
+    if fit.choice is None:
+        _, best = choose_model(problem, fit.robust.solution.state, auto, progress)
+        if any(set(groups_of(b)) - set(groups_of(m)) for b, m in zip(best.names, fit.models)):
+            better = [joint_name(best.names, [c.name for c in problem.cameras])]
+    numbers = {**findings[first].numbers, "better_models": float(len(better))}
+    named = findings[first].model_copy(update={"names": tuple(better), "numbers": numbers})
+    return [*findings[:first], named, *findings[first + 1 :]]
 
 
 def _with_wider_noise(

@@ -60,6 +60,7 @@ _HALVES = (
     "triangulated from the same pixels differ by {rms_um:.2g} µm RMS per axis; their covariances "
     "predict {predicted_um:.2g} µm (ratio {ratio:.2f}"
 )
+_RESIDUALS = "Look for a pattern in residuals.csv"
 _OF_ALL_TESTS = "probability of a false alarm in any of the tests of the residuals"
 
 
@@ -71,8 +72,7 @@ class Code(Enum):
     MODEL_FAILS = Kind(
         Status.REJECTED,
         _DEVIATE + ": the model does not describe these images",
-        "Look for a pattern in residuals.csv, and try --model auto, which can also free the "
-        "lenses' residual perspective (kappa)",
+        _RESIDUALS,
         0.5,
         "px, the noise floor: beyond it the robust weights would hide a wrong lens model",
     )
@@ -87,7 +87,7 @@ class Code(Enum):
         _USABLE,
         _DEVIATE + ": the rest is systematic, so errors in space may exceed their stated standard "
         "deviations",
-        "Look for a pattern in residuals.csv, and try --model auto",
+        _RESIDUALS,
         5.0,
         "noise floor over image noise: what the model lacks is then most of the residuals",
     )
@@ -110,10 +110,10 @@ class Code(Enum):
     PATTERN = Kind(
         _USABLE,
         "{cameras}: residuals point the same way in parts of the image (most in row {row:.0f}, "
-        "column {column:.0f} of {cells:.0f} x {cells:.0f}, {largest_sd:.1f} sd), so the lens model "
-        "lacks a term; because of this pattern every standard deviation has been multiplied by "
-        "{widening:.2g}",
-        "Try a richer --model",
+        "column {column:.0f} of {cells:.0f} x {cells:.0f}, {largest_sd:.1f} sd), which the lens "
+        "model does not describe; because of this pattern every standard deviation has been "
+        "multiplied by {widening:.2g}",
+        _RESIDUALS,
         _FALSE_ALARM,
         _OF_ALL_TESTS,
     )
@@ -131,7 +131,7 @@ class Code(Enum):
         _HALVES + ", probability {p_value:.1g}): an effect that the model does not contain acts on "
         "the images. The stated standard deviations contain a factor of {widening:.2g} for "
         "patterns in the residuals; what exceeds it is missing in them",
-        "Look for a pattern in residuals.csv, and try --model auto",
+        _RESIDUALS,
         _FALSE_ALARM,
         "probability of a false alarm",
     )
@@ -391,6 +391,11 @@ class Code(Enum):
         return Finding(code=self, numbers={**(numbers or {}), **more}, text=text, **places)
 
 
+LENS_FAILS = {Code.MODEL_FAILS, Code.SYSTEMATIC, Code.PATTERN, Code.HALVES_DISAGREE}
+"""Objections that another lens model may answer. The first of them in a calibration has the number
+``better_models``, 1 or 0, and the better model in ``names``."""
+ASK_FOR_VIEWS = {Code.FEW_VIEWS, Code.SMALL_TILTS, Code.OFFSET}
+"""Objections whose advice is to add views."""
 TRUST = {Code.NO_STRUCTURE, Code.HALVES_AGREE, Code.HALVES_NOT_COMPARED}
 """Notes on whether the covariance can be believed."""
 
@@ -436,6 +441,18 @@ class Finding(Part):
         }
 
     @property
+    def lens_advice(self) -> str:
+        """Return a sentence on the lens model that fits better, "" where none was looked for."""
+        if "better_models" not in self.numbers:
+            return ""
+        if self.names:
+            return f"Choose --model {self.names[0]}, which fits better"
+        return (
+            "No lens parameter explains it; possible causes are a target that bends from view to "
+            "view, refraction, and dots that are numbered wrongly"
+        )
+
+    @property
     def status(self) -> Status:
         """Return the best verdict that a calibration with this finding can have."""
         return self.code.value.status
@@ -444,7 +461,8 @@ class Finding(Part):
     def words(self) -> str:
         """Return the finding and its advice as a sentence without a full stop."""
         kind = self.code.value
-        return ". ".join(filter(None, (kind.says.format(**self._shown()), kind.todo)))
+        says = kind.says.format(**self._shown())
+        return ". ".join(filter(None, (says, kind.todo, self.lens_advice)))
 
 
 def _named(noun: str, names: Sequence[str]) -> str:

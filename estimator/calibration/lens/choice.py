@@ -214,8 +214,8 @@ def _step(
 ) -> Step:
     """Return the step that adds one group of parameters to the model ``before``."""
     gain = max(quadratic.rise(before) - quadratic.rise(lenses), 0.0)
-    bic_gain = gain - quadratic.penalty_of(Lens({group}))
-    return Step(camera, GROUPS[group], lenses, gain, bic_gain, True)
+    price = quadratic.penalty_of(lenses[camera]) - quadratic.penalty_of(before[camera])
+    return Step(camera, GROUPS[group], lenses, gain, gain - price, True)
 
 
 def _not_taken(quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens]]) -> list[Step]:

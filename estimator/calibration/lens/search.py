@@ -20,6 +20,7 @@ from itertools import product
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
@@ -61,6 +62,8 @@ class QuadraticCost:
         here is divided.
     penalty : penalty of each free parameter.
     group_penalty : further penalty of each group.
+    stretch_factor : factor of the penalty of aspect and skew beside a free image centre, see
+        `_design_effect`.
     """
 
     names: tuple[tuple[int, str], ...]
@@ -70,6 +73,7 @@ class QuadraticCost:
     variance: float
     penalty: float
     group_penalty: float
+    stretch_factor: float = 1.0
 
     @staticmethod
     def of(problem: Problem, solution: Solution) -> QuadraticCost:
@@ -100,12 +104,14 @@ class QuadraticCost:
         groups = sum(1 for c in range(len(problem.cameras)) for g in PLAIN_GROUPS
                      if (c, GROUPS[g][0]) in names)  # fmt: skip
         variance = _variance(problem, solution, joint)
+        perspective = any(parameter == "centre_u_px" for _, parameter in names)
         rows = 2 * int(np.sum(problem.kept))
         return QuadraticCost(
             (*names, *(m[0] for m in more)), minimum.predict(extend),
             np.r_[prior / unit, np.ones(len(more))],
             2 * (solution.cost - still) / variance, variance,
             float(np.log(rows)), float(GROUP_PENALTY * np.log(max(groups, 1))),
+            _design_effect(problem, solution, joint) if perspective else 1.0,
         )  # fmt: skip
 
     def rise(self, lenses: Lenses) -> float:
@@ -134,7 +140,10 @@ class QuadraticCost:
         """
         own = lens - {"centre"}
         groups = own | {"affine"} if "tilt" in own else own
-        return self.penalty * sum(len(GROUPS[g]) for g in own) + self.group_penalty * len(groups)
+        price = self.penalty * sum(len(GROUPS[g]) for g in own) + self.group_penalty * len(groups)
+        if {"centre", "affine"} <= lens:
+            price += (self.stretch_factor - 1) * self.penalty_of(Lens({"affine"}))
+        return price
 
     def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
         """Return how well the views determine a group of parameters of one camera.
@@ -173,6 +182,16 @@ def _variance(problem: Problem, solution: Solution, joint: JointCovariance) -> f
     error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
     dof = max(joint.effective_dof, 0.0)
     return float(((error**2).sum() + NOISE_DOF) / (dof + NOISE_DOF))
+
+
+def _design_effect(problem: Problem, solution: Solution, joint: JointCovariance) -> float:
+    """Return how much more power the residuals have in a parameter of the lens than in a dot.
+
+    It is 1 unless they have a pattern: an error of the lens that no model has is smooth. Both
+    cameras take it for a stretch of the target beside their perspective (docs/decisions/014).
+    """
+    error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
+    return float(residual_tests(problem, error, joint.leverage)[0]["widening"] ** 2)
 
 
 def possible(rich: Lens) -> list[Lens]:

@@ -24,7 +24,7 @@ from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
 from telerig.io.report.page.figures import Picture
 from telerig.io.report.page.page import drawn_over_cores, render_page
 from telerig.io.results.calibration_words import telecentricity_words
-from telerig.io.results.findings import TRUST, Status
+from telerig.io.results.findings import ASK_FOR_VIEWS, TRUST, Status
 from telerig.io.results.folders.calibration import CalibrationResults, read_results
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
@@ -99,6 +99,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "trust_words": [sentence(words) for words in trust if words],
         "comparison": results.comparison.content(),
         "advice": file.diagnostics.next_view,
+        "views_asked": any(f.code in ASK_FOR_VIEWS for f in file.findings or ()),
         "dots_drawn": dots_are_drawn(results),
     }
 

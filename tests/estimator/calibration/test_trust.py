@@ -143,6 +143,8 @@ def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:
     assert only(found, Code.HALVES_DISAGREE).numbers["widening"] == widening > 1
     assert "PATTERN" in codes(found)
     assert "! of two calibrations" in found.report()
+    named = [finding for finding in found.findings if "better_models" in finding.numbers]
+    assert [finding.names for finding in named] == [("tangential",)]
 
 
 @pytest.mark.slow

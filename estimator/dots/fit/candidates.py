@@ -266,7 +266,7 @@ def _is_small_dot(piece: Candidate) -> bool:
     if piece.reason == Reason.TOUCHES_BORDER:
         return True
     sound = piece.reason in (None, Reason.TOO_SMALL)
-    return sound and semi_axes(piece.shape_px)[1] <= _PIECE_SEMI_AXIS_PX
+    return sound and bool(semi_axes(piece.shape_px)[1] <= _PIECE_SEMI_AXIS_PX)
 
 
 def _first_look(

@@ -53,8 +53,14 @@ class Response:
 
         How many independent frequencies a band has follows from what the coherence of these
         spectra would be with random phases: a single line is always coherent, and shows nothing.
+        The taper ends where the samples do: cut off, slow motions of both would leak into all
+        bands, coherent with each other.
         """
-        taper = np.hanning(len(known)) * known
+        there = np.flatnonzero(known)
+        taper = np.zeros(len(known))
+        if len(there):
+            first, end = there[0], there[-1] + 1
+            taper[first:end] = np.hanning(end - first) * known[first:end]
         both = [np.fft.rfft(taper * (v - v[known].mean())) for v in (output, motion)]
         band, gains, coherences, variances = [], [], [], []
         low, high = 2, 2 + _LEAST_BINS

@@ -249,7 +249,7 @@ def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -
     solution = solve(problem, model, Options(robust=False))
     table = trajectories(solution, None).iloc[_inner(solution)]
     return Expected(
-        verdicts(solution, expected_shake(solution), read=False),
+        verdicts(solution, expected_shake(solution)),
         vertical_axis(problem.up),
         1e3 * table[[f"s{a}_mm" for a in AXES]].median().to_numpy(float),
         table[[f"sv{a}_mm_s" for a in AXES]].median().to_numpy(float),

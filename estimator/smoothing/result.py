@@ -24,7 +24,7 @@ from telerig.estimator.smoothing.graph.stage_travel import (
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.results_file import StoredTables, Tables
 from telerig.estimator.smoothing.verdict.evidence import BUBBLES, MARKS, Evidence, Pixels, Span
-from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
+from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra
 from telerig.factors.bubble_motion import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
@@ -293,7 +293,9 @@ def summary_of(
             "bubbles": _residuals(evidence.pixels[BUBBLES]),
             "references": _residuals(evidence.pixels[MARKS]),
         },
-        "whiteness": pixel_whiteness(solution),
+        "whiteness": {
+            name: found for name, one in evidence.lagged.items() if (found := one.compared())
+        },
         "accelerometer_spectra": accelerometer_spectra(solution),
         "encoder": _encoder(solution),
         "travel": _travel(solution),

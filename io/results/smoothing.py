@@ -40,7 +40,6 @@ of the shake's RMS is then left in the paths, and at most half of it.
 class Flag(StrEnum):
     """Name a condition under which a verdict has to be read with care.
 
-    LABEL_AMBIGUOUS : an oscillation may be the bubbles' or the rig's.
     SHAKE_BELOW_NOISE : the shake is smaller than the noise of the positions.
     SHAKE_UNMEASURED : nothing but the motion of one or two bubbles at a time shows the shake, so
         that all numbers depend on the priors.
@@ -48,7 +47,6 @@ class Flag(StrEnum):
         bubble at a time shows how the cameras' arms move on it.
     """
 
-    LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
     SHAKE_UNMEASURED = "SHAKE_UNMEASURED"
     ARMS_UNMEASURED = "ARMS_UNMEASURED"
@@ -106,24 +104,6 @@ class Place(StrEnum):
     SERVO = "servo"
 
 
-class AttributedLine(Part):
-    """Hold a spectral line and whose motion it is: the bubbles' or the rig's.
-
-    owner : to whom the line is attributed.
-    frequency_hz : its frequency in Hz.
-    rms_mm : RMS of its displacement in mm; None where it is not known.
-    other_owner_costs_nats : log-likelihood ratio of this attribution to the other one; None where
-        it was not computed.
-    ambiguous : whether the data cannot decide whose motion it is.
-    """
-
-    owner: str = ""
-    frequency_hz: float
-    rms_mm: float | None = None
-    other_owner_costs_nats: float | None = None
-    ambiguous: bool = False
-
-
 class AxisVerdict(Part):
     """Hold the verdict along one axis of the rig, and the numbers on which it is based.
 
@@ -135,7 +115,6 @@ class AxisVerdict(Part):
     sigma_encoder_mm : standard deviation that the encoder's scale and the travel axis add to all
         positions alike, in mm. `sigma_mm` is without it.
     shake_rms_mm : RMS of the shake in mm of the camera that shakes most.
-    lines : the spectral lines that were attributed to the rig or to the bubbles.
     """
 
     verdict: Verdict | None = None
@@ -146,7 +125,6 @@ class AxisVerdict(Part):
     sigma_shake_known_mm: float | None = None
     sigma_encoder_mm: float | None = None
     shake_rms_mm: float | None = None
-    lines: tuple[AttributedLine, ...] = ()
     words: str = ""
 
 

@@ -73,10 +73,6 @@ NOT_JUDGED = VerdictWords(
 )
 
 FLAG_WORDS: dict[str, str] = {
-    Flag.LABEL_AMBIGUOUS: (
-        "A line in the spectrum could be the bubbles' or the rig's, and the data do not say whose "
-        "it is. The bands hold for the reading that was taken."
-    ),
     Flag.SHAKE_BELOW_NOISE: (
         "The shake is smaller than what the images can show. It does no harm here: the bubbles' "
         "motion is as good as it would be on a rig that stands still."
@@ -174,15 +170,7 @@ def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
         text += (
             " Nothing but the motion of one or two bubbles shows how the arms move on the carriage."
         )
-    if Flag.LABEL_AMBIGUOUS in axis.flags:
-        hz = _ambiguous(axis)
-        text += f" The oscillation at {hz} could be the bubble's as well as the rig's."
     return text
-
-
-def _ambiguous(axis: AxisVerdict) -> str:
-    """Return the frequencies of the ambiguous lines along an axis."""
-    return ", ".join(sorted({f"{x.frequency_hz:.3g} Hz" for x in axis.lines if x.ambiguous}))
 
 
 _WORDS_OF_TEST = {
@@ -230,9 +218,6 @@ def _why(name: str, axis: AxisVerdict) -> str:
         return f"nothing but the motion of one or two bubbles shows the shake along {name}"
     if Flag.ARMS_UNMEASURED in axis.flags:
         return f"nothing but the motion of one or two bubbles shows how the arms move along {name}"
-    if Flag.LABEL_AMBIGUOUS in axis.flags:
-        hz = _ambiguous(axis)
-        return f"the oscillation at {hz} along {name} could be the bubble's as well as the rig's"
     left = share(1.0 - (axis.eta or 0.0), 1.0)
     return (
         f"along {name}, {left} of the shake's variance is left and widens the positions "

@@ -18,7 +18,7 @@ COMMON_HZ, ARM_HZ, ALONE_HZ = 20.0, 45.0, 80.0
 COMMON_UM, ARM_UM, ALONE_UM = 120.0, 50.0, 30.0
 AXES = {
     name: {"verdict": "RESOLVED", "flags": [], "q": q, "eta": 0.9961, "sigma_mm": 0.0231,
-           "sigma_shake_known_mm": 0.0222, "shake_rms_mm": 0.13, "lines": []}
+           "sigma_shake_known_mm": 0.0222, "shake_rms_mm": 0.13}
     for name, q in zip("xyz", (1.01, 1.07, 1.02))
 }  # fmt: skip
 changed = partial(edit, "smoothing.json")

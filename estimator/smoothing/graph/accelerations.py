@@ -1,28 +1,23 @@
 """What a smoothing says of the bubbles' motion beyond the states themselves.
 
 Velocity and acceleration are states where the bubbles' forces pass a low-pass (`Inertia`). Here are
-the frequency up to which an acceleration is followed, the variance of the way of each bubble, and
-the part of the pixels' noise that belongs to positions alone.
+the frequency up to which an acceleration is followed, and the part of the pixels' noise that
+belongs to positions alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.smoothing.graph.bubble_chains import BubbleChains
-from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State, points_in_rig
 from telerig.estimator.smoothing.graph.linear import white_noise
 from telerig.factors.bubble_motion import Inertia, inertial_bubble_path
-from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.state_space import Component
 from telerig.rig.triangulation import stacked_jacobian
 
-_STILL_MM_S = 1e-9
 _LEAST_INFORMATION = 1e-6
 _LOWEST_HZ, _FREQUENCIES, _ABOVE = 1e-2, 6000, 1e3
 """Of the spectra: the lowest frequency, their number, and the highest one over the low-pass's."""
@@ -68,56 +63,6 @@ def accelerations_of(graph: GraphLayout, state: State, covariance: Array) -> Acc
         for axis, one, time_s in zip(np.eye(3), variance, bubble.inertia.time_s, strict=True)
     ]  # fmt: skip
     return Accelerations(bubble.inertia, state.bubbles @ rows.T, found, np.array(band))
-
-
-def way_variances(
-    graph: GraphLayout,
-    state: State,
-    factors: Sequence[LinearFactors],
-    chains: BubbleChains,
-    draws: Draws,
-) -> tuple[Array, Array]:
-    """Return variances in mm^2 of the displacement (K, 3) of K bubbles from the first frame of each
-    track to its last one, and of the length (K,) of that way.
-
-    The steps of the way have the directions of the velocity. The share of the rig comes from draws
-    of its errors, which move the bubbles.
-
-    chains : the bubbles, eliminated for a fixed rig.  draws : at the solution.
-    """
-    first, last = graph.first_row[:-1], graph.first_row[1:] - 1
-    velocity = state.bubbles @ graph.bubble.velocity.T
-    along = velocity / np.maximum(np.linalg.norm(velocity, axis=-1, keepdims=True), _STILL_MM_S)
-    step = (along[1:] + along[:-1]) / 2
-    step[last[:-1]] = 0.0
-    by_place = np.zeros((graph.rows, 3, 4))
-    by_place[last, :, :3] += np.eye(3)
-    by_place[first, :, :3] -= np.eye(3)
-    by_place[1:, :, 3] += step
-    by_place[:-1, :, 3] -= step
-    rows = graph.in_bubble_basis(graph.bubble.position[None], np.arange(graph.rows))
-    by_state = rows.mT @ by_place
-    own = np.add.reduceat((by_state * _solved(chains, by_state)).sum(1), first)
-    pushed = np.zeros((graph.rows, graph.bubble.size, draws.errors.shape[-1]))
-    shake, constants = draws.of_family(graph, 0), draws.of_family(graph, 4)[0]
-    base = graph.base()
-    for linear in factors:
-        key = np.asarray(linear.keys[0])
-        if linear.weight is not None and key.size and base.bubbles <= key.flat[0] < base.means:
-            by_rig = linear.blocks[1] @ shake[np.asarray(linear.keys[1])]
-            by_rig += linear.blocks[2] @ constants
-            np.add.at(pushed, key - base.bubbles, -linear.blocks[0].mT @ by_rig)
-    moved = np.einsum("nsk,nsd->nkd", by_state, _solved(chains, pushed))
-    variance = own + (np.add.reduceat(moved, first) ** 2).mean(-1)
-    return variance[:, :3], variance[:, 3]
-
-
-def _solved(chains: BubbleChains, side: Array) -> Array:
-    """Return the bubbles' states (rows, D, N) for right sides of the normal equations."""
-    place, means = chains.places.place_of_row, np.zeros((len(chains.mean), 3, side.shape[-1]))
-    rows = np.empty_like(side)
-    rows[place] = side
-    return np.asarray(chains.solved(rows, means)[0][place])
 
 
 def add_slow_noise(graph: GraphLayout, state: State, bubbles: Array) -> None:

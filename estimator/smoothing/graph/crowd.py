@@ -24,7 +24,6 @@ from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.bubble_chains import BubbleChains, bubble_chains
 from telerig.estimator.smoothing.graph.elimination import (
-    Blocks,
     EliminatedGraph,
     eliminate,
     starts_of,
@@ -221,7 +220,7 @@ class EliminatedCrowd:
         out[ours.means : ours.sensors] = back.reshape(-1, count)
         return out
 
-    def blocks(self) -> Blocks:
+    def blocks(self) -> list[Array]:
         """Return the marginal covariances; what the rig adds to a bubble's is the mean bubble's.
 
         All is used up: what is not needed any more makes room for what is worked out.
@@ -232,7 +231,7 @@ class EliminatedCrowd:
         found, chain = self.mean.blocks(), self.mean_chains
         self.mean.cliques.clear()
         row = _mean_row(mean)[graph.frame_of_row]
-        added = found.own[1] - chain.covariances(chain.places.place_of_row)
+        added = found[1] - chain.covariances(chain.places.place_of_row)
         own = self.chains.covariances(self.chains.places.place_of_row)
         for first in range(0, graph.rows, _AT_ONCE):
             mine = np.arange(first, min(first + _AT_ONCE, graph.rows))
@@ -241,15 +240,9 @@ class EliminatedCrowd:
         order = self.chains.places.order
         means = np.empty_like(self.chains.mean)
         means[order] = self.chains.mean
-        mean_added = found.own[2] - self.mean_chains.mean[np.argsort(self.mean_chains.places.order)]
+        mean_added = found[2] - self.mean_chains.mean[np.argsort(self.mean_chains.places.order)]
         means += mean_added[segment]
-        _, any_row, cross_of_row = np.unique(row, return_index=True, return_inverse=True)
-        cross = found.cross[row[any_row]]
-        turn = _turn(mean, row[any_row], graph, any_row)
-        if turn is not None:
-            cross = cross @ np.swapaxes(turn, -1, -2)
-        blocks = [found.own[0], own, means, *found.own[3:]]
-        return Blocks(blocks, cross, any_row, cross_of_row)
+        return [found[0], own, means, *found[3:]]
 
 
 def add_own_calibration(

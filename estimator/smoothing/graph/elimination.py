@@ -33,24 +33,6 @@ _NOTHING = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """Covariances of the variables, each in the basis of `StateSpace.bases` that it is solved in.
-
-    own : for each kind of variable (shake, bubbles, ...), (n, d, d) for its n variables of d
-        numbers; that of the shake at the frames.
-    cross : (C, Ds, Db) covariances of the shake (Ds numbers) with a bubble (Db numbers) at the same
-        frame, for C observations.
-    cross_row : (C,) row of the bubbles' variables that each observation belongs to.
-    cross_of_row : (rows,) the observation's index for each such row.
-    """
-
-    own: list[Array]
-    cross: Array
-    cross_row: Ints
-    cross_of_row: Ints
-
-
-@dataclass(frozen=True)
 class EliminatedGraph:
     """Hold a graph whose variables have been eliminated.
 
@@ -100,9 +82,13 @@ class EliminatedGraph:
             out[own] = dtrtrs(clique.root, out[own] - clique.right @ out[above])[0]
         return out
 
-    def blocks(self) -> Blocks:
-        """Return the marginal covariances of all variables, and those of the shake with the bubbles
-        in the same frame."""
+    def blocks(self) -> list[Array]:
+        """Return the marginal covariances of the variables, each in the basis of `StateSpace.bases`
+        that it is solved in.
+
+        For each kind of variable (shake, bubbles, ...), (n, d, d) for its n variables of d numbers;
+        that of the shake at the frames.
+        """
         graph = self.graph
         base, counts = graph.base(), graph.counts()
         nodes, of_frame = np.unique(graph.nodes.of_frame, return_inverse=True)
@@ -115,14 +101,8 @@ class EliminatedGraph:
             if blocks.size
             for key, block in zip(some.tolist(), blocks)
         }
-        cross = np.zeros((graph.rows, counts.shake.size, counts.bubbles.size))
-        pairs: dict[int, list[tuple[int, Array]]] = {}
-        for node, row, block in zip(graph.node_of_row.tolist(), keys[1].tolist(), cross):
-            if cross.size:
-                pairs.setdefault(node, []).append((row, block))
-        fill_covariances(self.cliques, _sizes(graph), wanted, pairs)
-        rows = np.arange(graph.rows)
-        return Blocks([own[0][of_frame], *own[1:]], cross, rows, rows)
+        fill_covariances(self.cliques, _sizes(graph), wanted)
+        return [own[0][of_frame], *own[1:]]
 
 
 def eliminate(
@@ -135,17 +115,16 @@ def eliminate(
     """
     import gtsam
 
-    every = [*factors, *_bonds(graph)]
     (order, when), sizes = _ordering(graph), _sizes(graph)
     if cholesky:
         try:
-            cliques = _eliminated(every, order, when, sizes)
+            cliques = _eliminated(factors, order, when, sizes)
             if _least_pivot(cliques, factors, sizes) > LEAST_PIVOT:
                 return EliminatedGraph(graph, cliques)
         except RuntimeError:
             pass
     try:
-        return EliminatedGraph(graph, _eliminated(every, order, when, sizes, gtsam.EliminateQR))
+        return EliminatedGraph(graph, _eliminated(factors, order, when, sizes, gtsam.EliminateQR))
     except RuntimeError as error:
         raise CalibrationError(
             f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
@@ -226,23 +205,6 @@ def _least_pivot(
             )
     order = [np.arange(starts[k], starts[k + 1]) for c in cliques for k in c.fronts]
     return float(np.min(_diagonal(cliques) ** 2 / before[np.concatenate(order)], initial=1.0))
-
-
-def _bonds(graph: GraphLayout) -> list[LinearFactors]:
-    """Return empty factors between shake and bubbles that no image joins.
-
-    Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
-    its first row on would share none.
-    """
-    size = graph.counts().shake.size
-    seen = graph.row(graph.problem.observations.item, graph.problem.observations.frame)
-    alone = np.setdiff1d(np.arange(graph.rows), seen)
-    if not size or not len(alone):
-        return []
-    keys = (graph.node_of_row[alone], graph.base().bubbles + alone)
-    blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, graph.bubble.size))
-    nothing = np.zeros((len(alone), 1))
-    return [LinearFactors(keys, blocks, nothing, nothing[:, 0])]
 
 
 def _ordering(graph: GraphLayout) -> tuple[Ints, Ints]:
@@ -333,16 +295,12 @@ def cliques_of(net: Any, sizes: Sequence[int], when: Ints) -> list[Clique]:
 
 
 def fill_covariances(
-    cliques: Sequence[Clique],
-    sizes: Sequence[int],
-    wanted: Mapping[int, Array],
-    pairs: Mapping[int, Sequence[tuple[int, Array]]],
+    cliques: Sequence[Clique], sizes: Sequence[int], wanted: Mapping[int, Array]
 ) -> None:
     """Write marginal covariances into the arrays that are given.
 
     sizes : dimension of each key, keys counting from 0.
     wanted : (d, d) of keys.
-    pairs : (d, e) of keys with others of their clique.
     """
     from scipy.linalg.lapack import dtrtri
 
@@ -373,8 +331,6 @@ def fill_covariances(
             mine = slice(starts[key], starts[key] + sizes[key])
             if key in wanted:
                 wanted[key][...] = block[mine, mine]
-            for other, out in pairs.get(key, ()):
-                out[...] = block[mine, starts[other] : starts[other] + sizes[other]]
         if children[i]:
             joint[i] = block
 

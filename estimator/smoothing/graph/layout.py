@@ -457,6 +457,15 @@ class GraphLayout:
         turned = np.swapaxes(self.bubble_motion.basis, -1, -2)
         return times_chosen(block, turned, self.row_basis[row])
 
+    def bubble_covariances(self, block: Array) -> Array:
+        """Return the covariances (rows, D, D) of bubbles' states, in the place of those of their
+        increments, which are used up."""
+        for first in range(0, self.rows, _AT_ONCE):
+            mine = np.arange(first, min(first + _AT_ONCE, self.rows))
+            half = np.swapaxes(self.out_of_bubble_basis(block[mine], mine), -1, -2)
+            block[mine] = self.out_of_bubble_basis(half, mine)
+        return block
+
     def shake_moved(self, increments: Array) -> Array:
         """Return the changes (N, D) of the shake's states for increments (N, D) at all nodes."""
         turned = np.swapaxes(self.shake_motion.basis, -1, -2)

@@ -18,7 +18,6 @@ from telerig.estimator.smoothing.graph.accelerations import (
     Accelerations,
     accelerations_of,
     add_slow_noise,
-    way_variances,
 )
 from telerig.estimator.smoothing.graph.bubble_chains import bubble_chains
 from telerig.estimator.smoothing.graph.crowd import (
@@ -27,7 +26,8 @@ from telerig.estimator.smoothing.graph.crowd import (
     eliminated,
 )
 from telerig.estimator.smoothing.graph.draws import Draws, draws_of
-from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph
+from telerig.estimator.smoothing.graph.elimination import EliminatedGraph
+from telerig.estimator.smoothing.graph.known_rig import way_variances
 from telerig.estimator.smoothing.graph.layout import (
     GraphLayout,
     State,
@@ -97,22 +97,21 @@ class Covariances:
 
     shake : (F, Ds, Ds) for the F frames, with Ds states of carriage and cameras.
     bubbles : (rows, Db, Db), one row per bubble and frame, with Db states of a bubble.
-    cross : (C, Ds, Db) between the shake and a bubble in the same frame.
-    cross_of_row : (rows,) which of them is that of each bubble and frame.
     means : (K, 3, 3) for the mean velocities of K bubbles.
     sensors, encoder, calibration, marks, clocks : for the constants of `State` with the same names.
+    by_scale : (rows, 3) what the encoder's uncertain scale adds to the variances of the bubbles'
+        positions; None if the scale is no variable.
     """
 
     shake: Array
     bubbles: Array
-    cross: Array
-    cross_of_row: Ints
     means: Array
     sensors: Array
     encoder: Array
     calibration: Array
     marks: Array
     clocks: Array
+    by_scale: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -408,12 +407,15 @@ def _finish(
         ways = way_variances(graph, state, last.factors, chains, draws)
     if isinstance(last.done, EliminatedCrowd) and options.covariances and graph.share_size:
         shared = _joint_covariance(graph, last.done, (4,))
+    by_scale = None
+    if options.covariances and graph.encoder_flags[0] and graph.rows:
+        by_scale = _scale_variances(graph, last.done)
     last.factors.clear()
     give_back_freed_memory()
     found = None
     if options.covariances:
         progress("covariances", 0.0)
-        found = _covariances(graph, last.done.blocks())
+        found = replace(_covariances(graph, last.done.blocks()), by_scale=by_scale)
         if shared is not None:
             encoder, rig = np.split(np.arange(len(shared)), [graph.encoder_size])
             of_encoder, of_rig = (shared[np.ix_(mine, mine)] for mine in (encoder, rig))
@@ -443,6 +445,21 @@ def _joint_covariance(
     return (out + out.T) / 2
 
 
+def _scale_variances(graph: GraphLayout, done: EliminatedGraph | EliminatedCrowd) -> Array:
+    """Return what the encoder's uncertain scale adds to the variances (rows, 3) of positions.
+
+    It is the square of their covariance with the scale over the variance of the scale.
+    """
+    (nodes, shake), (rows, size) = graph.counts()[:2]
+    ends = np.cumsum([0, *(n * d for n, d in graph.counts())])
+    side = np.zeros((int(ends[-1]), 1))
+    side[ends[4]] = 1.0
+    column = done.solved(side)[:, 0]
+    states = column[nodes * shake : nodes * shake + rows * size].reshape(rows, size)
+    moves = graph.bubbles_moved(states) @ graph.bubble.position.T
+    return np.asarray(moves**2 / column[ends[4]])
+
+
 def drawn(solution: Solution, draws: int | None = None) -> Draws:
     """Return draws at a solution: those that it has, or by one more elimination.
 
@@ -455,22 +472,16 @@ def drawn(solution: Solution, draws: int | None = None) -> Draws:
     return in_large_stack(lambda: draws_of(graph, factors, eliminated(graph, factors), draws))
 
 
-def _covariances(graph: GraphLayout, blocks: Blocks) -> Covariances:
+def _covariances(graph: GraphLayout, own: list[Array]) -> Covariances:
     """Marginals in physical units."""
-    own, row = blocks.own, blocks.cross_row
-    shake, bubbles, cross = own[0], own[1], np.empty_like(blocks.cross)
+    shake, bubbles = own[:2]
     for mine in _parts(len(shake)):
         basis = _frame_basis(graph, mine)
         shake[mine] = basis @ shake[mine] @ np.swapaxes(basis, -1, -2)
-    for mine in _parts(graph.rows):
-        half = np.swapaxes(graph.out_of_bubble_basis(bubbles[mine], mine), -1, -2)
-        bubbles[mine] = graph.out_of_bubble_basis(half, mine)
-    for mine in _parts(len(row)):
-        block = _frame_basis(graph, graph.frame_of_row[row[mine]]) @ blocks.cross[mine]
-        cross[mine] = graph.out_of_bubble_basis(block, row[mine])
+    graph.bubble_covariances(bubbles)
     encoder = graph.encoder_size
     return Covariances(
-        shake, bubbles, cross, blocks.cross_of_row, own[2], own[3], own[4][0, :encoder, :encoder],
+        shake, bubbles, own[2], own[3], own[4][0, :encoder, :encoder],
         own[4][0, encoder:, encoder:], *own[5:],
     )  # fmt: skip
 

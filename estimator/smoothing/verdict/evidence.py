@@ -18,6 +18,7 @@ from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.linear import encoder, white_noise
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
+from telerig.estimator.smoothing.verdict.whiteness import Lagged, lagged
 
 AXES = ("x", "y", "z")
 BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
@@ -198,6 +199,7 @@ class Evidence:
     window_s : length of the time windows of `Tally`.
     tallies : squared residuals by (source, axis).
     pixels : detections by source.
+    lagged : products of the bubbles' residuals by camera.
     lost : unused samples by accelerometer.
     means : mean velocities by particle number.
     shake : None without a shake in the model.
@@ -209,6 +211,7 @@ class Evidence:
     window_s: float
     tallies: Mapping[tuple[str, str], Tally]
     pixels: Mapping[str, Pixels]
+    lagged: Mapping[str, Lagged]
     lost: Mapping[str, Lost]
     means: Mapping[int, Mean]
     shake: Shake | None
@@ -227,7 +230,9 @@ class Evidence:
         nodes = solution.graph.nodes
         return cls(
             (float(span.t_s[0]), float(span.t_s[-1])), span.window_s, tallies,
-            _pixels(solution, span), _lost(solution, span), _means(solution, span),
+            _pixels(solution, span),
+            lagged(solution, draws, span.holds(solution.graph.problem.observations.frame)),
+            _lost(solution, span), _means(solution, span),
             shake_of(solution, span), int(np.count_nonzero(span.spans(nodes.t_s))), solution.passes,
         )  # fmt: skip
 
@@ -241,6 +246,7 @@ class Evidence:
             self,
             tallies=_added(self.tallies, other.tallies),
             pixels=_added(self.pixels, other.pixels),
+            lagged=_added(self.lagged, other.lagged),
             lost=_added(self.lost, other.lost),
             means=means,
             shake=reduce(Shake.__add__, shake) if shake else None,

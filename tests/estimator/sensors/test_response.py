@@ -63,7 +63,9 @@ def test_slow_motions_that_end_before_the_record_show_nothing(rng: Generator) ->
     known, t = np.zeros(COUNT, bool), np.linspace(0, 1, COUNT)
     known[220:780] = True
     for _ in range(20):
-        slow = np.sin(2 * np.pi * (rng.uniform(0.3, 0.7, 2)[:, None] * t + rng.uniform(size=(2, 1))))
+        slow = np.sin(
+            2 * np.pi * (rng.uniform(0.3, 0.7, 2)[:, None] * t + rng.uniform(size=(2, 1)))
+        )
         both = 20 * slow + rng.normal(size=(2, COUNT))
         assert not len(Response.of(*both, known).band)
 

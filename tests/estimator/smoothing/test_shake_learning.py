@@ -30,7 +30,6 @@ from telerig.estimator.smoothing.learning.lines_of_sight import (
     sight_directions,
     signals_of,
 )
-from telerig.estimator.smoothing.learning.owners import attributions, moved_to_bubble, moved_to_rig
 from telerig.estimator.smoothing.learning.parameters import (
     log_prior,
     names_of,
@@ -197,27 +196,6 @@ def test_what_is_held_keeps_its_value() -> None:
         assert mode.rms_mm == pytest.approx(given.rms_mm, rel=1e-12)
     assert found.bubble.velocity_tau_s == start.bubble.velocity_tau_s
     assert not any(n.startswith("modes.0") for n in found.learned)
-
-
-def test_a_line_changes_hands_without_changing_one_bubbles_likelihood() -> None:
-    problem, _, _ = run(np.random.default_rng(9))
-    signals = signals_of(problem)[:1]
-    at = evidence(signals, true_model())
-    assert evidence(signals, moved_to_bubble(true_model(), 0)) == pytest.approx(at, abs=1e-5)
-    assert evidence(signals, moved_to_rig(true_model(), 1)) == pytest.approx(at, abs=1e-5)
-    assert evidence(signals, moved_to_rig(true_model(), 1, 0.3)) == pytest.approx(at, abs=1e-5)
-    modes = tuple(replace(m, force_hz=40.0) for m in true_model().modes)
-    filtered = replace(true_model(), modes=modes)
-    at = evidence(signals, filtered)
-    there = moved_to_bubble(filtered, 0)
-    assert evidence(signals, there) == pytest.approx(at, abs=1e-5)
-    back = moved_to_rig(there, len(there.bubble.zigzags) - 1)
-    assert evidence(signals, back) == pytest.approx(at, abs=1e-5)
-    assert back.modes[-1].force_hz == 40.0
-    several, _, _ = run(np.random.default_rng(9), bubbles=4)
-    costs = attributions(pooled(signals_of(several)[0]), true_model(), (0, 1, 0), several.up)
-    assert {(c.owner, c.index) for c in costs} == {("rig", 0), ("bubble", 1)}
-    assert all(c.log_likelihood_ratio > 5 and not c.ambiguous for c in costs)
 
 
 def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:

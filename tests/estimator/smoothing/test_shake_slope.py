@@ -21,7 +21,6 @@ from telerig.estimator.smoothing.learning.likelihood import (
     laplace_covariance,
 )
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled, signals_of
-from telerig.estimator.smoothing.learning.owners import moved_to_bubble
 from telerig.estimator.smoothing.learning.parameters import (
     log_prior,
     names_of,
@@ -44,14 +43,17 @@ def driven(model: ShakeModel, force_hz: float) -> ShakeModel:
 
 def partly_forced() -> ShakeModel:
     white = true_model()
-    return replace(white, modes=(*driven(white, 45.0).modes[:2], white.modes[2]))
+    common, left, _ = driven(white, 45.0).modes
+    line = Zigzag(common.frequency_hz, common.damping, common.rms_mm, common.force_hz)
+    bubble = replace(white.bubble, zigzags=(*white.bubble.zigzags, line))
+    return replace(white, modes=(common, left, white.modes[2]), bubble=bubble)
 
 
 MODELS = {
     "modes": true_model(),
     "bands": replace(true_model(0.4), broad_bands=BANDS),
     "with_low_pass_force": driven(true_model(), 60.0),
-    "partly with_low_pass_force": moved_to_bubble(partly_forced(), 0, 0.5),
+    "partly with_low_pass_force": partly_forced(),
 }
 
 

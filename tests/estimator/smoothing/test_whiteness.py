@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from leverages import leverages
 from numpy.typing import NDArray
 from scipy.stats import kstest
 from shake_learning_data import run, true_model
 
-from telerig.estimator.smoothing.graph.layout import graph_layout
-from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
+from telerig.estimator.smoothing.graph.elimination import starts_of
+from telerig.estimator.smoothing.graph.linear import all_factors
+from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.learning.default_priors import adapted
 from telerig.estimator.smoothing.problem.problem import Observations, ShakeModel, SmoothingProblem
-from telerig.estimator.smoothing.verdict.whiteness import (
-    drawn_residuals,
-    pixel_whiteness,
-    stretch_of,
-)
+from telerig.estimator.smoothing.verdict.evidence import Evidence, Span
+from telerig.factors.linear_factors import product
 
 Array = NDArray[np.float64]
 
@@ -38,11 +36,16 @@ def stated(problem: SmoothingProblem, times: float) -> SmoothingProblem:
     return replace(problem, observations=Observations(*whole))
 
 
+def whiteness(solution: Solution) -> dict[str, dict[str, Any]]:
+    of = Evidence.of(solution, drawn(solution)).lagged
+    return {name: one.compared() for name, one in of.items()}
+
+
 @pytest.mark.parametrize(("seed", "kept"), [(31, 1.0), (32, 1.0), (33, 0.7), (34, 0.5)])
 def test_residuals_of_the_right_model_are_as_expected(seed: int, kept: float) -> None:
     """They are not white: the fit follows part of the noise."""
     problem, _, _ = run(np.random.default_rng(seed), bubbles=2, seconds=1.5, kept=kept)
-    found = pixel_whiteness(solved(problem))
+    found = whiteness(solved(problem))
     assert list(found) == ["left", "right"]
     for one in found.values():
         assert one["verdict"] == "as expected" and one["p"] > 1e-3
@@ -56,30 +59,34 @@ def test_p_is_uniform_where_the_model_is_right() -> None:
     """Residuals drawn from the model itself, judged by others: a false alarm as often as said."""
     problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=1.0, kept=0.7)
     solution = solved(problem)
-    stretch = stretch_of(solution.graph, 100)
-    assert stretch is not None
-    others = drawn_residuals(solution, stretch, 60, np.random.default_rng(2))
+    others = drawn(solution, 60).pixels
     found = []
     for k in range(60):
-        residuals = solution.residuals[0].copy()
-        for which, drawn in others:
-            residuals[which] = drawn[..., k]
-        one = pixel_whiteness(replace(solution, residuals=(residuals, solution.residuals[1])))
+        one = whiteness(replace(solution, residuals=(others[..., k], solution.residuals[1])))
         found += [one["left"]["p"], one["right"]["p"]]
     assert kstest(found, "uniform").pvalue > 0.01
 
 
-def test_drawn_residuals_are_as_small_as_the_covariances_say() -> None:
-    """An independent way: variance left = 1 - leverage, from the posterior's covariance."""
-    problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=0.4)
+def test_drawn_residuals_are_as_small_as_the_leverages_say() -> None:
+    """An independent way: what a dense fit leaves of the noise's variance."""
+    problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=0.2)
     solution = solved(problem)
-    stretch = stretch_of(solution.graph, 40)
-    assert stretch is not None and stretch.inner == (0, 79)
-    drawn = drawn_residuals(solution, stretch, 400, np.random.default_rng(1))
-    for (which, residuals), (some, leverage) in zip(drawn, leverages(solution), strict=True):
-        np.testing.assert_array_equal(which, some)
-        np.testing.assert_allclose((residuals**2).mean(-1), 1 - leverage, atol=0.25)
-        np.testing.assert_allclose((residuals**2).mean((0, 2)), 1 - leverage.mean(0), rtol=0.02)
+    factors = all_factors(solution.graph, solution.state, solution.weights)
+    starts = starts_of(solution.graph)
+    blocks = product(factors, starts, np.eye(int(starts[-1])))
+    whole = np.concatenate([b.reshape(-1, b.shape[-1]) for b in blocks])
+    leverage = (np.linalg.qr(whole)[0] ** 2).sum(1)
+    ends = np.cumsum([f.rhs.size for f in factors])
+    pixels = [
+        1 - leverage[end - f.rhs.size : end].reshape(-1, 2)
+        for f, end in zip(factors, ends)
+        if f.weight is not None and f.rhs.size
+    ]
+    left = (drawn(solution, 400).pixels ** 2).mean(-1)
+    for camera, expected in enumerate(pixels):
+        mine = left[problem.observations.camera == camera]
+        np.testing.assert_allclose(mine, expected, atol=0.25)
+        np.testing.assert_allclose(mine.mean(0), expected.mean(0), rtol=0.03)
 
 
 def test_a_centre_that_wanders_is_seen() -> None:
@@ -91,14 +98,14 @@ def test_a_centre_that_wanders_is_seen() -> None:
         wander[:, k] = 0.8 * wander[:, k - 1] + 0.4 * rng.normal(size=(2, 2))
     pixels = obs.uv_px + wander[obs.camera, obs.frame]
     moved = Observations(obs.item, obs.frame, obs.camera, pixels, obs.covariance_px2)
-    for one in pixel_whiteness(solved(replace(problem, observations=moved))).values():
+    for one in whiteness(solved(replace(problem, observations=moved))).values():
         assert one["verdict"] == "correlated" and one["p"] < 1e-5
         assert one["rms_sigmas"] > 1.4 * one["expected_rms_sigmas"]
 
 
 def test_too_few_frames_are_not_judged() -> None:
     problem, _, _ = run(np.random.default_rng(37), bubbles=1, seconds=0.15)
-    assert pixel_whiteness(solved(problem)) == {}
+    assert whiteness(solved(problem)) == {"left": {}, "right": {}}
 
 
 def tracks(problem: SmoothingProblem, spans: list[tuple[int, int]]) -> SmoothingProblem:
@@ -116,27 +123,29 @@ def test_tracks_one_after_the_other_and_pauses() -> None:
     """Later bubbles count like the first; a rig without shake has no state where none is seen."""
     problem, _, _ = run(np.random.default_rng(38), bubbles=20, seconds=3.0)
     short = tracks(problem, [(30 * k, 30 * k + 29) for k in range(20)])
-    for one in pixel_whiteness(solved(short)).values():
+    for one in whiteness(solved(short)).values():
         assert one["verdict"] == "as expected"
         assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.12)
     apart = tracks(replace(problem, bubbles=problem.bubbles[:2]), [(0, 99), (500, 599)])
     still = solved(apart, TRUE.without_shake())
     assert still.graph.shake.size == 0
-    assert list(pixel_whiteness(still)) == ["left", "right"]
+    assert list(whiteness(still)) == ["left", "right"]
 
 
-def test_a_stretch_is_short_and_what_is_too_much_is_not_judged() -> None:
-    problem, _, _ = run(np.random.default_rng(38), bubbles=3, seconds=2.5, marks=2)
-    graph = solved(problem).graph
-    width = graph.shake.size + 3 * graph.bubble.size
-    for middle, first, inner in ((250, 150, (162, 337)), (0, 0, (0, 187)), (499, 300, (312, 499))):
-        stretch = stretch_of(graph, middle)
-        assert stretch is not None
-        assert stretch.size == 200 * width and stretch.inner == inner
-        inside = np.flatnonzero(stretch.column[:500] >= 0)
-        assert (inside[0], inside[-1]) == (first, first + 199)
-    crowd, _, _ = run(np.random.default_rng(38), bubbles=40, seconds=0.3)
-    assert stretch_of(graph_layout(crowd, TRUE, np.zeros(0)), 30) is None
+def test_few_draws_of_many_frames_do() -> None:
+    """As many as a crowd has: the frames show the scatter, and the pieces of a run add up."""
+    problem, _, _ = run(np.random.default_rng(39), bubbles=2, seconds=6.0)
+    solution = solved(problem)
+    draws = drawn(solution, 2)
+    whole = Evidence.of(solution, draws)
+    span = Span.whole(solution)
+    parts = [Evidence.of(solution, draws, replace(span, own=range(a, a + 600))) for a in (0, 600)]
+    for name, one in whole.lagged.items():
+        assert one.compared()["verdict"] == "as expected"
+        both = parts[0].lagged[name] + parts[1].lagged[name]
+        widths = (np.diagonal(each.covariance) for each in (both, one))
+        np.testing.assert_allclose(*widths, rtol=0.25)
+        assert both.degrees == one.degrees == 24 and np.all(one.pairs - both.pairs <= 20)
 
 
 @pytest.mark.parametrize(("times", "wanted"), [(0.6, 1 / 0.6), (1.0, 1.0), (2.0, 1.0)])

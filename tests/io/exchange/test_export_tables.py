@@ -61,7 +61,7 @@ def folder(tmp_path: Path) -> Path:
     write_table(table(), out / "trajectories.csv")
     shake = pd.DataFrame({"frame": [0, 1], "t_s": [0.0, 0.01], "left-1_x_mm": [0.1, -0.2]})
     write_table(shake, out / "shake.csv")
-    said = {"verdict": "PARTIAL", "flags": ["LABEL_AMBIGUOUS"]}
+    said = {"verdict": "PARTIAL", "flags": ["SHAKE_UNMEASURED"]}
     (out / "smoothing.json").write_text(json.dumps(said))
     return out
 
@@ -75,7 +75,7 @@ def named(results: RunResults) -> RunResults:
 
 def test_results_are_read_by_particle_with_frame_and_verdict(folder: Path) -> None:
     results = read_results(folder)
-    assert results.frame == LAB and results.verdict == "PARTIAL (LABEL_AMBIGUOUS)"
+    assert results.frame == LAB and results.verdict == "PARTIAL (SHAKE_UNMEASURED)"
     assert results.points["particle"].drop_duplicates().tolist() == [3, 7, 12]
     expected = table().sort_values(["particle", "frame"]).reset_index(drop=True)
     pd.testing.assert_frame_equal(results.points[expected.columns], expected, check_dtype=False)
@@ -116,7 +116,7 @@ def test_mat_is_what_loadmat_reads(folder: Path, tmp_path: Path) -> None:
             np.testing.assert_array_equal(values, results.points[column].to_numpy())
     assert loadmat(tmp_path / "out.mat")["trajectories"]["x_mm"][0, 0].shape == (56, 1)
     assert read["shake"].left_1_x_mm[1] == -0.2
-    assert read["info"].verdict == "PARTIAL (LABEL_AMBIGUOUS)"
+    assert read["info"].verdict == "PARTIAL (SHAKE_UNMEASURED)"
     matrix = read["cameras"].right.undistorted_matrix
     point = np.array([1.0, 2.0, 3.0])
     np.testing.assert_allclose((matrix @ [*point, 1])[:2], CAMERAS[1].project(point), atol=1e-12)

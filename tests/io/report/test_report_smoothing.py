@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 import pytest
 from report_page import Page
-from smoothed_folder import AXES, changed, read, write_folder
+from smoothed_folder import changed, read, write_folder
 
 from telerig.errors import InputError
 from telerig.io.report.page.figures import drawing
@@ -176,10 +176,10 @@ def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> Non
     changed(folder, flags=["SHAKE_BELOW_NOISE"])
     told = _judged(folder)
     assert told.colour == "good" and "does no harm" in told.sentences[-1]
-    changed(folder, flags=["LABEL_AMBIGUOUS", "ODD_ONE"])
+    changed(folder, flags=["ARMS_UNMEASURED", "ODD_ONE"])
     told = _judged(folder)
     assert told.colour == "usable" and len(told.warnings) == 2
-    assert "do not say whose it is" in told.warnings[0] and "odd one" in told.warnings[1]
+    assert "does not measure how" in told.warnings[0] and "odd one" in told.warnings[1]
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -199,22 +199,6 @@ def test_nothing_judged_and_nothing_optional(folder: Path) -> None:
     captions = _captions(folder)
     assert "nan" not in f"{page.spaced} {captions}".lower().split()
     assert "There is no naive trajectory to compare with" in captions
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_lines_that_could_be_the_others_are_listed(folder: Path) -> None:
-    line = {"owner": "bubble", "frequency_hz": 12.1, "rms_mm": 0.2, "ambiguous": True,
-            "other_owner_costs_nats": 0.42}  # fmt: skip
-    sure = line | {"owner": "rig", "frequency_hz": 31.0, "ambiguous": False,
-                   "other_owner_costs_nats": 14.04}  # fmt: skip
-    free = line | {"other_owner_costs_nats": -1e-6}
-    changed(folder, flags=["LABEL_AMBIGUOUS"],
-          axes=AXES | {"y": AXES["y"] | {"lines": [line, sure]},
-                       "z": AXES["z"] | {"lines": [free]}})  # fmt: skip
-    text = Page(write_track_report(folder)).spaced
-    assert "Is the spectral line the bubble's or the rig's?" in text
-    assert "12.1 y, z 200, 200 0.0 bubble not identifiable" in text
-    assert "31.0 y 200 14.0 rig identified from the data" in text
 
 
 def test_tables_of_another_tracking_are_named(folder: Path) -> None:

@@ -49,8 +49,6 @@ def test_the_conclusion_says_why_a_run_is_not_resolved() -> None:
     left = conclusion("PARTIAL", q=3.1, eta=0.88)
     assert left.startswith("PARTIAL: along y, 12.0 % of the shake's variance is left")
     assert "3.1 times" in left and "5 % or 1.25 times" in left
-    line = {"owner": "rig", "frequency_hz": 11.8, "rms_mm": 0.2, "ambiguous": True}
-    assert "11.8 Hz along y" in conclusion("PARTIAL", flags=(Flag.LABEL_AMBIGUOUS,), lines=(line,))
     assert "one or two bubbles" in conclusion("UNRESOLVED", flags=(Flag.SHAKE_UNMEASURED,))
     one = Contradiction(source="marks", axis="y", from_s=0.4, to_s=1.5, statistic=3.1)
     file = SmoothingFile(verdict=Verdict.CONTRADICTED, axes=axes(), contradictions=(one,))

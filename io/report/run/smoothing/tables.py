@@ -24,7 +24,7 @@ from telerig.io.results.folders.smoothing import (
     taken_away,
 )
 from telerig.io.results.folders.tracking import TrackResults
-from telerig.io.results.smoothing import AttributedLine, Flag, Grade, Mode, Verdict
+from telerig.io.results.smoothing import Flag, Grade, Mode, Verdict
 from telerig.io.results.verdict_words import (
     FLAG_WORDS,
     NOT_JUDGED,
@@ -61,7 +61,6 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
         "figures": smoothing_figures(results),
         "axes": axis_table(results),
         "judged": bool(results.file.axes),
-        "swaps": swap_rows(results),
         "unseen": unseen_words(results),
         "mode_heads": MODE_HEADS,
         "modes": mode_rows(results),
@@ -95,7 +94,6 @@ _HEADS = {
 _IN_UM = {"mm": ("µm", 1e3)}
 
 
-_SURE_LOG_LIKELIHOOD_RATIO = 5.0
 _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 
 
@@ -246,33 +244,6 @@ def _cell(key: str, value: Any) -> str:
 
 def _scaled(value: Any, factor: float = 1.0) -> str:
     return number(value * factor, 3) if is_number(value) else "-"
-
-
-def swap_rows(results: SmoothingResults) -> list[Row]:
-    """Return rows of spectral lines with their owner and how certain it is."""
-    alike: dict[tuple[str, str, str], list[tuple[str, AttributedLine]]] = {}
-    for axis, judged in results.file.axes.items():
-        for line in judged.lines:
-            key = (number(line.frequency_hz), line.owner or ABSENT, _identified_by(line))
-            alike.setdefault(key, []).append((axis, line))
-    return [_swap_row(*key, lines) for key, lines in alike.items()]
-
-
-def _identified_by(line: AttributedLine) -> str:
-    if line.ambiguous:
-        return "not identifiable"
-    sure = (line.other_owner_costs_nats or 0.0) >= _SURE_LOG_LIKELIHOOD_RATIO
-    return "identified from the data" if sure else "identified from the priors of the bubbles"
-
-
-def _swap_row(hz: str, owner: str, identified: str, lines: list[tuple[str, AttributedLine]]) -> Row:
-    """Row of one spectral line with all of its axes and the smallest of their likelihood ratios."""
-    axes = ", ".join(axis for axis, _ in lines)
-    sizes = ", ".join(_scaled(line.rms_mm, 1e3) for _, line in lines)
-    costs = [c for _, line in lines if (c := line.other_owner_costs_nats) is not None]
-    cost = f"{round(min(costs), 1) + 0.0:.1f}" if costs else ABSENT
-    strong = identified == "not identifiable"
-    return Row((hz, axes, sizes, cost, owner, identified), strong=strong)
 
 
 def residual_rows(results: SmoothingResults) -> list[Row]:
@@ -473,10 +444,7 @@ def whiteness_words(results: SmoothingResults) -> str:
     """Return sentences on what too large, small or correlated residuals mean."""
     known = known_parts(results, "whiteness", "expected").values()
     if not known:
-        return (
-            "Not judged: too few frames for it, too many bubbles at once, or sensors far faster "
-            "than the frames."
-        )
+        return "Not judged: too few frames for it."
     ratios = [v["rms_sigmas"] / v["expected_rms_sigmas"] for v in known]
     out = []
     if max(ratios) > _LARGER:

@@ -613,9 +613,10 @@ def _mountings(
 ) -> list[Finding]:  # fmt: skip
     """Return findings about sensors whose axes, place or unit contradict the other measurements.
 
-    The sensor with the clearest contradiction is corrected first, and the others are then compared
-    with it. A correction of axes has to make all measurements together at least as likely as
-    before; if either of two sensors could be corrected, the more likely correction is proposed.
+    The clearest contradiction comes first. Axes that gravity allows are judged by the images of the
+    sensor's own camera, and a correction has to make all measurements together at least as likely
+    as before; where gravity excludes those stated, the encoder and the other sensors, corrected so
+    far, help to choose.
 
     refused : earlier findings. Sensors with a wrong unit are not tested for it again, and axes are
         not tested without gravity.
@@ -634,50 +635,25 @@ def _mountings(
     axes = {s.name: s.axes for s in sensors}
     findings: list[Finding] = []
 
-    def judge() -> dict[str, Mounting]:
-        return {
-            s.name: mounting(
-                s.axes, s.reading_mm_s2.mean(0), problem.up, *read[s.name],
-                _expected(problem, images, s, axes, read),
-            )
-            for s in sensors
-        }  # fmt: skip
+    def judge(sensor: Accelerometer) -> Mounting:
+        expected = _expected(problem, images, sensor, axes, read)
+        at_rest = sensor.reading_mm_s2.mean(0)
+        return mounting(sensor.axes, at_rest, problem.up, *read[sensor.name], expected)
 
-    def log_evidence_with(changed: dict[str, Array]) -> float:
-        changed = axes | changed
-        return log_evidence(_with(problem, [replace(s, axes=changed[s.name]) for s in sensors]))
+    def log_evidence_of(axes: dict[str, Array]) -> float:
+        return log_evidence(_with(problem, [replace(s, axes=axes[s.name]) for s in sensors]))
 
-    while True:
-        judged = judge()
-        leads = {
-            n: m.lead for n, m in judged.items() if m.clear and not np.allclose(axes[n], m.axes)
-        }
-        worst = max(leads, key=lambda n: leads[n], default=None)
-        if worst is None or any(f.fix.get("sensor") == worst for f in findings):
-            break
-        stated, axes[worst] = axes[worst], judged[worst].axes
-        after = judge()
-        axes[worst] = stated
-        rivals = [
-            n for n in judged
-            if n != worst and not after[n].clear and (n in leads or len(sensors) == 2)
-            and not np.allclose(axes[n], judged[n].axes)
-        ]  # fmt: skip
-        if np.isfinite(leads[worst]):
-            likely = {
-                n: log_evidence_with({n: judged[n].axes})
-                for n in [worst, *sorted(rivals, key=lambda n: -judged[n].lead)[:1]]
-            }
-            first, *second = sorted(likely, key=lambda n: -likely[n])
-            if likely[first] < log_evidence_with({}):
-                break
-            if second and likely[first] < likely[second[0]] + CLEAR_LOG_RATIO:
-                if len(problem.t_s) < _LEAST_FRAMES:
-                    break
-                return [*findings, _one_of(first, second[0], judged)]
-            worst = first
-        axes[worst] = judged[worst].axes
-        findings.append(_axes_finding(worst, judged[worst]))
+    judged = {s.name: judge(s) for s in sensors}
+    for sensor in sorted(sensors, key=lambda s: -judged[s.name].lead):
+        found = judge(sensor)
+        if not found.clear:
+            continue
+        corrected = axes | {sensor.name: found.axes}
+        if np.isfinite(found.lead) and log_evidence_of(corrected) < log_evidence_of(axes):
+            continue
+        axes = corrected
+        judged[sensor.name] = found
+        findings.append(_axes_finding(sensor.name, found))
     for name, found in judged.items():
         if found.wrong_gain and name not in measured:
             findings.append(
@@ -701,18 +677,6 @@ def _axes_finding(name: str, found: Mounting) -> Finding:
         f"{_axes_line(name, found)} would fit",
         Code.SENSOR_AXES,
         {"sensor": name, "axes": rows},
-    )
-
-
-def _one_of(first: str, second: str, judged: dict[str, Mounting]) -> Finding:
-    """Return the finding that two sensors contradict each other, and either could be wrong."""
-    return Finding(
-        "they contradict each other: the axes of one of them are wrong, and the measurements do "
-        "not show clearly which",
-        f"accelerometers {first} and {second}",
-        f"check how both are mounted; either {_axes_line(first, judged[first])} or "
-        f"{_axes_line(second, judged[second])} would fit",
-        Code.SENSOR_AXES,
     )
 
 

@@ -1,21 +1,23 @@
 """Dots of a strip that is fixed to the tank: where in the image they may be, and each frame's dots.
 
-The luminance fit of `dots` measures them. Blobs that are not as large, as dark and as well fitted
-as the strip's dots are left out: bubbles, dirt, and dots that a bubble covers or the border cuts.
+They are found like the dots of a target (`dots.locate`). One test, how far a dot's looks are from
+those of the strip's, leaves out everything else: bubbles, dirt, and dots that a bubble covers.
+Before the strip's looks are known, they are what the description of the strip lets expect.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.dots.fit.candidates import is_unlike
-from telerig.estimator.dots.locate import measure_dots
+from telerig.estimator.dots.locate import COLUMNS, measure_dots
 from telerig.statistics import robust_sd
 
 if TYPE_CHECKING:
@@ -26,10 +28,11 @@ Window = tuple[slice, slice]
 BORDER_PX = 1.5
 """Least distance between a dot's blurred edge and the image's border."""
 
-_FIRST_SIZE = (0.7, 1.35)
-_LEAST_SPREAD = (0.03, 0.03, 0.05, 0.15)
+_EXPECTED, _EXPECTED_SD = (0.0, 0.0, -0.5, 0.5), (0.08, 0.15, 0.25, 0.7)
+"""The `_features` of a strip's dots, relative to the stated diameter, before any is seen: round,
+darker by 40 %, with residuals of a real print; and their standard deviations."""
+_LEAST_SPREAD = (0.03, 0.04, 0.05, 0.15)
 """Least standard deviations of the `_features` of a strip's dots from frame to frame."""
-_LEAST_ROUND, _LEAST_CONTRAST = 0.5, 0.2
 _LEAST_FRAMES, _LEAST_SHARE = 3, 0.25
 _SYSTEMATIC_PX = 0.005
 _RING_TAIL, _RING_STEP = 0.1, 0.25
@@ -85,101 +88,109 @@ def learn_look(
     polarity, diameter_px : nominal ones of the dots.
     """
     across = np.array([-travel_px[1], travel_px[0]]) / np.linalg.norm(travel_px)
-    rows, shape, count = [], (0, 0), 0
-    for image in images:
-        found = _round_dots(image, polarity, diameter_px)
-        rows.append(np.column_stack([np.full(len(found), count), found]))
-        shape, count = image.shape, count + 1
-    seen = np.concatenate(rows) if rows else np.zeros((0, 1 + len(_COLUMNS)))
-    groups = _bands(seen, across, diameter_px)
+    expected = DotLook(
+        polarity, diameter_px, ((slice(0, None), slice(0, None)),), diameter_px / 2, 1.0,
+        np.array(_EXPECTED) + [np.log(diameter_px / 2), 0.0, 0.0, 0.0], np.array(_EXPECTED_SD),
+    )  # fmt: skip
+    parts, shape = [pd.DataFrame(columns=[*COLUMNS, "image"], dtype=float)], (0, 0)
+    for count, image in enumerate(images):
+        parts.append(_dots_like(image, expected).assign(image=count))
+        shape = image.shape
+    seen = pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
+    place = seen[["u_px", "v_px"]].to_numpy(float) @ across
+    groups = _bands(place, seen["image"].to_numpy(), diameter_px)
     if not groups:
         return None
-    kept = seen[np.concatenate(groups)]
-    features = _features(kept[:, 1:])
-    windows = tuple(
-        _window(seen[group, 1:3] @ across, across, diameter_px, shape) for group in groups
-    )
+    kept = seen.iloc[np.concatenate(groups)]
+    features = _features(kept)
     usual = np.median(features, axis=0)
-    spread = np.maximum(robust_sd(features - usual, axis=0), _LEAST_SPREAD)
-    a_px, blur_px = np.median(kept[:, [5, 9]], axis=0)
-    return DotLook(polarity, diameter_px, windows, float(a_px), float(blur_px), usual, spread)
-
-
-def _features(dots: Array) -> Array:
-    """Return logs (n, 4) of both semi-axes, of the contrast and of chi2_dof (of 1 where it is less)
-    of dots (n, 11), `_COLUMNS`."""
-    return np.asarray(np.log(np.column_stack([dots[:, 4:7], np.maximum(dots[:, 7], 1.0)])))
+    a_px, blur_px = kept[["a_px", "blur_px"]].median()
+    return replace(
+        expected, a_px=float(a_px), blur_px=float(blur_px), usual=usual,
+        windows=tuple(_window(place[group], across, diameter_px, shape) for group in groups),
+        spread=np.maximum(robust_sd(features - usual, axis=0), _LEAST_SPREAD),
+    )  # fmt: skip
 
 
 def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
     """Return the dots of one frame that look like the strip's and are whole in the image."""
-    parts = [np.zeros((0, len(_COLUMNS)))]
-    for window in look.windows:
-        found = _round_dots(image[window], look.polarity, look.diameter_px)
-        free = [_is_free(image[window], dot, look) for dot in found]
-        found = found[np.array(free, bool)]
-        found[:, :2] += (window[1].start, window[0].start)
-        parts.append(found)
-    dots = np.concatenate(parts)
+    dots = _dots_like(image, look)
+    sigma = np.sqrt((dots["suu_px2"] + dots["svv_px2"]) / 2)
+    uv_px = dots[["u_px", "v_px"]].to_numpy(float)
+    return DotSightings(uv_px, np.hypot(sigma.to_numpy(float), _SYSTEMATIC_PX))
+
+
+def _dots_like(image: NDArray[Any], look: DotLook) -> pd.DataFrame:
+    """Return the dots (`COLUMNS`) of an image that look like these and are whole and free in it."""
+    parts = [pd.DataFrame(columns=COLUMNS, dtype=float)]
+    for k, window in enumerate(look.windows):
+        if min(image[window].shape) < 8:
+            continue
+        dots = measure_dots(
+            image[window], polarity=look.polarity, min_diameter_px=max(look.diameter_px / 2, 3.0),
+            max_diameter_px=1.5 * look.diameter_px + 2.0,
+        ).dots  # fmt: skip
+        dots["u_px"] += window[1].start
+        dots["v_px"] += window[0].start
+        good = np.isfinite(dots.to_numpy(float)).all(1) & _is_whole(dots, image, look)
+        for earlier in look.windows[:k]:  # they may overlap
+            good &= ~_is_whole(dots, image, look, earlier)
+        parts.append(dots[good])
+    dots = pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
     off = (_features(dots) - look.usual) / look.spread
     off[:, 3] = np.maximum(off[:, 3], 0.0)
-    good = ~is_unlike(off)
-    size = np.array(image.shape[::-1]) - 1
-    margin = look.margin_px - 0.5
-    good &= np.all((dots[:, :2] > margin) & (dots[:, :2] < size - margin), axis=1)
-    kept = _single(dots[good], look.diameter_px)
-    sigma = np.sqrt((kept[:, 2] + kept[:, 3]) / 2)
-    return DotSightings(kept[:, :2], np.hypot(sigma, _SYSTEMATIC_PX))
+    alike = dots[~is_unlike(off) & ~dots["ring"].to_numpy(bool)]
+    return alike[np.array([_is_free(image, dot, look) for dot in alike.itertuples()], bool)]
 
 
-_COLUMNS = (
-    *("u_px", "v_px", "suu_px2", "svv_px2", "a_px", "b_px", "contrast", "chi2_dof", "blur_px"),
-    *("inner_level", "outer_level"),
-)
+def _features(dots: pd.DataFrame) -> Array:
+    """Return logs (n, 4) of the mean semi-axis, of the ratio of both, of the contrast and of
+    chi2_dof (of 1 where it is less) of n dots."""
+    a, b, inner, outer, chi2 = dots[
+        ["a_px", "b_px", "inner_level", "outer_level", "chi2_dof"]
+    ].to_numpy(float).T  # fmt: skip
+    contrast = np.abs(outer - inner) / np.maximum(np.maximum(inner, outer), 1e-9)
+    parts = (np.sqrt(a * b), b / a, np.maximum(contrast, 1e-9), np.maximum(chi2, 1.0))
+    return np.asarray(np.log(np.column_stack(parts)))
 
 
-def _is_free(image: NDArray[Any], dot: Array, look: DotLook) -> bool:
+def _is_whole(
+    dots: pd.DataFrame, image: NDArray[Any], look: DotLook, window: Window | None = None
+) -> Bools:
+    """Return (n,) whether each dot is whole in the image, or in a part of it."""
+    uv, margin = dots[["u_px", "v_px"]].to_numpy(float), look.margin_px - 0.5
+    spans = [(0, image.shape[1]), (0, image.shape[0])]
+    if window is not None:
+        spans = [part.indices(n)[:2] for part, (_, n) in zip(window[::-1], spans)]
+    low, high = np.array(spans).T
+    return np.asarray(np.all((uv > low + margin) & (uv < high - 1 - margin), axis=1))
+
+
+def _is_free(image: NDArray[Any], dot: Any, look: DotLook) -> bool:
     """Whether the screen is seen all round a dot: neither a bubble's edge nor its bright middle."""
-    u, v, inner, outer = dot[0], dot[1], dot[9], dot[10]
     first = look.a_px + 3 * look.blur_px
     last = first + max(3.0, 0.8 * look.a_px)
-    low = np.maximum(np.floor(np.array([u, v]) - last).astype(int), 0)
-    high = np.ceil(np.array([u, v]) + last).astype(int) + 1
+    centre = np.array([dot.u_px, dot.v_px])
+    low = np.maximum(np.floor(centre - last).astype(int), 0)
+    high = np.ceil(centre + last).astype(int) + 1
     window = image[low[1] : high[1], low[0] : high[0]]
     rows, columns = np.indices(window.shape)
-    distance = np.hypot(columns + low[0] - u, rows + low[1] - v)
+    distance = np.hypot(columns + low[0] - dot.u_px, rows + low[1] - dot.v_px)
     ring = window[(distance > first) & (distance < last)]
-    off = np.abs(np.quantile(ring, (_RING_TAIL, 1 - _RING_TAIL)) - outer)
-    return bool(ring.size > 0 and off.max() < _RING_STEP * abs(outer - inner))
+    off = np.abs(np.quantile(ring, (_RING_TAIL, 1 - _RING_TAIL)) - dot.outer_level)
+    return bool(ring.size > 0 and off.max() < _RING_STEP * abs(dot.outer_level - dot.inner_level))
 
 
-def _round_dots(image: NDArray[Any], polarity: Polarity, diameter_px: float) -> Array:
-    """Return (n, 11) _COLUMNS of the dots of about the right size."""
-    low, high = (share * diameter_px for share in _FIRST_SIZE)
-    if min(image.shape) < 8:
-        return np.zeros((0, len(_COLUMNS)))
-    dots = measure_dots(
-        image, polarity=polarity, min_diameter_px=max(low, 3.0), max_diameter_px=high + 2.0
-    ).dots
-    inner, outer = (dots[name].to_numpy(float) for name in ("inner_level", "outer_level"))
-    contrast = np.abs(outer - inner) / np.maximum(np.maximum(inner, outer), 1e-9)
-    table = dots.assign(contrast=contrast)[list(_COLUMNS)].to_numpy(float)
-    size = 2 * np.sqrt(table[:, 4] * table[:, 5])
-    good = (size > low) & (size < high) & (table[:, 5] > _LEAST_ROUND * table[:, 4])
-    good &= (contrast > _LEAST_CONTRAST) & ~dots["ring"].to_numpy(bool)
-    return np.asarray(table[good & np.isfinite(table).all(1)])
-
-
-def _bands(seen: Array, across: Array, diameter_px: float) -> list[Ints]:
-    """Return rows of ``seen`` by strip: dots at one distance from the line of travel."""
-    if not len(seen):
+def _bands(place: Array, image: Ints, diameter_px: float) -> list[Ints]:
+    """Return the dots of each strip: those (n,) at one place across the line of travel that
+    enough images show."""
+    if not len(place):
         return []
-    place = seen[:, 1:3] @ across
     order = np.argsort(place)
     cuts = np.flatnonzero(np.diff(place[order]) > 1.5 * diameter_px) + 1
     groups = np.split(order, cuts)
-    frames = [len(set(seen[g, 0])) for g in groups]
-    least = min(_LEAST_FRAMES, int(seen[:, 0].max()) + 1)
+    frames = [len(np.unique(image[group])) for group in groups]
+    least = min(_LEAST_FRAMES, int(image.max()) + 1)
     enough = max(least, _LEAST_SHARE * max(frames))
     counts = [len(g) for g in groups]
     return [g for g, f, n in zip(groups, frames, counts) if f >= enough and n >= 0.2 * max(counts)]
@@ -198,12 +209,3 @@ def _window(place: Array, across: Array, diameter_px: float, shape: Sequence[int
         slice(int(rows[0]), min(int(rows[-1]) + 4, height)),
         slice(int(columns[0]), min(int(columns[-1]) + 4, width)),
     )
-
-
-def _single(dots: Array, diameter_px: float) -> Array:
-    """Return the dots without those that are found twice because windows overlap."""
-    kept: list[Array] = []
-    for dot in dots:
-        if all(np.hypot(*(dot[:2] - other[:2])) > diameter_px / 2 for other in kept):
-            kept.append(dot)
-    return np.array(kept).reshape(-1, len(_COLUMNS))

@@ -1,4 +1,5 @@
-"""Compiled loop: how much of each pixel's blurred footprint an ellipse covers."""
+"""Compiled loops: how much of each pixel's blurred footprint an ellipse covers, and the fit of a
+dot."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from math import ceil, cos, erf, exp, pi, sin, sqrt
 
 import numpy as np
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Ints
 from telerig.compiled import compiled
 
 _FOURTH = -1.0 / 120.0 / 24.0
@@ -15,6 +16,7 @@ _NODE_SPACING_SIGMA = 1.1
 _LEAST_NODES = 24
 _REACH_SIGMA = 7.0
 """Beyond so many standard deviations the point spread is below 1e-10 of its peak."""
+_MIN_SIGMA_PX, _MIN_SEMI_AXIS_PX = 0.3, 0.6
 
 
 @compiled
@@ -85,3 +87,181 @@ def coverages(first: Array, theta: Array, value: Array, gradient: Array) -> None
                 by_sigma += full[1, v, u]
                 value[n, v, u] += inside
                 gradient[n, 5, v, u] += by_sigma
+
+
+@compiled
+def predict(
+    at: Ints, first: Array, radius: float, parameters: Array, value: Array, gradient: Array,
+    grey: Array, jacobian: Array,
+) -> None:  # fmt: skip
+    """Compute the grey levels of the luminance model and their derivatives; see `luminance`.
+
+    at : (P, 2) row and column of each pixel in the window. first : (1, 2) u and v of the window's
+    first pixel, from its middle. parameters : (12,) theta and the levels.
+    value, gradient : (1, V, U), (1, 6, V, U) work space. grey, jacobian : (P,), (12, P), filled.
+    """
+    theta = np.empty((1, 6))
+    for i in range(6):
+        theta[0, i] = parameters[i]
+    value[:] = 0.0
+    gradient[:] = 0.0
+    coverages(first, theta, value, gradient)
+    spread = theta[0, 5] ** 2 / radius
+    for p in range(len(at)):
+        v, u = at[p, 0], at[p, 1]
+        x, y = (first[0, 0] + u) / radius, (first[0, 1] + v) / radius
+        covered = value[0, v, u]
+        contrast = parameters[9] + parameters[10] * x + parameters[11] * y
+        for i in range(6):
+            jacobian[i, p] = gradient[0, i, v, u] * contrast
+        jacobian[6, p], jacobian[7, p], jacobian[8, p] = 1.0, x, y
+        jacobian[9, p] = covered
+        jacobian[10, p] = covered * x - spread * gradient[0, 0, v, u]
+        jacobian[11, p] = covered * y - spread * gradient[0, 1, v, u]
+        grey[p] = 0.0
+        for i in range(6, 12):
+            grey[p] += parameters[i] * jacobian[i, p]
+
+
+@compiled
+def prior_rows(prior: Array, radius: float, parameters: Array, rows: Array, gap: Array) -> float:
+    """Fill in the whitened equations of the priors on two contrast gradients and the edge's blur.
+
+    prior : (6,) the fields of `luminance.Prior`. rows : (3, 12), which must be 0. gap : (3,) prior
+    minus present value. Returns the sum of its squares.
+    """
+    tied, background, contrast = prior[3] > 0.0, parameters[6], parameters[9]
+    weight = 1.0 / (prior[2] * radius * max(abs(contrast), 1e-12))
+    for k in range(2):
+        rows[k, 10 + k] = weight
+        if tied:
+            rows[k, 7 + k] = -contrast / background * weight
+        else:
+            rows[k, 9] = -prior[k] * radius * weight
+    rows[2, 5] = 1.0 / prior[5]
+    total = 0.0
+    for k in range(3):
+        gap[k] = prior[4] / prior[5] if k == 2 else 0.0
+        for i in range(12):
+            gap[k] -= rows[k, i] * parameters[i]
+        total += gap[k] ** 2
+    return total
+
+
+@compiled
+def normal_equations(
+    prior: Array, radius: float, parameters: Array, residual: Array, weight: Array,
+    jacobian: Array, information: Array, pull: Array,
+) -> float:  # fmt: skip
+    """Fill in information (12, 12) and gradient (12,) of a fit, and return its chi-square."""
+    rows, gap, weighted = np.zeros((3, 12)), np.zeros(3), np.empty(len(residual))
+    chi2 = prior_rows(prior, radius, parameters, rows, gap)
+    for p in range(len(residual)):
+        chi2 += weight[p] * residual[p] ** 2
+    for i in range(12):
+        total = 0.0
+        for p in range(len(residual)):
+            weighted[p] = weight[p] * jacobian[i, p]
+            total += weighted[p] * residual[p]
+        for k in range(3):
+            total += rows[k, i] * gap[k]
+        pull[i] = total
+        for j in range(i + 1):
+            total = 0.0
+            for p in range(len(residual)):
+                total += weighted[p] * jacobian[j, p]
+            for k in range(3):
+                total += rows[k, i] * rows[k, j]
+            information[i, j] = information[j, i] = total
+    return chi2
+
+
+@compiled
+def damped_step(information: Array, pull: Array, damping: float, step: Array) -> None:
+    """Solve the normal equations, scaled to a unit diagonal and damped, by Cholesky factors."""
+    root, scale = np.zeros((12, 12)), np.empty(12)
+    for i in range(12):
+        scale[i] = sqrt(max(information[i, i], 1e-300))
+    for i in range(12):
+        for j in range(i + 1):
+            total = information[i, j] / (scale[i] * scale[j])
+            if i == j:
+                total += damping
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            root[i, j] = sqrt(max(total, 1e-14)) if i == j else total / root[j, j]
+    for i in range(12):
+        total = pull[i] / scale[i]
+        for k in range(i):
+            total -= root[i, k] * step[k]
+        step[i] = total / root[i, i]
+    for i in range(11, -1, -1):
+        total = step[i]
+        for k in range(i + 1, 12):
+            total -= root[k, i] * step[k]
+        step[i] = total / root[i, i]
+    for i in range(12):
+        step[i] /= scale[i]
+
+
+@compiled
+def is_admissible(parameters: Array, radius: float) -> bool:
+    """Return whether a fit is near its start; none may run away over the image."""
+    m11, m12, m22, sigma = parameters[2], parameters[3], parameters[4], parameters[5]
+    mean, half = 0.5 * (m11 + m22), sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12)
+    near = max(abs(parameters[0]), abs(parameters[1])) < radius + 2.0
+    size = mean + half < 2.0 * radius + 3.0 and mean - half > _MIN_SEMI_AXIS_PX
+    return near and size and _MIN_SIGMA_PX <= sigma <= 1.5 * (mean + half) + 1.0
+
+
+@compiled
+def descend(
+    at: Ints, first: Array, radius: float, prior: Array, grey: Array, weight: Array,
+    value: Array, gradient: Array, parameters: Array, residual: Array, jacobian: Array,
+    iterations: int, tolerance: float,
+) -> bool:  # fmt: skip
+    """Take Levenberg-Marquardt steps at fixed weights; return whether the fit has converged.
+
+    It has when a step would lower chi-square by less than ``tolerance``, relative to chi-square
+    per pixel above 1; that step is taken without another evaluation. ``parameters``, ``residual``
+    and ``jacobian`` are those of the start, and are replaced by those of the end.
+    """
+    information, pull, step, moved = np.empty((12, 12)), np.empty(12), np.empty(12), np.empty(12)
+    model, slopes = np.empty(len(residual)), np.empty((12, len(residual)))
+    damping, gap = 1e-4, np.zeros(3)
+    for _ in range(iterations):
+        chi2 = normal_equations(
+            prior, radius, parameters, residual, weight, jacobian, information, pull
+        )
+        damped_step(information, pull, damping, step)
+        gain = 0.0
+        for i in range(12):
+            moved[i] = parameters[i] + step[i]
+            gain += step[i] * pull[i]
+        better = False
+        if is_admissible(moved, radius):
+            small = gain < tolerance * max(1.0, chi2 / max(len(residual), 1))
+            if small and damping <= 1e-3:
+                for i in range(12):
+                    parameters[i] = moved[i]
+                    for p in range(len(residual)):
+                        residual[p] -= step[i] * jacobian[i, p]
+                return True
+            predict(at, first, radius, moved, value, gradient, model, slopes)
+            trial = prior_rows(prior, radius, moved, np.zeros((3, 12)), gap)
+            for p in range(len(residual)):
+                trial += weight[p] * (grey[p] - model[p]) ** 2
+            better = trial <= chi2 * (1.0 + 1e-12)
+        if better:
+            for i in range(12):
+                parameters[i] = moved[i]
+                for p in range(len(residual)):
+                    jacobian[i, p] = slopes[i, p]
+            for p in range(len(residual)):
+                residual[p] = grey[p] - model[p]
+            damping = max(damping / 10.0, 1e-9)
+        else:
+            damping = max(damping, 1e-4) * 10.0
+            if damping > 1e8:
+                return False
+    return False

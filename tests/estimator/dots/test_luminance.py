@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from seeds import few_or_many
 
-from telerig.estimator.dots.fit import luminance
 from telerig.estimator.dots.fit.blurred_ellipse import coverage_on_grid, shape_from_axes
 from telerig.estimator.dots.fit.candidates import Candidate, Look, reason_against_fit
+from telerig.estimator.dots.fit.kernels import damped_step, predict
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Reason, Start, Window, fit_dots
 from telerig.estimator.images.noise import (
     NoiseModel,
@@ -93,44 +93,29 @@ def test_spread_equals_prediction_and_the_bound(radius: float, draws: int) -> No
 
 
 def test_jacobian_of_the_model() -> None:
-    shape = shape_from_axes(5.0, 3.0, 0.4)
-    window = Window(picture(shape), 0, 0, np.ones((SIZE, SIZE), dtype=bool))
-    problem = luminance.gather([window], [Start(CENTRE, shape, 1.0)], noise_of(1.0), [HELD])
-    parameters = np.array([0.2, -0.1, *shape, 0.9, 40.0, 3.0, -2.0, 150.0, 0.5, -0.4])
+    parameters = np.array([0.2, -0.1, *shape_from_axes(5, 3, 0.4), 0.9, 40.0, 3, -2, 150, 0.5, -0.4])
+    at, first = np.argwhere(np.ones((SIZE, SIZE), bool)), np.array([[-17.0, -17.0]])
+    value, gradient = np.empty((1, SIZE, SIZE)), np.empty((1, 6, SIZE, SIZE))
 
-    def model(values: Array) -> tuple[Array, Array, Array]:
-        return luminance.grey_levels(problem, values[None, :6], values[None, 6:])
+    def model(values: Array) -> tuple[Array, Array]:
+        grey, jacobian = np.empty(len(at)), np.empty((12, len(at)))
+        predict(at, first, 5.0, values, value, gradient, grey, jacobian)
+        return grey, jacobian
 
-    jacobian = model(parameters)[1][0]
+    jacobian = model(parameters)[1]
     for i in range(12):
         step = 1e-5 * np.eye(12)[i]
-        high, low = parameters + step, parameters - step
-        quotient = (model(high)[0][0] - model(low)[0][0]) / 2e-5
+        quotient = (model(parameters + step)[0] - model(parameters - step)[0]) / 2e-5
         np.testing.assert_allclose(jacobian[i], quotient, atol=0.1)
 
 
-def test_dots_fitted_together_are_those_fitted_alone() -> None:
-    """Large and small, round and so bent that the edge's expansion would not do, one dirty.
-
-    The most curved dot sets the number of nodes of the exact sum for all dots beside it.
-    """
-    rng = np.random.default_rng(3)
-    shapes = [shape_from_axes(a, b, 0.4) for a, b in ((9, 8), (4, 2.5), (11, 5), (3, 3), (12, 11))]
-    windows = []
-    for shape in shapes:
-        grey = picture(shape) + 2.0 * rng.standard_normal((SIZE, SIZE))
-        windows.append(Window(grey, 0, 0, rng.uniform(size=grey.shape) < 0.8))
-    windows[0].grey[14:18, 22:26] -= 60.0
-    starts = [Start(CENTRE + rng.uniform(-0.4, 0.4, 2), shape * 1.06, 1.2) for shape in shapes]
-    priors = [Prior(), HELD, Prior(tie_to_background=True), Prior(edge_px=0.85), HELD]
-    together = fit_dots(windows, starts, noise_of(2.0), priors)
-    for i, ours in enumerate(together):
-        (alone,) = fit_dots(windows[i : i + 1], starts[i : i + 1], noise_of(2.0), priors[i : i + 1])
-        for name in ("centre_px", "shape_px", "levels", "covariance_px2", "chi2_dof"):
-            np.testing.assert_allclose(
-                getattr(ours, name), getattr(alone, name), rtol=1e-6, atol=1e-6
-            )
-        assert (ours.pixels, ours.dropped, ours.converged) == (alone.pixels, alone.dropped, True)
+def test_damped_steps_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(0)
+    rows, step = rng.standard_normal((30, 12)) * 10.0 ** rng.uniform(-3, 3, 12), np.empty(12)
+    information, pull = rows.T @ rows, rng.standard_normal(12)
+    damped_step(information, pull, 0.3, step)
+    scaled = information + 0.3 * np.diag(np.diag(information))
+    np.testing.assert_allclose(step, np.linalg.solve(scaled, pull), rtol=1e-8)
 
 
 @pytest.mark.parametrize("pixels", [0, 1, 3])

@@ -7,7 +7,7 @@ it as a prior for each dot's own contrast gradient, and take the neighbours' blu
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -30,7 +30,7 @@ from telerig.estimator.dots.fit.candidates import (
     reason_against_blob,
     reason_against_fit,
 )
-from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dots
+from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dot
 from telerig.estimator.dots.fit.surroundings import (
     close_neighbours,
     contrast_gradients,
@@ -225,13 +225,12 @@ class _Scene:
     def _coarse_fits(
         self, blobs: Sequence[Candidate], noise: NoiseModel, sigma_px: float
     ) -> list[DotFit]:
-        starts = [Start(blob.centre_px, blob.shape_px, sigma_px) for blob in blobs]
-        windows = [
-            dot_window(self.grey, self.labels, blob, start, coarse=True)
-            for blob, start in zip(blobs, starts)
-        ]
-        priors = [Prior()] * len(blobs)
-        return fit_dots(windows, starts, noise, priors, tolerance=0.3, outlier_rounds=1)
+        fits = []
+        for blob in blobs:
+            start = Start(blob.centre_px, blob.shape_px, sigma_px)
+            window = dot_window(self.grey, self.labels, blob, start, coarse=True)
+            fits.append(fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1))
+        return fits
 
     def second_fits(self, fits: list[DotFit], noise: NoiseModel) -> list[DotFit]:
         """Fit each dot again, with the illumination and its neighbours known from the first fits.
@@ -245,19 +244,14 @@ class _Scene:
         again: Sequence[int] = range(len(fits))
         for _ in range(_ROUNDS):
             moved: set[int] = set()
-            for group in _apart(again, neighbours):
-                windows = {i: self._window(i, fits, neighbours[i]) for i in group}
-                chosen = [i for i in group if np.count_nonzero(windows[i].mask) >= _FEWEST_PIXELS]
-                found = fit_dots(
-                    [windows[i] for i in chosen],
-                    [_start(fits[i]) for i in chosen],
-                    noise,
-                    [priors[i] for i in chosen],
-                )
-                for i, fit in zip(chosen, found):
-                    if neighbours[i] and _has_moved(fits[i], fit):
-                        moved |= {i, *neighbours[i]}
-                    fits[i] = fit
+            for i in again:
+                window = self._window(i, fits, neighbours[i])
+                if np.count_nonzero(window.mask) < _FEWEST_PIXELS:
+                    continue
+                fit = fit_dot(window, _start(fits[i]), noise, priors[i])
+                if neighbours[i] and _has_moved(fits[i], fit):
+                    moved |= {i, *neighbours[i]}
+                fits[i] = fit
             again = sorted(moved)
             if not again:
                 break
@@ -269,20 +263,6 @@ class _Scene:
         known = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
         window = dot_window(self.grey, self.labels, blobs[dot], _start(fits[dot]), known=known)
         return without_neighbours(window, [fits[k] for k in near])
-
-
-def _apart(dots: Sequence[int], neighbours: list[list[int]]) -> Iterator[list[int]]:
-    """Yield groups of dots; the dots of a group share no pixels, so they can be fitted together."""
-    left = list(dots)
-    while left:
-        group: list[int] = []
-        near: set[int] = set()
-        for i in left:
-            if i not in near:
-                group.append(i)
-                near.update(neighbours[i])
-        yield group
-        left = sorted(set(left) - set(group))
 
 
 def _start(fit: DotFit) -> Start:

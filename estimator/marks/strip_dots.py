@@ -140,7 +140,9 @@ def _dots_like(image: NDArray[Any], look: DotLook) -> pd.DataFrame:
     off = (_features(dots) - look.usual) / look.spread
     off[:, 3] = np.maximum(off[:, 3], 0.0)
     alike = dots[~is_unlike(off) & ~dots["ring"].to_numpy(bool)]
-    return alike[np.array([_is_free(image, dot, look) for dot in alike.itertuples()], bool)]
+    free = [_is_free(image, dot, look) for dot in alike.itertuples()]
+    found: pd.DataFrame = alike.loc[np.array(free, bool)]
+    return found
 
 
 def _features(dots: pd.DataFrame) -> Array:

@@ -211,7 +211,7 @@ def is_admissible(parameters: Array, radius: float) -> bool:
     mean, half = 0.5 * (m11 + m22), sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12)
     near = max(abs(parameters[0]), abs(parameters[1])) < radius + 2.0
     size = mean + half < 2.0 * radius + 3.0 and mean - half > _MIN_SEMI_AXIS_PX
-    return near and size and _MIN_SIGMA_PX <= sigma <= 1.5 * (mean + half) + 1.0
+    return bool(near and size and _MIN_SIGMA_PX <= sigma <= 1.5 * (mean + half) + 1.0)
 
 
 @compiled

@@ -14,7 +14,6 @@ its derivatives with respect to theta are neglected. The loops over pixels are i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from enum import StrEnum
 
@@ -262,7 +261,8 @@ class _Fit:
         whitened = np.abs(self.residual) / np.sqrt(variance)
         places = [len(whitened) // 2, int(0.95 * (len(whitened) - 1))]
         middle, high = np.partition(whitened, places)[places]
-        return whitened > _OUTLIER_SIGMA * max(1.0, NORMAL_FROM_MEDIAN * middle, 0.51 * high)
+        limit = _OUTLIER_SIGMA * max(1.0, NORMAL_FROM_MEDIAN * middle, 0.51 * high)
+        return np.asarray(whitened > limit)
 
     def result(self, converged: bool) -> DotFit:
         """Return the fit with its covariance."""
@@ -275,7 +275,7 @@ class _Fit:
         distance = approximate_distance_px(theta[2:5], self.x - theta[0], self.y - theta[1])
         edge = squared[(np.abs(distance) < 2.0 * theta[5]) & used]
         inside = used & (self.jacobian[9] > _INSIDE)
-        count = np.count_nonzero(used)
+        count = int(np.count_nonzero(used))
         chi2 = float(np.sum((self.weight * squared)[used]))
         contrast = max(abs(self.parameters[9]), 1e-12)
         return DotFit(
@@ -307,24 +307,24 @@ def _inverse(information: Array) -> Array:
     return np.asarray(inverse / both)
 
 
-def fit_dots(
-    windows: Sequence[Window],
-    starts: Sequence[Start],
+def fit_dot(
+    window: Window,
+    start: Start,
     noise: NoiseModel,
-    priors: Sequence[Prior],
+    prior: Prior,
     *,
     iterations: int = 25,
     tolerance: float = 0.02,
     outlier_rounds: int = 3,
-) -> list[DotFit]:
-    """Fit the luminance model of each dot to the pixels of its window.
+) -> DotFit:
+    """Fit the luminance model of a dot to the pixels of its window.
 
-    windows, starts, priors : one for each dot. Pixels whose residual exceeds 5 standard deviations
-        are left out, if they are few; the standard deviation is enlarged if the fit as a whole is
-        worse than the noise.
+    Pixels whose residual exceeds 5 standard deviations are left out, if they are few; the standard
+    deviation is enlarged if the fit as a whole is worse than the noise.
+
     iterations : largest number of steps.
-    tolerance : a fit has converged if one more step would lower chi-square by less than this.
+    tolerance : the fit has converged if one more step would lower chi-square by less than this.
     outlier_rounds : how many times outliers are searched.
     """
-    fits = [_Fit(*one[:2], noise, one[2]) for one in zip(windows, starts, priors)]
-    return [fit.result(fit.minimise(iterations, tolerance, outlier_rounds)) for fit in fits]
+    fit = _Fit(window, start, noise, prior)
+    return fit.result(fit.minimise(iterations, tolerance, outlier_rounds))

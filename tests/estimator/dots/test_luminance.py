@@ -14,7 +14,7 @@ from seeds import few_or_many
 from telerig.estimator.dots.fit.blurred_ellipse import coverage_on_grid, shape_from_axes
 from telerig.estimator.dots.fit.candidates import Candidate, Look, reason_against_fit
 from telerig.estimator.dots.fit.kernels import damped_step, predict
-from telerig.estimator.dots.fit.luminance import DotFit, Prior, Reason, Start, Window, fit_dots
+from telerig.estimator.dots.fit.luminance import DotFit, Prior, Reason, Start, Window, fit_dot
 from telerig.estimator.images.noise import (
     NoiseModel,
     agreed_factor,
@@ -59,7 +59,7 @@ def lit_picture(radius: float, slope_per_px: float) -> Array:
 def fit(grey: Array, shape: Array, sigma: float, prior: Prior = HELD) -> DotFit:
     window = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
     start = Start(CENTRE + (0.4, -0.3), shape * 1.06, 1.2)
-    return fit_dots([window], [start], noise_of(sigma), [prior])[0]
+    return fit_dot(window, start, noise_of(sigma), prior)
 
 
 @pytest.mark.parametrize("axes", [(4.0, 4.0), (4.0, 1.7), (10.0, 10.0), (10.0, 4.2), (13.0, 12.0)])
@@ -93,7 +93,8 @@ def test_spread_equals_prediction_and_the_bound(radius: float, draws: int) -> No
 
 
 def test_jacobian_of_the_model() -> None:
-    parameters = np.array([0.2, -0.1, *shape_from_axes(5, 3, 0.4), 0.9, 40.0, 3, -2, 150, 0.5, -0.4])
+    shape = shape_from_axes(5.0, 3.0, 0.4)
+    parameters = np.array([0.2, -0.1, *shape, 0.9, 40.0, 3.0, -2.0, 150.0, 0.5, -0.4])
     at, first = np.argwhere(np.ones((SIZE, SIZE), bool)), np.array([[-17.0, -17.0]])
     value, gradient = np.empty((1, SIZE, SIZE)), np.empty((1, 6, SIZE, SIZE))
 
@@ -126,7 +127,7 @@ def test_a_dot_that_shows_hardly_a_pixel_does_not_disturb_the_others(pixels: int
     hidden.mask.flat[pixels:] = False
     whole = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
     start = Start(CENTRE + (0.4, -0.3), shape * 1.06, 1.2)
-    none, one = fit_dots([hidden, whole], [start, start], noise_of(2.0), [HELD, HELD])
+    none, one = (fit_dot(window, start, noise_of(2.0), HELD) for window in (hidden, whole))
     assert not none.converged and none.pixels == pixels
     blob = Candidate(1, CENTRE, shape, 94.0, (), None)
     assert reason_against_fit(blob, none, grey.shape, "white_on_black", LOOK) == Reason.HIDDEN
@@ -138,7 +139,7 @@ def test_a_fit_that_left_its_blob_is_no_dot(change: dict[str, Any]) -> None:
     shape = shape_from_axes(6, 5, 0.3)
     grey = picture(shape)
     whole = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
-    (fit,) = fit_dots([whole], [Start(CENTRE, shape, 1.2)], noise_of(2.0), [HELD])
+    fit = fit_dot(whole, Start(CENTRE, shape, 1.2), noise_of(2.0), HELD)
     blob = Candidate(1, CENTRE, shape, 94.0, (), None)
     rest = (grey.shape, "white_on_black", LOOK)
     assert reason_against_fit(blob, fit, *rest) is None

@@ -1,7 +1,7 @@
 """Tests how sensors are mounted and in which unit they and the encoder read.
 
-The regression is that of the clocks (see ``alignment``). The coefficients that follow from the
-stated mounting and unit are compared with those of all other mountings.
+The regression is that of the clocks (see ``alignment``). Every mounting, the stated one or another,
+is a hypothesis about its coefficients; axes and exchanged records are compared by likelihood.
 """
 
 from __future__ import annotations
@@ -101,102 +101,84 @@ def mounting(
     candidates = turned[upright]
     stated = np.flatnonzero(np.abs(candidates - axes).max((1, 2)) < 1e-9)
     judging = [f for f in expected if f.whole or not len(stated)]
-    parts = [p for f in judging if (p := _Part.of(f, x, known)) is not None]
-    if not parts:
+    fits = [(f, r) for f in judging if (r := Regression.of(f.values, f.known & known, x))]
+    if not fits:
         found = axes if len(stated) else candidates[0]
         return Mounting(found, not len(stated), 0.0, float("nan"), float("inf"))
-    score = _scores(candidates, parts, 0)
+
+    def scores(axes: Array, shift: int = 0) -> Array:
+        each = [r.log_ratios(axes @ f.direction, shift) for f, r in fits]
+        return np.asarray(np.sum(each, axis=0))
+
+    score = scores(candidates)
     changes = np.abs(candidates - axes).sum((1, 2))
     best = int(np.lexsort((changes, -score))[0])
-    gain, gain_sd = _gain(candidates[best], parts)
+    gain, gain_sd = _gain(candidates[best], [(f, r) for f, r in fits if f.whole])
     if not len(stated):
         return Mounting(candidates[best], True, float("inf"), gain, gain_sd)
     own = int(stated[0])
-    length = len(parts[0].x)
-    shifts = np.linspace(0.1, 0.9, _SHIFTS) * length
+    shifts = np.linspace(0.1, 0.9, _SHIFTS) * len(fits[0][1].x)
     both = candidates[[best, own]]
-    chance = [float(np.ptp(_scores(both, parts, int(s)))) for s in shifts]
+    chance = [float(np.ptp(scores(both, int(s)))) for s in shifts]
     lead = float(score[best] - score[own])
     clear = best != own and lead > max(CLEAR_LOG_RATIO, _CHANCE * max(chance))
     return Mounting(candidates[best], bool(clear), lead, gain, gain_sd)
 
 
 @dataclass(frozen=True)
-class _Part:
-    direction: Array
+class Regression:
+    """Hold a measured acceleration and what explains it, both made white, without means.
+
+    y, x : (n,), (n, k) of n samples.
+    size : effective number of independent samples.
+    """
+
     y: Array
     x: Array
     size: float
-    whole: bool
 
     @classmethod
-    def of(cls, expected: Expected, x: Array, known: Bools) -> _Part | None:
-        both = expected.known & known
-        if np.count_nonzero(both) < _LEAST_SAMPLES:
+    def of(cls, values: Array, known: Bools, x: Array) -> Regression | None:
+        """Return the regression of values (N,) on x (N, k) by generalised least squares; None if
+        too few of them are known (N,)."""
+        if np.count_nonzero(known) < _LEAST_SAMPLES:
             return None
-        y, x = expected.values - expected.values[both].mean(), x - x[both].mean(0)
-        rest = y[both] - x[both] @ np.linalg.lstsq(x[both], y[both], rcond=None)[0]
-        whole, used = filtered(np.column_stack([y, x]), both, whitening_filter(rest))
+        y, x = values - values[known].mean(), x - x[known].mean(0)
+        rest = y[known] - x[known] @ np.linalg.lstsq(x[known], y[known], rcond=None)[0]
+        whole, used = filtered(np.column_stack([y, x]), known, whitening_filter(rest))
         if np.count_nonzero(used) < _LEAST_SAMPLES:
             return None
         y, x = whole[used, 0], whole[used, 1:]
         fit = x @ np.linalg.lstsq(x, y, rcond=None)[0]
-        return cls(expected.direction, y, x, effective_size(y - fit, fit), expected.whole)
+        return cls(y, x, effective_size(y - fit, fit))
+
+    def log_ratios(self, hypotheses: Array, shift: int = 0) -> Array:
+        """Return the log-likelihood ratio (h,) of each hypothesis to none.
+
+        hypotheses : (h, k) the measured acceleration is a multiple, not negative, of x times them.
+        shift : by so many samples x is shifted.
+        """
+        predicted = hypotheses @ np.roll(self.x, shift, axis=0).T
+        gain = np.clip((predicted @ self.y) / np.maximum((predicted**2).sum(1), 1e-12), 0.0, None)
+        rest = ((self.y - gain[:, None] * predicted) ** 2).sum(1)
+        total = max(float(self.y @ self.y), 1e-12)
+        return np.asarray(-0.5 * self.size * np.log(np.maximum(rest, 1e-12) / total))
 
 
-def _scores(candidates: Array, parts: Sequence[_Part], shift: int) -> Array:
-    """Return each candidate's log-likelihood ratio (p,) with its best gain, readings shifted."""
-    total = np.zeros(len(candidates))
-    for p in parts:
-        x = np.roll(p.x, shift, axis=0)
-        force = np.einsum("pij,j->pi", candidates, p.direction) @ x.T
-        gain = np.clip((force @ p.y) / np.maximum((force**2).sum(1), 1e-12), 0.0, None)
-        rest = ((p.y - gain[:, None] * force) ** 2).sum(1)
-        total -= 0.5 * p.size * np.log(np.maximum(rest, 1e-12) / max(float(p.y @ p.y), 1e-12))
-    return total
-
-
-def _gain(axes: Array, parts: Sequence[_Part]) -> tuple[float, float]:
-    """Return reading over true acceleration and its sd, over the parts that are whole."""
+def _gain(axes: Array, fits: Sequence[tuple[Expected, Regression]]) -> tuple[float, float]:
+    """Return reading over true acceleration, and its sd."""
     weight = total = 0.0
-    for p in (p for p in parts if p.whole):
-        force = p.x @ (axes @ p.direction)
+    for expected, fit in fits:
+        force = fit.x @ (axes @ expected.direction)
         square = float(force @ force)
         if square <= 0:
             continue
-        ratio = float(force @ p.y) / square
-        variance = float(((p.y - ratio * force) ** 2).mean()) / square * len(p.y) / p.size
+        ratio = float(force @ fit.y) / square
+        spread = float(((fit.y - ratio * force) ** 2).mean()) / square
+        variance = spread * len(fit.y) / fit.size
         weight += 1 / max(variance, 1e-12)
         total += ratio / max(variance, 1e-12)
     if not weight or not total > 0:
         return float("nan"), float("inf")
     inverse, sd = total / weight, float(weight**-0.5)
     return 1 / inverse, sd / inverse**2
-
-
-def preference(y: Array, known: Bools, stated: Array, other: Array) -> float:
-    """Return by how much the log-likelihood of a measurement rises if it is of another motion.
-
-    The measurement is fitted by generalised least squares as a multiple, not negative, of the
-    prediction for the stated motion and of that for the other one. 0 if there are too few samples.
-
-    y : (n,) samples of the measurement.
-    known : (n,) which samples to use.
-    stated, other : (n,) predictions of the samples from the stated and from the other motion.
-    """
-    if np.count_nonzero(known) < _LEAST_SAMPLES:
-        return 0.0
-    both = np.column_stack([y, stated, other])
-    both = both - both[known].mean(0)
-    x = both[known, 1:]
-    rest = both[known, 0] - x @ np.linalg.lstsq(x, both[known, 0], rcond=None)[0]
-    whole, used = filtered(both, known, whitening_filter(rest))
-    if np.count_nonzero(used) < _LEAST_SAMPLES:
-        return 0.0
-    target, squares = whole[used, 0], []
-    for x in whole[used, 1:].T:
-        gain = max(float(x @ target) / max(float(x @ x), 1e-12), 0.0)
-        left = target - gain * x
-        squares.append((max(float(left @ left), 1e-12), effective_size(left, x)))
-    size = min(size for _, size in squares)
-    return 0.5 * size * float(np.log(squares[0][0] / squares[1][0]))

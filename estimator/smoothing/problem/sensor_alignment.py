@@ -29,8 +29,8 @@ from telerig.estimator.sensors.mounting import (
     CLEAR_LOG_RATIO,
     Expected,
     Mounting,
+    Regression,
     mounting,
-    preference,
 )
 from telerig.estimator.sensors.response import CommonGain, Response
 from telerig.estimator.smoothing.problem.problem import (
@@ -746,24 +746,27 @@ def _lead_of_exchange(
 ) -> float:
     """Return the log-likelihood ratio of exchanged to stated records of two cameras' sensors."""
     known = read[one.name][1] & read[two.name][1]
-    force = {s.camera: read[s.name][0] @ s.axes for s in (one, two)}
-    exchanged = {s.camera: read[o.name][0] @ s.axes for s, o in ((one, two), (two, one))}
-    lead = 0.0
-    for c, _, seen in images.cameras:
-        if c in force:
-            for k, d in enumerate(directions(problem.cameras[c])):
-                predicted = force[c] @ d, exchanged[c] @ d
-                lead += preference(seen.values[:, k], seen.known & known, *predicted)
+    readings = np.concatenate([read[one.name][0], read[two.name][0]], 1)
+    axes = {one.camera: one.axes, two.camera: two.axes}
+    seen = [
+        (values.values[:, k], values.known, {c: d})
+        for c, _, values in images.cameras
+        if c in axes
+        for k, d in enumerate(directions(problem.cameras[c]))
+    ]
     for source in ("marks", "bubbles"):
-        for _, values, there, cameras in images.differences(problem, source):
-            if set(cameras) == set(force):
-                weights = np.split(shared_rows(problem, *cameras), 2)
-                rows = [w @ directions(problem.cameras[c]) for c, w in zip(cameras, weights)]
-                stated, other = (
-                    np.sum([f[c] @ r for c, r in zip(cameras, rows)], axis=0)
-                    for f in (force, exchanged)
-                )
-                lead += preference(values, there & known, stated, other)
+        for _, differences, there, pair in images.differences(problem, source):
+            if set(pair) == set(axes):
+                weights = np.split(shared_rows(problem, *pair), 2)
+                rows = (w @ directions(problem.cameras[c]) for c, w in zip(pair, weights))
+                seen.append((differences, there, dict(zip(pair, rows))))
+    lead = 0.0
+    for values, there, along in seen:
+        fit = Regression.of(values, there & known, readings)
+        if fit is not None:
+            mounts = [axes[c] @ along.get(c, np.zeros(3)) for c in (one.camera, two.camera)]
+            hypotheses = np.array([np.concatenate(mounts), np.concatenate(mounts[::-1])])
+            lead += float(np.diff(fit.log_ratios(hypotheses))[0])
     return lead
 
 

@@ -95,7 +95,7 @@ STUDIES = (
     ),
     Study("shake_faults"),
     Study("plan"),
-    Study("sensor_faults", "faults"),
+    Study("sensor_faults", "faults --scenarios S1 --configurations one,marks --clocks unknown"),
     Study("sound_runs", "--out {work}/sound_runs.jsonl", writes=False),
     Study("before_a_run", "--out {work}/before_a_run", writes=False),
     Study("smoothing_speed"),

@@ -47,6 +47,9 @@ _FEW, _MORE, _SHORT_S = 3, 8, 0.2
 _LEFT = 1e-4
 """Squared distance, in posterior standard deviations summed over all states, at which the
 conjugate gradients end."""
+_ROUNDING = 1e-16
+"""The same over that of the start, below which the residual's own rounding is what is left: the
+refinements start again from a residual that is worked out anew."""
 _MOST_STEPS = 60
 _MOST_REFINEMENTS = 8
 _AT_ONCE = 8192
@@ -140,8 +143,9 @@ class EliminatedCrowd:
         found, rest = np.zeros_like(side), side.copy()
         way = ahead = self._preconditioned(rest)
         height = (rest * ahead).sum(0)
+        enough = np.maximum(_LEFT, _ROUNDING * height)
         for step in range(_MOST_STEPS):
-            if height.max(initial=0.0) < _LEFT:
+            if (height < enough).all():
                 return found, step
             image = self._schur(way)
             length = height / np.where(height > 0, (way * image).sum(0), 1.0)

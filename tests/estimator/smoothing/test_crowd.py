@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,3 +134,23 @@ def test_draws_of_a_crowds_errors_have_the_spread_that_it_states() -> None:
     assert 0.7 < np.sqrt(np.mean((each / _sigma(found, rows)) ** 2)) < 1.3
     np.testing.assert_allclose(anew.errors, draws.errors, atol=1e-4 * np.abs(draws.errors).max())
     np.testing.assert_allclose(anew.pixels, draws.pixels, atol=0.02)
+
+
+def test_a_start_far_from_the_solution_takes_no_more_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of eight bubbles began 3e12 standard deviations away, and ended with an error."""
+    problem, *_ = run(np.random.default_rng(6), bubbles=12, seconds=0.3)
+    made = []
+    true = crowd.eliminate_crowd
+
+    def kept(*given: Any, **named: Any) -> crowd.EliminatedCrowd:
+        made.append(true(*given, **named))
+        return made[-1]
+
+    monkeypatch.setattr(crowd, "eliminate_crowd", kept)
+    cut = with_comings_and_goings(problem, np.random.default_rng(7), 40)
+    graph = solve(cut, true_model(), Options(covariances=False)).graph
+    size = sum(n * d for n, d in graph.counts())
+    side = np.random.default_rng(8).standard_normal((size, 1))
+    near, (far, steps) = made[-1].solved(side), made[-1].solved_in_steps(1e14 * side)
+    assert steps < 10
+    np.testing.assert_allclose(far / 1e14, near, atol=1e-4 * np.abs(near).max())

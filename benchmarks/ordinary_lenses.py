@@ -37,6 +37,8 @@ from telerig.rig.lens_parameters import INDEX
 from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
+LEAST_DOTS = 6
+"""OpenCV gets only views with so many dots that both cameras see."""
 STUDIES = {
     "plain": "Axes at 20 to 70 degrees",
     "parallel": "Nearly parallel axes",
@@ -189,6 +191,8 @@ def opencv_centres(rig: Rig, dots: pd.DataFrame) -> Array:
     for view in dots["view"].unique():
         left, right = (table.loc[view] for table in tables)
         both = left.index.intersection(right.index)
+        if len(both) < LEAST_DOTS:
+            continue
         points.append(np.array([place[dot] for dot in both], np.float32))
         for out, table in zip(seen, (left, right)):
             out.append(table.loc[both, ["u_px", "v_px"]].to_numpy(np.float32))

@@ -185,7 +185,8 @@ class Gaussian:
             rest = np.setdiff1d(np.arange(count), stay)
             away, blocks = self.of_blocks[rest], self.blocks[rest]
         else:
-            first, stay, away = self.rig, np.arange(count), views
+            first, stay = self.rig or 6, np.arange(count)  # something is kept
+            away = views = np.arange(first, size).reshape(-1, 6)
             blocks = self.common[views[:, :, None], views[:, None]]
         kept = np.concatenate([np.arange(first), self.of_blocks[stay].ravel()])
         coupling = np.zeros((len(kept), *away.shape[::-1]))
@@ -197,7 +198,7 @@ class Gaussian:
             coupling[first:] = of_views.transpose(3, 2, 1, 0).reshape(-1, *away.shape[::-1])
         matrix = np.zeros((len(kept),) * 2)
         matrix[:first, :first] = self.common[:first, :first]
-        across = self.cross[:first][..., stay].swapaxes(1, 2).reshape(first, -1)
+        across = self.cross[:first][..., stay].swapaxes(1, 2).reshape(first, n * len(stay))
         matrix[:first, first:], matrix[first:, :first] = across, across.T
         own = first + np.arange(n * len(stay)).reshape(-1, n)
         matrix[own[:, :, None], own[:, None]] = self.blocks[stay]

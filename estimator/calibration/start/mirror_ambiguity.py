@@ -22,7 +22,7 @@ from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
-from telerig.estimator.calibration.solver.system import System, images_of, retracted
+from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.known_target import angle_between, mirrored
 from telerig.estimator.calibration.thresholds import STRONG_PERSPECTIVE, TIE_DEG
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
@@ -361,19 +361,11 @@ def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
     All other parameters stay as they are. steps : largest number of Gauss-Newton steps.
     """
     system = System(problem)
+    views = np.arange(system.views_at, system.dots_at)
+    others, step = np.delete(np.arange(system.size), views), np.zeros(system.size)
     for _ in range(steps):
-        normal = np.zeros((len(problem.views), 6, 6))
-        right = np.zeros((len(problem.views), 6))
-        for c, obs in enumerate(system.images):
-            columns = system.columns(state, c)[-7:]
-            for v, a, b in images_of(obs):
-                flat = columns[..., a:b].reshape(7, -1)
-                normal[v] += flat[:-1] @ flat[:-1].T
-                right[v] -= flat[:-1] @ flat[-1]
-        # a view that only one telecentric camera sees has an undetermined depth
-        normal += (1e-9 + 1e-9 * np.trace(normal, axis1=-2, axis2=-1))[:, None, None] * np.eye(6)
-        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
-        state = replace(state, rig_from_target=retracted(state.rig_from_target, step))
+        step[views], _ = system.gaussian(state).hold(others).step()
+        state = system.moved(state, step)
         if np.abs(step).max() < 1e-10:
             break
     return state

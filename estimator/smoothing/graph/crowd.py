@@ -27,6 +27,7 @@ from telerig.estimator.smoothing.graph.elimination import (
     EliminatedGraph,
     eliminate,
     starts_of,
+    units,
 )
 from telerig.estimator.smoothing.graph.layout import (
     Families,
@@ -129,23 +130,31 @@ class EliminatedCrowd:
         """Return the solutions (D, N) of the normal equations for right sides (D, N)."""
         return self.solved_in_steps(side)[0]
 
-    def solved_in_steps(self, side: Array) -> tuple[Array, int]:
-        """Return what `solved` returns, and the number of conjugate-gradient steps."""
+    def columns(self, at: Ints) -> Array:
+        """Return columns (D, n) of the covariance at variables of the rig; each as good as the
+        variance on its diagonal, which may be far smaller than `_LEFT`."""
+        return self.solved_in_steps(units(at, _size(self.graph)), relative=True)[0]
+
+    def solved_in_steps(self, side: Array, *, relative: bool = False) -> tuple[Array, int]:
+        """Return what `solved` returns, and the number of conjugate-gradient steps.
+
+        relative : whether `_LEFT` is a share of the squared length that each solution has.
+        """
         rig, rows, means = self._split(side)
         bubbles = self._bubbles(rows.copy(), means.copy())
-        found, steps = self._by_gradients(rig - self._pull(bubbles[0]))
+        found, steps = self._by_gradients(rig - self._pull(bubbles[0]), relative)
         pushed = self._push(found)
         rows, means = self._bubbles(rows - pushed, means)
         return self._joined(found, rows, means), steps
 
-    def _by_gradients(self, side: Array) -> tuple[Array, int]:
+    def _by_gradients(self, side: Array, relative: bool) -> tuple[Array, int]:
         """Solve the Schur complement for sides (R, N), all columns together."""
         found, rest = np.zeros_like(side), side.copy()
         way = ahead = self._preconditioned(rest)
         height = (rest * ahead).sum(0)
-        enough = np.maximum(_LEFT, _ROUNDING * height)
+        enough = _LEFT * height if relative else np.maximum(_LEFT, _ROUNDING * height)
         for step in range(_MOST_STEPS):
-            if (height < enough).all():
+            if (height <= enough).all():
                 return found, step
             image = self._schur(way)
             length = height / np.where(height > 0, (way * image).sum(0), 1.0)

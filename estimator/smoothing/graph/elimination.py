@@ -74,6 +74,10 @@ class EliminatedGraph:
             out[above] -= clique.right.T @ mine
         return self._substituted(out)
 
+    def columns(self, at: Ints) -> Array:
+        """Return columns (D, n) of the covariance at n of the D variables."""
+        return self.solved(units(at, int(starts_of(self.graph)[-1])))
+
     def _substituted(self, out: Array) -> Array:
         """Solve for the roots' right sides (D, N), in place."""
         from scipy.linalg.lapack import dtrtrs
@@ -178,6 +182,13 @@ def _first_place(linear: LinearFactors, place: Ints) -> Ints:
 def _sizes(graph: GraphLayout) -> list[int]:
     """Dimension of each key."""
     return [d for n, d in graph.counts() for _ in range(n)]
+
+
+def units(at: Ints, size: int) -> Array:
+    """Return unit vectors (size, n) along n variables."""
+    out = np.zeros((size, len(at)))
+    out[at, np.arange(len(at))] = 1.0
+    return out
 
 
 def starts_of(graph: GraphLayout) -> Ints:

@@ -439,9 +439,7 @@ def _joint_covariance(
     out = np.zeros((len(rows), len(rows)))
     for first in range(0, len(rows), _COLUMNS_AT_ONCE):
         mine = np.arange(first, min(first + _COLUMNS_AT_ONCE, len(rows)))
-        side = np.zeros((int(ends[-1]), len(mine)))
-        side[rows[mine], np.arange(len(mine))] = 1.0
-        out[:, mine] = done.solved(side)[rows]
+        out[:, mine] = done.columns(rows[mine])[rows]
     return (out + out.T) / 2
 
 
@@ -451,13 +449,11 @@ def _scale_variances(graph: GraphLayout, done: EliminatedGraph | EliminatedCrowd
     It is the square of their covariance with the scale over the variance of the scale.
     """
     (nodes, shake), (rows, size) = graph.counts()[:2]
-    ends = np.cumsum([0, *(n * d for n, d in graph.counts())])
-    side = np.zeros((int(ends[-1]), 1))
-    side[ends[4]] = 1.0
-    column = done.solved(side)[:, 0]
+    at = sum(n * d for n, d in graph.counts()[:4])
+    column = done.columns(np.array([at]))[:, 0]
     states = column[nodes * shake : nodes * shake + rows * size].reshape(rows, size)
     moves = graph.bubbles_moved(states) @ graph.bubble.position.T
-    return np.asarray(moves**2 / column[ends[4]])
+    return np.asarray(moves**2 / column[at])
 
 
 def drawn(solution: Solution, draws: int | None = None) -> Draws:

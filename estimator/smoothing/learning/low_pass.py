@@ -29,6 +29,7 @@ from telerig.factors.bubble_motion import (
     NOISE,
     BubbleModel,
     Inertia,
+    Prior,
     Triple,
     bubble_processes,
     inertial_bubble_path,
@@ -82,14 +83,19 @@ def learned_inertia(solution: Solution) -> Inertia | None:
     steps = np.split(step, np.cumsum([len(p) - 1 for p in pieces])[:-1])
     ends = np.cumsum([len(p) for p in pieces])[:-1]
 
-    def paths(directions: Array, bubble: BubbleModel = bubble) -> _Paths:
+    def paths(
+        directions: Array, bubble: BubbleModel = bubble, inertia: Prior = INERTIA_S
+    ) -> _Paths:
         every = []
         for direction in np.broadcast_to(directions, (len(directions), len(place), 3)):
             cut = (np.split(x, ends) for x in (direction, place, _variance(direction, information)))
             every.append([_series(*part) for part in zip(steps, *cut, strict=True)])
-        return _Paths(bubble, directions[:, 0], dt_s, every)
+        return _Paths(bubble, directions[:, 0], dt_s, every, inertia)
 
-    both = [paths(up[None, None]).learned(), paths(np.linalg.svd(up[None])[2][1:, None]).learned()]
+    across = paths(np.linalg.svd(up[None])[2][1:, None]).learned()
+    # swings show the low-pass; along the vertical there may be none that shows it
+    alike = replace(INERTIA_S, median=float(across[0, 0]))
+    both = [paths(up[None, None], inertia=alike).learned(), across]
     probable, shortest = (_by_axis(a, b, up) for a, b in zip(*both, strict=True))
     seen = information.any((1, 2))
     if not seen.any():
@@ -239,12 +245,16 @@ def _series(step: Ints, direction: Array, place: Array, variance: Array) -> Seri
 
 @dataclass(frozen=True)
 class _Paths:
-    """Series of all bubbles along each of some directions (k, 3); dt_s : (U,) lengths of steps."""
+    """Series of all bubbles along each of some directions (k, 3); dt_s : (U,) lengths of steps.
+
+    inertia : prior of the low-pass's time.
+    """
 
     bubble: BubbleModel
     directions: Array
     dt_s: Array
     series: Sequence[Sequence[Series]]
+    inertia: Prior
 
     def learned(self) -> Array:
         """Return (2, 3): time of the low-pass in s, intensity of the forces and noise over the
@@ -265,7 +275,7 @@ class _Paths:
         """Return the most probable values (3,) of `learned`, the first ones held."""
         from scipy.optimize import minimize
 
-        priors = [INERTIA_S, FORCES, NOISE]
+        priors = [self.inertia, FORCES, NOISE]
         free = priors[len(held) :]
         begin = np.array([p.median for p in free]) if start is None else start[len(held) :]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -199,6 +200,17 @@ def test_standard_deviations_are_true_where_low_pass_and_noise_have_to_be_learne
     assert ((mean > 0.8) & (mean < 1.25)).all()
     assert 0.4 < np.mean(ways) < 1.8  # 27 of them
     assert 0.3 < np.mean(lengths) < 2.2  # 9 of them
+
+
+def test_a_low_pass_that_the_vertical_does_not_show_is_taken_from_across(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Pixels of 2 px hide it there: the prior alone gives a fifth of it."""
+    monkeypatch.setattr(sys.modules[__name__], "PIXEL", 2.0)
+    problem, _ = drawn_bubbles(np.random.default_rng(4), 0.01, 250, 4, 0.004)
+    found = low_pass.learned_inertia(solve(problem, model_of(None), PLAIN))
+    assert found is not None and found.time_s[0] == pytest.approx(0.01, rel=0.2)
+    assert found.time_s[1] > 0.3 * found.time_s[0]
 
 
 def test_errors_along_paths_of_a_steady_speed_are_smaller() -> None:

@@ -37,8 +37,8 @@ from telerig.rig.lens_parameters import INDEX
 from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
-LEAST_DOTS = 6
-"""OpenCV gets only views with so many dots that both cameras see."""
+LEAST_DOTS, LEAST_VIEWS = 6, 4
+"""OpenCV gets only views with so many dots that both cameras see, and rigs with so many views."""
 STUDIES = {
     "plain": "Axes at 20 to 70 degrees",
     "parallel": "Nearly parallel axes",
@@ -183,7 +183,7 @@ def errors(rig: Rig, found: telerig.Calibration) -> tuple[Array, Array]:
 
 
 def opencv_centres(rig: Rig, dots: pd.DataFrame) -> Array:
-    """Errors (4,) in px of the image centres of OpenCV's stereo calibration."""
+    """Errors (4,) in px of the image centres of OpenCV's stereo calibration, NaN without one."""
     place = dict(zip(TARGET.ids().tolist(), TARGET.nominal_mm(TARGET.ids())))
     tables = [dots[dots["camera"] == name].set_index(["view", "dot"]) for name in ("left", "right")]
     seen: list[list[Array]] = [[], []]
@@ -196,6 +196,8 @@ def opencv_centres(rig: Rig, dots: pd.DataFrame) -> Array:
         points.append(np.array([place[dot] for dot in both], np.float32))
         for out, table in zip(seen, (left, right)):
             out.append(table.loc[both, ["u_px", "v_px"]].to_numpy(np.float32))
+    if len(points) < LEAST_VIEWS:
+        return np.full(4, np.nan)
     size, flags = (int(SIZE[0]), int(SIZE[1])), cv2.CALIB_FIX_K3
     single = [
         cv2.calibrateCamera(points, uv, size, np.eye(3), np.zeros(5), flags=flags) for uv in seen
@@ -278,7 +280,7 @@ def study(name: str, seeds: range) -> list[str]:
 
 def _of_rigs(errors: list[tuple[float, float]], which: int) -> str:
     values = np.array(errors)[:, which]
-    return f"{np.median(values):.2f} and {values.max():.2f}"
+    return f"{np.nanmedian(values):.2f} and {np.nanmax(values):.2f}"
 
 
 if __name__ == "__main__":

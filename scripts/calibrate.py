@@ -11,6 +11,7 @@ import typer
 
 from telerig.command_options import CalibrationOptions
 from telerig.errors import InputError
+from telerig.live import publish
 from telerig.scripts import options
 from telerig.scripts.console import (
     EXIT_REJECTED,
@@ -21,6 +22,7 @@ from telerig.scripts.console import (
     say_written,
     stopped_by_signals,
     typed_command,
+    viewed,
 )
 
 if TYPE_CHECKING:
@@ -69,6 +71,7 @@ def calibrate(
         ),
     ] = None,
     report: options.Report = True,
+    view: options.View = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Calibrate the rig from views of the target.
@@ -93,7 +96,7 @@ def calibrate(
     settings = chosen.keywords
     check_options(**settings)
     record = {**chosen.record(), "compare": None if compare is None else str(compare)}
-    with report_beside(report) as write_report:
+    with viewed(view, dataset.name), report_beside(report) as write_report:
         earlier = None if compare is None else _earlier(compare, dataset)
         if watch:
             data, run = _watched(dataset, chosen.source, until_um, poll or _POLL_S, settings)
@@ -116,6 +119,7 @@ def calibrate(
             seconds={"calibrate": time.perf_counter() - begun}, change=change, report=write_report,
             used=used, again=typed_command(),
         )  # fmt: skip
+        publish("results", folder=folder.resolve(), dataset=data.path)
     say(run.calibration.report())
     if change is not None:
         say(f"since {compare}: {change.words()}")

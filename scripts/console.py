@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import typer
 
 import telerig
+from telerig import live
 from telerig.errors import TelerigError, TelerigWarning
 from telerig.progress import Steps, steps_shown
 
@@ -208,3 +209,12 @@ def progress(quiet: bool) -> Iterator[Steps]:
     """Yield a `Progress` that shows a progress bar on a terminal, and plain lines elsewhere."""
     with contextlib.nullcontext(Steps(None)) if quiet else steps_shown() as steps:
         yield steps
+
+
+@contextmanager
+def viewed(wanted: bool, name: str) -> Iterator[None]:
+    """Show the work in a viewer if that is wanted, and say where; name : of what is worked on."""
+    with live.viewed(wanted, name) as address:
+        if address:
+            say(f"open {address}")
+        yield

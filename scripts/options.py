@@ -50,6 +50,12 @@ AcceptedFaults = Annotated[
     typer.Option("--accept", help=SmoothingOptions.settings()["accept"].help),
 ]
 Report = Annotated[bool, typer.Option(help="Write report.html.")]
+View = Annotated[
+    bool,
+    typer.Option(
+        "--view", help="Show it in a viewer while it works; needs pip install 'telerig[view]'."
+    ),
+]
 Quiet = Annotated[bool, typer.Option(help="Print the summary only.")]
 
 

@@ -19,6 +19,7 @@ from telerig.scripts.console import (
     run_file,
     say,
     stopped_by_signals,
+    viewed,
 )
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def record(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the tables [the run].")] = None,
     ports: Annotated[bool, typer.Option("--ports", help="List the serial ports and end.")] = False,
+    view: options.View = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Record the devices of rig.toml ([devices.NAME]) until Ctrl-C: stage.csv and the others.
@@ -98,7 +100,7 @@ def record(
         place = out or run
         if place is not None:
             refuse_existing(place)
-        done = write_tables(_recorded(run, seconds, port or [], rig, quiet), out)
+        done = write_tables(_recorded(run, seconds, port or [], rig, view, quiet), out)
     say(recording_words(done))
     for error in done.errors.values():
         typer.echo(f"telerig: {error}", err=True)
@@ -107,8 +109,9 @@ def record(
 
 
 def _recorded(
-    run: Path | None, seconds: float | None, ports: list[str], rig: Path | None, quiet: bool
-) -> Path:
+    run: Path | None, seconds: float | None, ports: list[str], rig: Path | None, view: bool,
+    quiet: bool,
+) -> Path:  # fmt: skip
     from telerig.io.recording.session import record as record_run
 
     if run is None:
@@ -125,7 +128,7 @@ def _recorded(
     description = _description(file)
     devices = _devices(description, ports)
     cameras = list(description.cameras)
-    with stopped_by_signals() as stop, _display(quiet) as tell:
+    with viewed(view, run.name), stopped_by_signals() as stop, _display(quiet) as tell:
         return record_run(devices, run, cameras=cameras, seconds=seconds, stop=stop, tell=tell)
 
 

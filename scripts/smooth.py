@@ -19,6 +19,7 @@ from telerig.scripts.console import (
     say,
     say_written,
     typed_command,
+    viewed,
 )
 
 
@@ -43,6 +44,7 @@ def smooth(
         ),
     ] = None,
     report: options.Report = True,
+    view: options.View = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Smooth tracked runs: bubbles in the lab frame, the shake of each camera, and a verdict.
@@ -69,7 +71,7 @@ def smooth(
                 run, chosen, calibration,
                 tracks / name if several and tracks else tracks,
                 out / name if several and out else out,
-                report=report, quiet=quiet, several=several,
+                report=report, view=view, quiet=quiet, several=several,
             )  # fmt: skip
         except TelerigError as error:
             if not several:
@@ -91,6 +93,7 @@ def _smooth_one(
     out: Path | None,
     *,
     report: bool,
+    view: bool,
     quiet: bool,
     several: bool,
 ) -> None:
@@ -108,7 +111,7 @@ def _smooth_one(
         "--calibration": calibration or [], "--tracks": [tracks], "--out": [out]
     }  # fmt: skip
     again = command_line("smooth", str(run), chosen, given, report=report)
-    with progress(quiet) as stage:
+    with viewed(view, run.name), progress(quiet) as stage:
         found = smooth_run(
             run, folder, chosen, calibration, tracks=tracks or own, report=report, stage=stage,
             again=again if several else typed_command(),

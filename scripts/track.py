@@ -13,6 +13,7 @@ from telerig.scripts.console import (
     say,
     say_written,
     typed_command,
+    viewed,
 )
 
 
@@ -24,6 +25,7 @@ def track(
     calibration: options.CalibrationFiles = None,
     out: options.RunFolder = None,
     report: options.Report = True,
+    view: options.View = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Find the bubbles of a run, match them across the views, and follow them in space.
@@ -44,7 +46,7 @@ def track(
     if out is None:
         check_run_name(run)
     folder = out or default_folder(run)
-    with progress(quiet) as stage:
+    with viewed(view, run.name), progress(quiet) as stage:
         summary = track_run(
             run, folder, chosen, calibration, again=typed_command(), report=report, stage=stage
         )

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from telerig.live import ADDRESS
 from telerig.scripts.console import errors_in_words, run_file, say
 
 
@@ -44,7 +45,7 @@ def view(
     if save is not None:
         say(f"written: {save} ({save.stat().st_size / 1e6:.1f} MB)")
     if web:
-        say("open http://127.0.0.1:9090?url=rerun%2Bhttp://127.0.0.1:9876/proxy; Ctrl-C ends it")
+        say(f"open {ADDRESS} ; Ctrl-C ends it")
         while stream is not None:
             time.sleep(1.0)
 

@@ -13,6 +13,7 @@ from telerig.estimator.batch.cluster import dask_executor
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import RunData, load_run
 from telerig.io.results.inputs import fingerprints
+from telerig.live import publish
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -93,7 +94,7 @@ def track_run(
     calibration : files of the calibration; None for that of the dataset. again : the command line
     that makes the folder again.
     """
-    from telerig.estimator.calibration.result.calibration import calibration_for
+    from telerig.estimator.calibration.result.calibration import calibration_for, of_run
     from telerig.estimator.tracking.results_folder import write_tracking
     from telerig.estimator.tracking.track import TrackOptions
 
@@ -107,11 +108,14 @@ def track_run(
         if stage is not None:
             stage("reading the run", 0, 1)
         data = load_with(run, calibrated, options.source)
-        return write_tracking(
+        publish("recording", path=data.path, rig=of_run(calibrated, data.cameras).cameras)
+        summary = write_tracking(
             data if count is None else data.first(count), calibrated, folder,
             options=TrackOptions(options.min_diameter_px), record=record, report=report,
             stage=stage, executor=executor,
         )  # fmt: skip
+    publish("results", folder=folder.resolve())
+    return summary
 
 
 def smooth_run(
@@ -130,13 +134,17 @@ def smooth_run(
     tracks : tracks.csv, or the folder that holds it. calibration : files of the calibration; None
     for that of the dataset. again : the command line that makes the results again.
     """
-    from telerig.estimator.calibration.result.calibration import calibration_for
+    from telerig.estimator.calibration.result.calibration import calibration_for, of_run
     from telerig.estimator.smoothing import results_folder
 
     calibrated, files = calibration_for(run, calibration)
     if stage is not None:
         stage("reading the run", 0, 1)
-    return results_folder.smooth_run(
-        load_tracked_run(run, calibrated), calibrated, tracks, folder, **options.keywords,
-        inputs=files, report=report, stage=stage, again=again,
+    data = load_tracked_run(run, calibrated)
+    publish("recording", path=data.path, rig=of_run(calibrated, data.cameras).cameras)
+    found = results_folder.smooth_run(
+        data, calibrated, tracks, folder, **options.keywords, inputs=files, report=report,
+        stage=stage, again=again,
     )  # fmt: skip
+    publish("results", folder=folder.resolve())
+    return found

@@ -30,6 +30,7 @@ from telerig.estimator.dots.dataset_dots import (
 )
 from telerig.estimator.dots.locate import REJECTED
 from telerig.io.dataset.dataset import Dataset, NoViewsError, View, load_dataset
+from telerig.live import due, folder_for_viewer, publish
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ class WatchedFolder:
                 complete = stamp[0] > 0 and before.get(path) == stamp
                 if complete and self._found.get(path, (None,))[0] != stamp:
                     self._found[path] = stamp, self._detected(dataset, view, camera)
+                    self._show(path)
         self.dataset = replace(dataset, views=self._views(dataset))
         self._remind(dataset, time.monotonic())
 
@@ -133,6 +135,17 @@ class WatchedFolder:
         if found.failure:
             self.tell(f"view {view.name}, camera {camera} cannot be used: {found.failure}")
         return found
+
+    def _show(self, path: Path) -> None:
+        """Tell a viewer what was found in an image."""
+        image = self._found[path][1]
+        dots, rejected = (
+            table[["u_px", "v_px"]].to_numpy(float) for table in (image.dots, image.rejected)
+        )
+        publish(
+            "found", camera=image.camera, view=image.view, file=path, dots_px=dots,
+            rejected_px=rejected,
+        )  # fmt: skip
 
     def _views(self, dataset: Dataset) -> tuple[View, ...]:
         """Return the views with those of their images whose dots have been detected so far."""
@@ -264,6 +277,10 @@ def _solved(
     except TelerigError as error:
         tell(f"{_views(count)}: {error}")
         return False
+    if due("results"):
+        place = folder_for_viewer()
+        calibration.save(place)
+        publish("results", folder=place, dataset=dataset.path)
     words, enough = standing(calibration, dataset, count, until_um)
     tell(words)
     return enough

@@ -34,6 +34,7 @@ from telerig.io.results.verdict_words import number_words
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.tables.smoothing import AXES
 from telerig.short_text import counted, share
+from telerig.spectra import motion_spectrum
 
 Progress = Callable[[str, float, int], None]
 
@@ -59,7 +60,6 @@ _LATE_PX = 0.1
 
 _SEGMENT = 512
 _LOOKED_AT = 24
-_LEAST_HZ = 3.0
 _MOST_REFUSED = 4
 _GAP = 1.5
 _MOST_PLANNED = 4000
@@ -324,22 +324,17 @@ def _without_refused(run: RunData, findings: Sequence[Finding]) -> RunData:
 def sensor_shake(run: RunData) -> tuple[float, float] | None:
     """Return the RMS (mm) of the strongest shake along an axis of an accelerometer, and its line.
 
-    The density of the acceleration divided by (2 pi f)^4 is that of the motion; frequencies (Hz)
-    below `_LEAST_HZ` are left out. None without an accelerometer.
+    Frequencies (Hz) are those of `motion_spectrum`. None without an accelerometer.
     """
-    from scipy.signal import welch
-
     found = []
     for _, rows in () if run.accelerometers is None else run.accelerometers.groupby("sensor"):
-        readings = 1e3 * rows[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy(float)
-        rate = 1 / float(np.median(np.diff(rows["t_s"])))
-        length = min(len(readings), round(rate))
-        hz, density = welch(readings, rate, nperseg=length, detrend="linear", axis=0)
-        seen = hz >= _LEAST_HZ
-        moved = density[seen] / (2 * np.pi * hz[seen, None]) ** 4
-        rms = np.sqrt(moved.sum(0) * (hz[1] - hz[0]))
-        axis = int(np.argmax(rms))
-        found.append((float(rms[axis]), float(hz[seen][np.argmax(moved[:, axis])])))
+        readings = rows[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy(float)
+        motion = motion_spectrum(rows["t_s"].to_numpy(float), readings)
+        if motion is not None:
+            rms = 1e-3 * np.sqrt(motion.density.sum(0) * motion.step_hz)
+            axis = int(np.argmax(rms))
+            line = motion.frequency_hz[np.argmax(motion.density[:, axis])]
+            found.append((float(rms[axis]), float(line)))
     return max(found, default=None)
 
 

@@ -41,6 +41,7 @@ from telerig.io.files.csv_table import write_table
 from telerig.io.files.hashing import hashed
 from telerig.io.machine.parallel import cores, keep_freed_memory, ordered_map, quick_workers
 from telerig.io.results.inputs import Source, fingerprints
+from telerig.live import due, publish
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -233,6 +234,8 @@ class DetectionStore:
             finished = ordered_map(partial(_write, self, kind, table_of), missing, workers)
         for first, last in finished:
             done += last - first
+            if kind == "detections" and due("detected"):
+                publish("detected", file=self.path((first, last)), frame=last - 1)
             if progress is not None:
                 progress(name, done, self.frame_count)
 

@@ -53,6 +53,7 @@ from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.tables.table import CALIBRATION_SHARE, EXTRAPOLATED, POINT
+from telerig.live import publish
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
 from telerig.rig.camera import Camera
@@ -152,6 +153,7 @@ class TrackingStream:
                 many, area = self.covered.get(str(camera), (0, 0.0))
                 many, area = many + int(areas.notna().sum()), area + float(areas.sum())
                 self.covered[str(camera)] = many, area
+            publish("linked", tracks=part.tracks, detections=part.detections)
             yield part
 
     def _with_share(self, part: Linked) -> Linked:

@@ -172,9 +172,9 @@ def load_run(
     image_sizes_px : (width, height) by camera; they replace those of rig.toml.
     pair_by : how the images of several cameras are paired: "numbers", "order" or "auto", see
         `telerig.io.dataset.run.pair_frames`.
-    skip_unreadable : True leaves out every frame that cannot be read, False leaves out none and
-        raises an error. None leaves out only the last frame of a recording, which may be cut short
-        because the disk was full or the power failed.
+    skip_unreadable : True leaves out every frame that cannot be read, and every table of a sensor
+        or of marks, False leaves out none and raises an error. None leaves out only the last frame
+        of a recording, which may be cut short because the disk was full or the power failed.
 
     Returns a `RunData`. Raises InputError, which names the file, the row or frame, and what to do.
     """
@@ -204,7 +204,8 @@ def load_run(
     count = len(positions[names[0]]) if images else None
     recorded = _recorded_times(sources, positions)
     t_s = _times(folder, every, count, detections, notes, recorded)
-    stage = _table(folder / "stage.csv", read_stage_csv)
+    lost = notes if skip_unreadable else None
+    stage = _table(folder / "stage.csv", read_stage_csv, lost)
     sensors = list(rig.accelerometers) if rig else None
     run = RunData(
         name=folder.name,
@@ -218,11 +219,12 @@ def load_run(
         rig=rig,
         stage=stage,
         accelerometers=_table(
-            folder / "accelerometer.csv", lambda file: read_accelerometer_csv(file, sensors)
+            folder / "accelerometer.csv", lambda file: read_accelerometer_csv(file, sensors), lost
         ),
         references=_table(
             folder / "references.csv",
             lambda file: _of(names, read_references_csv(file, every, sizes, len(t_s))),
+            lost,
         ),
         detections=detections,
         notes=notes,
@@ -459,9 +461,21 @@ def _outside_record(t_s: Array, outside: Ints) -> str:
     return f"{frames} at {span} lie outside the record of stage.csv"
 
 
-def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | None:
-    """Read a table with ``read``; returns None when the file does not exist."""
-    return read(file) if file.is_file() else None
+def _table(
+    file: Path, read: Callable[[Path], pd.DataFrame], lost: list[str] | None
+) -> pd.DataFrame | None:
+    """Read a table with ``read``; returns None when the file does not exist.
+
+    lost : gets a sentence on a file that cannot be read, which is then None; without this list
+        InputError is raised.
+    """
+    try:
+        return read(file) if file.is_file() else None
+    except InputError as error:
+        if lost is None:
+            raise
+        lost.append(f"{file.name} is left out: {error.what} ({error.where})")
+        return None
 
 
 def _with_ends_checked(run: RunData) -> RunData:

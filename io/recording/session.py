@@ -24,6 +24,7 @@ from telerig.io.recording.ports import Reader, open_port
 from telerig.io.recording.protocols import Readings, joined, parser
 from telerig.io.recording.replay import GAP_INTERVALS
 from telerig.io.rig_file.description import DeviceDescription
+from telerig.live import publish
 
 LOG_NAME = "recording.raw"
 FAILED_NAME = "recording.failed.raw"
@@ -139,6 +140,7 @@ def record(
     except InputError:
         _close_all(ports)
         raise
+    publish("recorder", devices=tuple(devices), cameras=tuple(cameras), folder=folder.resolve())
     with log:
         try:
             _Session(header, ports, log).run(seconds, stop, tell)
@@ -234,6 +236,8 @@ class _Session:
 
     def _add(self, i: int, found: Readings) -> None:
         self._status[i].add(self._devices[i], found)
+        arrived_s = (found.arrived_ns - self._start_ns) * 1e-9
+        publish("readings", device=self._devices[i].name, arrived_s=arrived_s, values=found.values)
         if not self._checked:
             self._first[i].append(found)
 
@@ -261,6 +265,8 @@ class _Session:
 
     def _report(self) -> Status:
         seconds = (time.monotonic_ns() - self._start_ns) * 1e-9
+        rates = {status.name: status.rate_hz for status in self._status}
+        publish("status", seconds=seconds, rates_hz=rates)
         return Status(seconds, self._log.bytes, tuple(map(copy.copy, self._status)))
 
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.io.report.calibration.rig import rig_outline
+from telerig.arrays import Array
+from telerig.io.report.calibration.rig import camera_outline, rig_outline
 from telerig.io.report.page.figures import KEPT, LEFT_OUT, camera_colour
 from telerig.io.results.folders.calibration import CalibrationResults
-from telerig.io.view.stream import grey_levels, log_image, need_rerun, path, rgb
+from telerig.io.view.names import RIG, VIEW, need_rerun, of_image, path
+from telerig.io.view.stream import grey_levels, log_image, rgb
+from telerig.rig.camera import Camera
 
 Images = Callable[[str, str], NDArray[Any] | None]
 MAGNIFIED = 1_000.0
@@ -30,22 +33,22 @@ def log_calibration(
     None.
     """
     rr = need_rerun()
-    stream.log("rig", rr.ViewCoordinates.RDF, static=True)
-    log_cameras(stream, results)
+    stream.log(RIG, rr.ViewCoordinates.RDF, static=True)
     outline = rig_outline(results)
+    log_cameras(stream, RIG, results.cameras, outline.plates_mm.reshape(-1, 3))
     some = list(results.views)[:3]
     levels = {c: grey_levels([i for v in some if (i := image(c, v)) is not None])
               for c in results.camera_names}  # fmt: skip
     for k, view in enumerate(results.views):
-        stream.set_time("view", sequence=k)
+        stream.set_time(VIEW, sequence=k)
         loop = outline.plates_mm[k][[0, 1, 2, 3, 0]]
-        stream.log("rig/target/plate", rr.LineStrips3D([loop], labels=[view]))
-        stream.log("rig/target/dots", rr.Points3D(outline.dots_mm[k], radii=0.15))
+        stream.log(f"{RIG}/target/plate", rr.LineStrips3D([loop], labels=[view]))
+        stream.log(f"{RIG}/target/dots", rr.Points3D(outline.dots_mm[k], radii=0.15))
         for camera in results.camera_names:
             _log_view(stream, results, rejected, camera, view, image, levels[camera])
     plates = outline.plates_mm[:, [0, 1, 2, 3, 0]]
     grey = [150, 150, 150, 80]
-    stream.log("rig/all_poses", rr.LineStrips3D(list(plates), colors=grey), static=True)
+    stream.log(f"{RIG}/all_poses", rr.LineStrips3D(list(plates), colors=grey), static=True)
     off = results.points_mm - _flat(results.points_mm)
     arrows = rr.Arrows3D(origins=results.points_mm, vectors=_DEVIATIONS * off,
                          labels=[str(d) for d in results.dot_ids], show_labels=False)  # fmt: skip
@@ -64,7 +67,7 @@ def _log_view(
     image: Images, levels: tuple[float, float],
 ) -> None:  # fmt: skip
     rr = need_rerun()
-    place, picture = path("images", camera), image(camera, view)
+    place, picture = of_image(camera), image(camera, view)
     if picture is None:
         stream.log(f"{place}/image", rr.Clear(recursive=False))
     else:
@@ -88,39 +91,23 @@ def _log_view(
         ))  # fmt: skip
 
 
-def log_cameras(stream: Any, results: CalibrationResults) -> None:
-    """Log bodies, fields and optical axes of the cameras; bodies stand where they are drawn."""
+def log_cameras(
+    stream: Any, place: str, cameras: Sequence[Camera], points_mm: Array, bodies: bool = True
+) -> None:
+    """Log what cameras see round points (N, 3), their optical axes, and their bodies, at a place.
+
+    Bodies stand where they are drawn; their distance is not measured.
+    """
     rr = need_rerun()
-    for i, camera in enumerate(rig_outline(results).cameras):
-        colour, place = rgb(camera_colour(i)), path("rig", "cameras", camera.name)
+    for i, camera in enumerate(camera_outline(camera, points_mm) for camera in cameras):
+        colour, entity = rgb(camera_colour(i)), f"{place}/{path('cameras', camera.name)}"
         body, field = (part.reshape(8, 3)[_BOX] for part in (camera.body_mm, camera.field_mm))
-        stream.log(f"{place}/body", rr.LineStrips3D([body], colors=colour), static=True)
-        stream.log(f"{place}/field",
-                   rr.LineStrips3D([field], colors=[*colour, 60]), static=True)  # fmt: skip
-        stream.log(f"{place}/axis",
+        if bodies:
+            stream.log(f"{entity}/body", rr.LineStrips3D([body], colors=colour), static=True)
+        thin = rr.Radius.ui_points(0.4)
+        stream.log(f"{entity}/field", rr.LineStrips3D(
+            [field], colors=[(c + 2 * 255) // 3 for c in colour], radii=thin
+        ), static=True)  # fmt: skip
+        stream.log(f"{entity}/axis",
                    rr.LineStrips3D([camera.axis_mm], colors=colour, labels=[camera.name]),
                    static=True)  # fmt: skip
-
-
-def layout(results: CalibrationResults) -> Any:
-    """Return the layout of the window: images on the left, the rig on the right."""
-    need_rerun()
-    import rerun.blueprint as rrb
-
-    images = [
-        rrb.Spatial2DView(origin=f"images/{c}", name=f"camera {c}") for c in results.camera_names
-    ]
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*images),
-            rrb.Vertical(
-                rrb.Spatial3DView(origin="rig", name="rig and poses"),
-                rrb.Spatial3DView(
-                    origin="target", name=f"deviations of the dots, x {_DEVIATIONS:g}"
-                ),
-                row_shares=[2, 1],
-            ),
-        ),
-        rrb.TimePanel(timeline="view"),
-        collapse_panels=True,
-    )

@@ -19,12 +19,26 @@ from telerig.io.report.plot.spectrum import shake_spectrum
 from telerig.io.results.bodies import ellipsoids_of
 from telerig.io.results.folders.smoothing import AXES, SmoothingResults
 from telerig.io.results.folders.tracking import TrackResults
-from telerig.io.view.stream import grey_levels, log_image, log_series, need_rerun, path, rgb
+from telerig.io.tables.table import POINT
+from telerig.io.view.calibration import log_cameras
+from telerig.io.view.names import (
+    BODIES,
+    FRAME,
+    PATHS,
+    SPACE,
+    TIME,
+    need_rerun,
+    of_image,
+)
+from telerig.io.view.stream import grey_levels, log_image, log_series, log_spectrum, rgb
 from telerig.rig.camera import Camera
 
 Images = Callable[[str, int], NDArray[Any] | None]
 _RAY_MM = 8.0
 """Half of the part of a ray that is drawn, about the bubble."""
+_SURE = 0.95
+"""A pair of outlines with a smaller probability is marked."""
+_BAND_SD = 2.0
 _MOST_SERIES = 12
 _MOST_READINGS = 20_000
 _NO_TRACK = "#fabe14"
@@ -46,31 +60,37 @@ def log_run(
     and bodies are shown; paths and series are whole.
     """
     rr = need_rerun()
-    stream.log("space", rr.ViewCoordinates.RDF, static=True)
+    stream.log(SPACE, rr.ViewCoordinates.RDF, static=True)
     times = _times(tracks, smoothing)
     _log_paths(stream, tracks, smoothing)
-    _log_series(stream, tracks, smoothing)
-    outlines = outlines_px(detections) if len(detections) else np.zeros((0, 0, 2))
-    rows_of = {key: np.asarray(rows) for key, rows
-               in detections.groupby(["frame", "camera"]).indices.items()}  # fmt: skip
+    log_track_series(stream, tracks.tracks, detections)
+    if smoothing is not None:
+        _log_smoothed_series(stream, smoothing)
+    if len(cameras) and len(tracks.tracks):
+        log_cameras(stream, f"{SPACE}/rig", cameras, tracks.points_mm, bodies=False)
     bodies = tracks.tracks if smoothing is None else _with_shapes(smoothing, tracks)
-    in_space, tracked = _rows_by_frame(bodies), _rows_by_frame(tracks.tracks)
+    found, in_space, tracked = map(_rows_by_frame, (detections, bodies, tracks.tracks))
+    hidden = _hidden(tracks.tracks)
+    unseen, none = _rows_by_frame(hidden), np.zeros(0, np.int64)
     some = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, 5).astype(int))]
     levels = {c: grey_levels([i for f in some if (i := image(c, f)) is not None])
               for c in tracks.cameras}  # fmt: skip
     for frame in frames:
-        stream.set_time("frame", sequence=frame)
+        stream.set_time(FRAME, sequence=frame)
         if frame in times:
-            stream.set_time("time", duration=times[frame])
+            stream.set_time(TIME, duration=times[frame])
         for camera in tracks.cameras:
             picture = image(camera, frame)
             if picture is not None:
-                log_image(stream, path("images", camera, "image"), picture, levels[camera])
-            rows = rows_of.get((frame, camera), np.zeros(0, np.int64))
-            _log_outlines(stream, camera, detections.iloc[rows], outlines[rows])
-        if len(cameras):
-            _log_rays(stream, tracks, cameras, tracked.get(frame, np.zeros(0, np.int64)))
-        _log_bodies(stream, bodies.iloc[in_space.get(frame, np.zeros(0, np.int64))])
+                log_image(stream, of_image(camera, "image"), picture, levels[camera])
+        rows = tracks.tracks.iloc[tracked.get(frame, none)]
+        log_outlines(stream, tracks.cameras, detections.iloc[found.get(frame, none)])
+        log_rays(stream, cameras, rows)
+        _log_hidden(stream, cameras, hidden.iloc[unseen.get(frame, none)], rows)
+        here = bodies.iloc[in_space.get(frame, none)]
+        if smoothing is not None:
+            _log_travel(stream, rows, here)
+        log_bodies(stream, here)
 
 
 def _rows_by_frame(table: pd.DataFrame) -> dict[int, Ints]:
@@ -90,43 +110,106 @@ def _with_shapes(smoothing: SmoothingResults, tracks: TrackResults) -> pd.DataFr
     return frames if len(frames) else smoothing.trajectories.assign(d_eq_mm=np.nan)
 
 
-def _log_outlines(stream: Any, camera: str, rows: pd.DataFrame, outlines: Array) -> None:
-    rr = need_rerun()
-    named = np.isfinite(rows["particle"].to_numpy(float))
-    ids = np.nan_to_num(rows["particle"].to_numpy(float)).astype(int)
-    colours = [rgb(colour_of(k) if known else _NO_TRACK) for k, known in zip(ids.tolist(), named)]
-    words = [f"{k if known else ''} {flags}".strip()
-             for k, known, flags in zip(ids.tolist(), named, rows["flags"])]  # fmt: skip
-    closed = [np.vstack([outline, outline[:1]]) for outline in outlines]
-    stream.log(
-        path("images", camera, "outlines"), rr.LineStrips2D(closed, colors=colours, labels=words)
-    )
+def _hidden(tracks: pd.DataFrame) -> pd.DataFrame:
+    """Return where bubbles are in the frames between those that see them, on straight lines."""
+    parts = []
+    for particle, mine in tracks.groupby("particle"):
+        seen = mine["frame"].to_numpy(np.int64)
+        gap = np.setdiff1d(np.arange(seen[0], seen[-1]), seen)
+        if len(gap):
+            place = {c: np.interp(gap, seen, mine[c].to_numpy(float)) for c in POINT}
+            parts.append(pd.DataFrame({"frame": gap, "particle": particle, **place}))
+    columns = ["frame", "particle", *POINT]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
 
 
-def _log_rays(stream: Any, tracks: TrackResults, cameras: Sequence[Camera], rows: Any) -> None:
-    """Log each bubble's ray of every camera as the others see it."""
+def log_outlines(stream: Any, cameras: Sequence[str], rows: pd.DataFrame) -> None:
+    """Log the outlines of a frame's detections, in the colours of their tracks."""
     rr = need_rerun()
-    table = tracks.tracks.iloc[rows]
-    points = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-    colours = np.array([rgb(colour_of(int(k))) for k in table["particle"]]).reshape(-1, 3)
+    for camera in cameras:
+        mine = rows[rows["camera"] == camera]
+        outlines = outlines_px(mine) if len(mine) else np.zeros((0, 1, 2))
+        named = np.isfinite(mine["particle"].to_numpy(float))
+        ids = np.nan_to_num(mine["particle"].to_numpy(float)).astype(int)
+        colours = [
+            rgb(colour_of(k) if known else _NO_TRACK) for k, known in zip(ids.tolist(), named)
+        ]
+        words = [f"{k if known else 'no track'} {flags}".strip()
+                 for k, known, flags in zip(ids.tolist(), named, mine["flags"])]  # fmt: skip
+        closed = [np.vstack([outline, outline[:1]]) for outline in outlines]
+        strips = rr.LineStrips2D(closed, colors=colours, labels=words)
+        stream.log(of_image(camera, "outlines"), strips)
+
+
+def log_rays(stream: Any, cameras: Sequence[Camera], rows: pd.DataFrame) -> None:
+    """Log each bubble's ray of every camera, in space and as the other cameras see it.
+
+    Pairs of outlines that are uncertain are marked where the rays begin. rows : of tracks.csv.
+    """
+    rr = need_rerun()
+    points = rows[[*POINT]].to_numpy(float)
+    colours = np.array([rgb(colour_of(int(k))) for k in rows["particle"]]).reshape(-1, 3)
+    sure = rows["confidence"].to_numpy(float) if "confidence" in rows else np.ones(len(rows))
     strips: dict[str, list[Array]] = {camera.name: [] for camera in cameras}
     shades: dict[str, list[Any]] = {camera.name: [] for camera in cameras}
+    words: dict[str, list[str]] = {camera.name: [] for camera in cameras}
+    rays = []
     for camera in cameras:
-        uv = table[[f"{camera.name}_u_px", f"{camera.name}_v_px"]].to_numpy(float)
+        uv = rows[[f"{camera.name}_u_px", f"{camera.name}_v_px"]].to_numpy(float)
+        doubtful = np.flatnonzero((sure < _SURE) & np.isfinite(uv).all(1)).tolist()
+        stream.log(of_image(camera.name, "uncertain_pairs"), rr.Points2D(
+            uv[doubtful], colors=rgb(_NO_TRACK), radii=rr.Radius.ui_points(4.0),
+            labels=[f"pair {sure[k]:.0%}" for k in doubtful],
+        ))  # fmt: skip
         for k in np.flatnonzero(np.isfinite(uv).all(1)).tolist():
             origin, direction = camera.unproject(uv[k])
             direction = direction / np.linalg.norm(direction)
             along = (points[k] - origin) @ direction + np.linspace(-_RAY_MM, _RAY_MM, 9)
-            ray = origin + along[:, None] * direction
+            rays.append(origin + along[:, None] * direction)
             for other in cameras:
                 if other.name != camera.name:
-                    strips[other.name].append(other.project(ray))
+                    strips[other.name].append(other.project(rays[-1]))
                     shades[other.name].append([*colours[k], 120])
+                    words[other.name].append(f"{rows['particle'].iloc[k]} in {camera.name}")
     for name, lines in strips.items():
-        stream.log(path("images", name, "rays"), rr.LineStrips2D(lines, colors=shades[name]))
+        lines_px = rr.LineStrips2D(
+            lines, colors=shades[name], labels=words[name], show_labels=False
+        )
+        stream.log(of_image(name, "rays"), lines_px)
+    stream.log(
+        f"{SPACE}/rig/rays",
+        rr.LineStrips3D(rays, colors=[190, 190, 190], radii=rr.Radius.ui_points(0.5)),
+    )
 
 
-def _log_bodies(stream: Any, rows: pd.DataFrame) -> None:
+def _log_hidden(
+    stream: Any, cameras: Sequence[Camera], hidden: pd.DataFrame, rows: pd.DataFrame
+) -> None:
+    """Log where bubbles are predicted in the images of cameras that do not see them."""
+    rr = need_rerun()
+    for camera in cameras:
+        blank = rows[~np.isfinite(rows[f"{camera.name}_u_px"].to_numpy(float))]
+        both = pd.concat([part for part in (hidden, blank) if len(part)] or [hidden])
+        stream.log(of_image(camera.name, "predicted"), rr.Points2D(
+            camera.project(both[[*POINT]].to_numpy(float)), radii=rr.Radius.ui_points(3.0),
+            colors=[rgb(colour_of(int(k))) for k in both["particle"]],
+            labels=[f"{int(k)} hidden" for k in both["particle"]],
+        ))  # fmt: skip
+
+
+def _log_travel(stream: Any, rows: pd.DataFrame, smoothed: pd.DataFrame) -> None:
+    """Log how far the rig has moved: the tank's frame less the rig's, of the same bubbles."""
+    rr = need_rerun()
+    if f"naive_{POINT[0]}" not in smoothed:
+        return
+    both = rows.merge(smoothed, on="particle", suffixes=("", "_smoothed"))
+    moved = both[[f"naive_{c}" for c in POINT]].to_numpy(float) - both[[*POINT]].to_numpy(float)
+    if np.isfinite(moved).all(1).any():
+        stream.log(f"{SPACE}/rig", rr.Transform3D(translation=np.nanmedian(moved, axis=0)))
+
+
+def log_bodies(stream: Any, rows: pd.DataFrame) -> None:
+    """Log the bodies of a frame's bubbles in space."""
     rr = need_rerun()
     points = rows[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     quadrics, _ = ellipsoids_of(rows)
@@ -135,7 +218,7 @@ def _log_bodies(stream: Any, rows: pd.DataFrame) -> None:
     axes = axes * np.sign(np.linalg.det(axes))[:, None, None]
     turned = Rotation.from_matrix(axes).as_quat() if len(axes) else np.zeros((0, 4))
     ids = rows["particle"].to_numpy()[good]
-    stream.log("space/bubbles", rr.Ellipsoids3D(
+    stream.log(BODIES, rr.Ellipsoids3D(
         half_sizes=np.sqrt(squares.clip(0)), centers=points[good],
         quaternions=[rr.Quaternion(xyzw=q) for q in turned],
         colors=[rgb(colour_of(int(k))) for k in ids], labels=[str(int(k)) for k in ids],
@@ -146,6 +229,7 @@ def _log_bodies(stream: Any, rows: pd.DataFrame) -> None:
 def _log_paths(stream: Any, tracks: TrackResults, smoothing: SmoothingResults | None) -> None:
     rr = need_rerun()
     kinds: dict[str, tuple[pd.DataFrame, str, str]] = {}
+    bands: list[Array] = []
     if smoothing is None or not len(smoothing.trajectories):
         kinds["tracked"] = (tracks.tracks, "", SMOOTHED)
     else:
@@ -159,17 +243,33 @@ def _log_paths(stream: Any, tracks: TrackResults, smoothing: SmoothingResults | 
             place = mine[[f"{prefix}{axis}_mm" for axis in AXES]].to_numpy(float)
             lines.append(place[np.isfinite(place).all(1)])
             shades.append(rgb(colour if prefix else colour_of(int(particle))))
-        stream.log(f"space/paths/{name}", rr.LineStrips3D(lines, colors=shades), static=True)
+            if name == "smoothed" and smoothing is not None:
+                sd = mine[[f"s{axis}_mm" for axis in AXES]].to_numpy(float) * smoothing.up
+                bands += [place + side * _BAND_SD * sd for side in (-1, 1)]
+        stream.log(f"{PATHS}/{name}", rr.LineStrips3D(lines, colors=shades), static=True)
+    stream.log(
+        f"{PATHS}/bands",
+        rr.LineStrips3D(bands, colors=[190, 190, 190], radii=rr.Radius.ui_points(0.4)),
+        static=True,
+    )
 
 
-def _log_series(stream: Any, tracks: TrackResults, smoothing: SmoothingResults | None) -> None:
-    table = tracks.tracks
-    for particle in table["particle"].value_counts().index[:_MOST_SERIES].astype(int).tolist():
-        mine = table[table["particle"] == particle]
+def log_track_series(stream: Any, tracks: pd.DataFrame, detections: pd.DataFrame) -> None:
+    """Log ray miss, way and fit of the outlines of the longest tracks, or of some frames."""
+    table = detections if "chi2_dof" in detections else detections.assign(chi2_dof=np.nan)
+    fits = table.groupby(["frame", "particle"])["chi2_dof"].mean()
+    for particle in tracks["particle"].value_counts().index[:_MOST_SERIES].astype(int).tolist():
+        mine, name = tracks[tracks["particle"] == particle], f"bubble {particle}"
         miss_um = 1e3 * mine["ray_miss_mm"].to_numpy(float)
-        _series(stream, mine, "ray_miss_um", f"bubble {particle}", miss_um, colour_of(particle))
-    if smoothing is None:
-        return
+        _series(stream, mine, "ray_miss_um", name, miss_um, colour_of(particle))
+        steps = np.diff(mine[[*POINT]].to_numpy(float), axis=0)
+        ways = np.linalg.norm(steps, axis=1) / np.diff(mine["frame"])
+        _series(stream, mine.iloc[1:], "step_mm", name, ways, colour_of(particle))
+        fit = fits.reindex([(f, particle) for f in mine["frame"]]).to_numpy(float)
+        _series(stream, mine, "outline_chi2", name, fit, colour_of(particle))
+
+
+def _log_smoothed_series(stream: Any, smoothing: SmoothingResults) -> None:
     for particle in smoothing.bubbles[:_MOST_SERIES]:
         mine, name, colour = smoothing.track(particle), f"bubble {particle}", colour_of(particle)
         speed = np.linalg.norm(mine[[f"v{a}_mm_s" for a in AXES]].to_numpy(float), axis=1)
@@ -188,16 +288,15 @@ def _heights(rows: pd.DataFrame, prefix: str, up: Array) -> Array:
 
 
 def _log_shake(stream: Any, smoothing: SmoothingResults) -> None:
-    rr, shake = need_rerun(), smoothing.shake
+    shake = smoothing.shake
     for camera in smoothing.cameras:
-        spectrum = shake_spectrum(smoothing.shake, camera)
+        spectrum = shake_spectrum(shake, camera)
+        if spectrum is not None:
+            log_spectrum(stream, camera, spectrum, static=True)
         for axis in smoothing.seen(camera):
-            k, name = AXES.index(axis), f"{camera} {axis}"
             values = 1e3 * shake[f"{camera}_{axis}_mm"].to_numpy(float)
-            _series(stream, shake, "shake_um", name, values, CAMERA_COLOURS[k])
-            if spectrum is not None:
-                bars = rr.BarChart(spectrum.density[:, k], abscissa=spectrum.frequency_hz)
-                stream.log(path("spectra", name), bars, static=True)
+            colour = CAMERA_COLOURS[AXES.index(axis)]
+            _series(stream, shake, "shake_um", f"{camera} {axis}", values, colour)
 
 
 def log_sensors(stream: Any, run: RunData, smoothing: SmoothingResults | None) -> None:
@@ -237,30 +336,3 @@ def _series(
 ) -> None:
     frames, t_s = rows["frame"].to_numpy(np.int64), rows["t_s"].to_numpy(float)
     log_series(stream, plot, frames, t_s, {name: values}, {name: colour})
-
-
-def layout(tracks: TrackResults, smoothing: SmoothingResults | None) -> Any:
-    """Return the layout of the window: images, space and time series side by side."""
-    need_rerun()
-    import rerun.blueprint as rrb
-
-    images = [
-        rrb.Spatial2DView(origin=path("images", c), name=f"camera {c}") for c in tracks.cameras
-    ]
-    names = {"ray_miss_um": "ray miss / µm"}
-    if smoothing is not None:
-        names |= {"height_less_line_mm": "height less a straight line / mm",
-                  "shake_um": "shake / µm", "speed_mm_s": "speed / (mm/s)",
-                  "encoder_residual_um": "encoder less the carriage / µm"}  # fmt: skip
-    names |= {"accelerometers_m_s2": "accelerometers / (m/s²)"}
-    plots = [rrb.TimeSeriesView(origin=f"plots/{key}", name=name) for key, name in names.items()]
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*images),
-            rrb.Spatial3DView(origin="space", name="paths"),
-            rrb.Vertical(*plots),
-            column_shares=[2, 2, 2],
-        ),
-        rrb.TimePanel(timeline="frame"),
-        collapse_panels=True,
-    )

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from dataclasses import replace
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
+from telerig.errors import InputError, TelerigWarning
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import RunData, RunSource, load_run, recordings
 from telerig.io.files.atomic import atomic_path
@@ -20,9 +20,9 @@ from telerig.io.results.folders.calibration import read_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import TrackResults, read_track_results, run_cameras
 from telerig.io.tables.calibration import REJECTED
-from telerig.io.view import calibration as of_calibration
-from telerig.io.view import run as of_run
-from telerig.io.view.stream import need_rerun
+from telerig.io.view.calibration import log_calibration
+from telerig.io.view.names import calibration_layout, need_rerun, run_layout
+from telerig.io.view.run import log_run, log_sensors
 
 MOST_IMAGES = 4_000
 """Of a longer run every k-th frame is shown, so that a recording stays small (some 20 kB an image,
@@ -60,21 +60,24 @@ def view(
     if save is not None:
         with atomic_path(Path(save)) as temporary:
             stream.save(str(temporary))
-            _log(stream, place, frames, recording)
+            log_results(stream, place, frames, recording)
             stream.flush()
             stream.disconnect()
         return stream
+    in_notebook = _in_notebook()
     if web:
-        uri = stream.serve_grpc()
-        _log(stream, place, frames, recording)
-        rr.serve_web_viewer(open_browser=False, connect_to=uri)
-        return stream
-    if not _in_notebook():
+        served(stream)
+    elif not in_notebook:
         stream.spawn()
-    _log(stream, place, frames, recording)
-    if _in_notebook():
+    log_results(stream, place, frames, recording)
+    if in_notebook and not web:
         stream.notebook_show()
     return stream
+
+
+def served(stream: Any) -> None:
+    """Serve a recording for a browser on this computer, at `telerig.live.ADDRESS`."""
+    need_rerun().serve_web_viewer(open_browser=False, connect_to=stream.serve_grpc())
 
 
 def _in_notebook() -> bool:
@@ -82,14 +85,25 @@ def _in_notebook() -> bool:
     return hasattr(shell, "kernel")
 
 
-def _log(stream: Any, place: Path, frames: tuple[int, int] | None, recording: Path | None) -> None:
+def log_results(
+    stream: Any,
+    place: Path,
+    frames: tuple[int, int] | None = None,
+    recording: Path | None = None,
+    dataset: Path | None = None,
+) -> None:
+    """Log a folder of results and the layout of the window.
+
+    frames, recording : as for `view`. dataset : of a calibration; None for the one it lies in.
+    """
     if (place / "calibration.json").is_file():
         results = read_results(place)
         rejected = pd.DataFrame()
         if (place / "rejected.csv").is_file():
             rejected = REJECTED.read(place / "rejected.csv")
-        stream.send_blueprint(of_calibration.layout(results))
-        of_calibration.log_calibration(stream, results, rejected, _views_of(place))
+        stream.send_blueprint(calibration_layout(results.camera_names))
+        images = _views_of(dataset or place.resolve().parent.parent)
+        log_calibration(stream, results, rejected, images)
         return
     if not (place / "tracking.json").is_file():
         raise InputError(
@@ -103,17 +117,21 @@ def _log(stream: Any, place: Path, frames: tuple[int, int] | None, recording: Pa
     image, count = _frames_of(data, tracks)
     every = range(count)[slice(*frames)] if frames else range(count)
     shown = every[:: -(-len(every) * len(tracks.cameras) // MOST_IMAGES) or 1]
-    stream.send_blueprint(of_run.layout(tracks, smoothing))
+    smoothed = ("height_less_line_mm", "shake_um", "speed_mm_s", "encoder_residual_um")
+    plots = ["ray_miss_um", "step_mm", "outline_chi2", *(() if smoothing is None else smoothed)]
+    if data is not None and data.accelerometers is not None:
+        plots.append("accelerometers_m_s2")
+    stream.send_blueprint(run_layout(tracks.cameras, plots, spectra=smoothing is not None))
     found = read_outlines(place / "detections.csv", tracks.cameras)
-    of_run.log_run(stream, tracks, smoothing, cameras or (), found, image, list(shown))
+    log_run(stream, tracks, smoothing, cameras or (), found, image, list(shown))
     if data is not None:
-        of_run.log_sensors(stream, data, smoothing)
+        log_sensors(stream, data, smoothing)
 
 
-def _views_of(place: Path) -> Callable[[str, str], NDArray[Any] | None]:
+def _views_of(dataset: Path) -> Callable[[str, str], NDArray[Any] | None]:
     """Return the function that reads a view's image from the dataset of a calibration."""
     try:
-        data = load_dataset(place.resolve().parent.parent, source="images")
+        data = load_dataset(dataset, source="images")
     except InputError:
         return lambda _camera, _view: None
     views = {view.name: view for view in data.views}
@@ -135,10 +153,29 @@ def _recording_of(place: Path, recording: Path | None, tracks: TrackResults) -> 
     run = recording or folder.parent.parent / "runs" / folder.name
     if not (run.is_dir() and (recordings(run) or (run / "detections.csv").is_file())):
         return None
-    sizes = {c: s for c in tracks.cameras if (s := tracks.image_size_px(c)) is not None}
     source: RunSource = "images" if recordings(run) else "detections"
-    data = load_run(run, source=source, cameras=tracks.cameras, image_sizes_px=sizes)
-    return replace(data, skip_unreadable=True)
+    sizes = {c: s for c in tracks.cameras if (s := tracks.image_size_px(c)) is not None}
+    return load_for_view(run, source, tracks.cameras, sizes)
+
+
+def load_for_view(
+    run: Path, source: RunSource, cameras: Sequence[str], sizes: Mapping[str, tuple[int, int]]
+) -> RunData | None:
+    """Return a recording without what cannot be read, which warnings name; None if nothing can.
+
+    source, cameras, sizes : as for `load_run`.
+    """
+    try:
+        data = load_run(
+            run, source=source, cameras=cameras, image_sizes_px=sizes, skip_unreadable=True
+        )
+    except InputError as error:
+        warnings.warn(f"the recording is not shown: {error}", TelerigWarning, stacklevel=2)
+        return None
+    tables = {"stage.csv": data.stage, "accelerometer.csv": data.accelerometers}
+    if any(table is None and (run / name).is_file() for name, table in tables.items()):
+        warnings.warn("; ".join(data.notes), TelerigWarning, stacklevel=2)
+    return data
 
 
 def _frames_of(

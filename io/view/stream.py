@@ -10,29 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
-from telerig.errors import InputError
+from telerig.io.report.page.figures import CAMERA_COLOURS
+from telerig.io.tables.smoothing import AXES
+from telerig.io.view.names import FRAME, TIME, need_rerun, of_plot, of_spectrum
+from telerig.spectra import Spectrum
 
 _QUALITY = 80
 """Of JPEG: 512 x 512 px of a backlit tank take some 20 kB."""
+_MOST_HZ = 200.0
 _MOST_PX = 1024
 """Larger images are shown smaller; outlines and pixels keep their coordinates."""
-
-
-def need_rerun() -> Any:
-    """Return rerun. Raises InputError, with what to install, where it is missing."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise InputError(
-            "the viewer needs rerun, which is not installed", where="rerun",
-            todo="pip install 'telerig[view]'",
-        ) from error  # fmt: skip
-    return rerun
-
-
-def path(*parts: str) -> str:
-    """Return the path of an entity; names of cameras and views may hold any character."""
-    return str(need_rerun().new_entity_path(list(parts)))
 
 
 def grey_levels(images: list[NDArray[Any]]) -> tuple[float, float]:
@@ -63,29 +50,41 @@ def log_image(stream: Any, path: str, image: NDArray[Any], levels: tuple[float, 
 
 
 def log_series(
-    stream: Any, plot: str, frames: Ints, t_s: Array, series: Mapping[str, Array],
+    stream: Any, plot: str, frames: Ints | None, t_s: Array, series: Mapping[str, Array],
     colours: Mapping[str, str],
 ) -> None:  # fmt: skip
     """Log series of one plot by their names: numbers (F,) over frames and times (F,); NaN are left
     out.
 
-    colours : of each series, like "#1f5fa8".
+    frames : None where there are none. colours : of each series, like "#1f5fa8".
     """
     rr = need_rerun()
     for name, values in series.items():
         good = np.isfinite(values)
         if not good.any():
             continue
-        place = path("plots", plot, name)
+        place = of_plot(plot, name)
         stream.log(place, rr.SeriesLines(colors=rgb(colours[name]), names=name), static=True)
+        of_time = [rr.TimeColumn(TIME, duration=t_s[good])]
+        of_frames = [] if frames is None else [rr.TimeColumn(FRAME, sequence=frames[good])]
         stream.send_columns(
             place,
-            indexes=[
-                rr.TimeColumn("frame", sequence=frames[good]),
-                rr.TimeColumn("time", duration=t_s[good]),
-            ],
+            indexes=[*of_frames, *of_time],
             columns=rr.Scalars.columns(scalars=values[good]),
         )
+
+
+def log_spectrum(stream: Any, name: str, spectrum: Spectrum, static: bool = False) -> None:
+    """Log the spectrum of a motion (F, 3) or (F, 1) in µm²/Hz, up to `_MOST_HZ`."""
+    rr = need_rerun()
+    seen = (spectrum.frequency_hz > 0) & (spectrum.frequency_hz <= _MOST_HZ)
+    axes = AXES if spectrum.density.shape[1] > 1 else ("",)
+    for axis, density, colour in zip(axes, spectrum.density.T, CAMERA_COLOURS):
+        if np.any(density[seen] > 0):
+            bars = rr.BarChart(
+                np.sqrt(density[seen]), abscissa=spectrum.frequency_hz[seen], color=rgb(colour)
+            )
+            stream.log(of_spectrum(name, axis), bars, static=static)
 
 
 def rgb(colour: str) -> list[int]:

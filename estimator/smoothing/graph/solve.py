@@ -46,6 +46,7 @@ from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingPro
 from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.robust_loss import truncation_weights
 from telerig.io.machine.parallel import give_back_freed_memory
+from telerig.live import due, publish
 from telerig.rig.lens_parameters import INDEX
 from telerig.statistics import robust_sd
 
@@ -230,6 +231,8 @@ def _solve(
         last = _linear_solve(graph, state, weights, samples)
         leap = 0.0 if exact else last.largest_px
         state = moved(graph, state, last.done.vector)
+        if due("shake"):
+            publish("shake", t_s=problem.t_s, shake_mm=_shake_mm(graph, state))
         residuals = pixel_residuals(graph, state)
         samples, changed = rejection.update(samples, sample_residuals(graph, state))
         fresh = weights
@@ -256,6 +259,13 @@ def _solve(
     return replace(
         found, sample_weights=samples, sample_residuals=sample_residuals(graph, found.state)
     )
+
+
+def _shake_mm(graph: GraphLayout, state: State) -> dict[str, Array]:
+    """Return the shake (F, 3) by camera."""
+    states, offset = graph.shake_at_frames(state.shake), graph.shake.offset
+    cameras = graph.problem.cameras
+    return {camera.name: states @ rows.T for camera, rows in zip(cameras, offset)}
 
 
 def _check_converged(graph: GraphLayout, state: State, largest_px: float) -> None:

@@ -58,7 +58,7 @@ def rig_outline(results: CalibrationResults) -> RigOutline:
     plates = np.array([pose.apply(plate) for pose in poses]).reshape(-1, 4, 3)
     dots = np.array([pose.apply(results.points_mm) for pose in poses])
     dots = dots.reshape(len(poses), -1, 3)
-    cameras = tuple(_camera_outline(camera, plates.reshape(-1, 3)) for camera in results.cameras)
+    cameras = tuple(camera_outline(camera, plates.reshape(-1, 3)) for camera in results.cameras)
     return RigOutline(cameras, tuple(results.views), plates, dots)
 
 
@@ -86,7 +86,8 @@ def common_plane(results: CalibrationResults) -> Array:
     return np.array([across / np.linalg.norm(across), along])
 
 
-def _camera_outline(camera: Camera, points_mm: Array) -> CameraOutline:
+def camera_outline(camera: Camera, points_mm: Array) -> CameraOutline:
+    """Return what is drawn of a camera that sees points (N, 3) in the rig frame (mm)."""
     depth = camera.camera_from_rig.apply(points_mm)[:, 2]
     middle = float(depth.mean())
     half_field = 0.5 * min(camera.image_size_px) / camera["scale_px_per_mm"]

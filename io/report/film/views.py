@@ -97,7 +97,11 @@ def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
             "is not there, so nothing can be drawn into the images", where=str(file),
             todo="track the run again (`telerig track`)",
         )  # fmt: skip
-    table = DETECTIONS.read_known(file)
+    return outlines_of(DETECTIONS.read_known(file), cameras)
+
+
+def outlines_of(table: pd.DataFrame, cameras: Sequence[str]) -> pd.DataFrame:
+    """Return rows of detections.csv with a place, as `read_outlines` does."""
     absent: dict[str, Any] = {name: 0.0 for name in _SHAPE if name not in table}
     absent |= {name: np.nan for name in _ELLIPSE if name not in table}
     table = table.assign(**absent)

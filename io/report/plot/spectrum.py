@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.spectra import LEAST_FRAMES, Spectrum, segment, welch_density
 
-LEAST_FRAMES = 32
-_LONGEST_SEGMENT = 1024
 _MOST_TRACKS = 20
 _FINITE_SHARE = 0.7
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """One-sided power densities (F, 3) per axis at (F,) Hz."""
-
-    frequency_hz: Array
-    density: Array
-
-    @property
-    def step_hz(self) -> float:
-        """How finely frequencies are told apart."""
-        return float(self.frequency_hz[1])
 
 
 def velocity_spectrum(trajectories: pd.DataFrame, kind: str = "") -> Spectrum:
@@ -63,30 +47,3 @@ def shake_spectrum(shake: pd.DataFrame, camera: str) -> Spectrum | None:
         return None
     values = 1e3 * shake[[f"{camera}_{axis}_mm" for axis in "xyz"]].to_numpy(float)
     return Spectrum(*welch_density(shake["t_s"].to_numpy(float), values, segment(len(values))))
-
-
-def segment(frames: int) -> int:
-    """Return the frames per segment of Welch's estimate: about five, half overlapping."""
-    return min(frames, _LONGEST_SEGMENT, max(64, frames // 3))
-
-
-def welch_density(t_s: Array, values: Array, length: int) -> tuple[Array, Array]:
-    """Return frequencies (F,) and one-sided densities (F, K) of detrended columns (N, K)."""
-    from scipy.signal import detrend, welch
-
-    even, rate_hz = evenly(t_s, values)
-    level = np.asarray(detrend(even, axis=0))
-    frequency, density = welch(level, rate_hz, nperseg=min(length, len(even)), axis=0)
-    return np.asarray(frequency), np.asarray(density)
-
-
-def evenly(t_s: Array, values: Array) -> tuple[Array, float]:
-    """Return columns (N, K) interpolated to even times, and the rate in Hz."""
-    step = float(np.median(np.diff(t_s)))
-    count = min(round((t_s[-1] - t_s[0]) / step) + 1, 4 * len(t_s))
-    wanted = np.linspace(t_s[0], t_s[-1], count)
-    columns = []
-    for one in values.T:
-        there = np.isfinite(one)
-        columns.append(np.interp(wanted, t_s[there], one[there]) if there.any() else 0 * wanted)
-    return np.stack(columns, 1), (count - 1) / (t_s[-1] - t_s[0])

@@ -19,7 +19,7 @@ from smoothed_folder import (
     write_folder,
 )
 
-from telerig.io.report.plot.spectrum import evenly, shake_spectrum, velocity_spectrum
+from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.smoothing.figures import density_limits
 from telerig.io.report.run.smoothing.tables import axis_table, mode_rows
 from telerig.io.results.folders.smoothing import (
@@ -27,6 +27,7 @@ from telerig.io.results.folders.smoothing import (
     shake_rms_um,
     taken_away,
 )
+from telerig.spectra import evenly
 
 
 @pytest.fixture(scope="module")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -14,24 +11,13 @@ import pytest
 import tifffile
 from filmed_run import FRAMES, SIZE_PX, write_run
 from typer.testing import CliRunner
+from viewed import entities, needs_rerun
 
 import telerig
 from telerig.errors import InputError
 from telerig.io.view.show import frames_of
 from telerig.io.view.stream import grey_levels
 from telerig.scripts.main import app
-
-needs_rerun = pytest.mark.skipif(
-    find_spec("rerun") is None, reason="rerun is not installed: pip install 'telerig[view]'"
-)
-
-
-def entities(file: Path) -> dict[str, int]:
-    """Entities of a recording by their paths, and how many chunks each has."""
-    command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(file)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found = re.findall(r"^Chunk\(\S+ with \d+ rows[^)]*\) - (/\S+)", done.stdout, re.MULTILINE)
-    return {path: found.count(path) for path in found}
 
 
 def view(*words: object) -> str:

@@ -24,7 +24,7 @@ from telerig.io.report.page.figures import (
     draw_curves,
     drawing,
 )
-from telerig.io.report.plot.spectrum import Spectrum, shake_spectrum, velocity_spectrum
+from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.smoothing.bubbles import BUBBLE_PICTURES
 from telerig.io.report.run.tracking.scene import track_colour
 from telerig.io.results.folders.smoothing import (
@@ -37,6 +37,7 @@ from telerig.io.results.folders.smoothing import (
     shake_rms_um,
 )
 from telerig.short_text import is_number, number
+from telerig.spectra import Spectrum
 from telerig.statistics import median, rms
 
 PLACES = ("first", "bubbles", "lab", "taken", "velocity", "shake", "spectra", "white")

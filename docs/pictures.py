@@ -2,13 +2,15 @@
 
 It runs `telerig demo` and a small batch in a temporary folder (some minutes), and draws the
 pictures of their reports, a frame of each film, and which folder imports which. The two pictures of
-whole pages need chromium or Chrome; without a browser they stay as they are. Needs telerig[dev].
+whole pages need chromium or Chrome, those of the viewer what docs/viewer.py needs; without it they
+stay as they are. Needs telerig[dev].
 """
 
 from __future__ import annotations
 
 import argparse
 import base64
+import re
 import shutil
 import subprocess
 import sys
@@ -23,6 +25,7 @@ import av
 import grimp
 import networkx as nx
 import numpy as np
+import viewer
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -39,7 +42,6 @@ FOLDER = Path(__file__).parent / "pictures"
 DPI = 150
 COLOURS = 64
 LARGEST_BYTES, ALL_BYTES = 150_000, 700_000
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPENED = ("telerig.estimator", "telerig.io")
 """Folders that are shown as their inner folders in the picture of the imports."""
 FLOOR_COLOURS = {"rig": "#d9ead3", "factors": "#fce5cd", "io": "#d0e0f0", "estimator": "#fff2cc"}
@@ -62,12 +64,44 @@ def pictures(work: Path) -> Iterator[tuple[str, Image.Image]]:
         with av.open(str(run / "film" / film)) as film:
             frames = list(film.decode(video=0))
         yield name, frames[int(share * len(frames))].to_image()
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if viewer.missing():
+        sys.stdout.write(f"not installed: {viewer.missing()}; the viewer's pictures stay\n")
+    else:
+        yield from viewer_pictures(calibration, run, work)
+    browser = next(filter(None, map(shutil.which, viewer.BROWSERS)), None)
     if browser is None:
         sys.stdout.write("no browser: report.png and batch.png stay as they are\n")
         return
     yield "report", screenshot(browser, parts_of_report(calibration), (1280, 1500), work)
     yield "batch", screenshot(browser, batch_page(work / "batch"), (1280, 1700), work)
+
+
+def viewer_pictures(calibration: Path, run: Path, work: Path) -> Iterator[tuple[str, Image.Image]]:
+    """Yield pictures of the viewer: a calibration, a run, and the page's wrong join."""
+    wrong = wrong_join(work / "pair")
+    for name, folder in (("calibration", calibration), ("run", run), ("join", wrong)):
+        yield f"viewer-{name}", shrunk(viewer.viewer_picture(folder))
+
+
+def wrong_join(place: Path) -> Path:
+    """Return the results of docs/viewer.md before its correction, from the blocks of the page."""
+    page = (FOLDER.parent / "viewer.md").read_text(encoding="utf-8")
+    code = "".join(re.findall(r"^(?:import|found|late|kept).*\n", page, re.MULTILINE))
+    telerig("simulate", "rise", "--no-images", "--bubbles", "2", "--frames", "40", "--seed", "1",
+            "--out", place)  # fmt: skip
+    telerig("calibrate", place, "--quiet", "--no-report")
+    telerig("track", place / "runs" / "rise", "--quiet", "--no-report")
+    subprocess.run(
+        [sys.executable, "-c", f"import pandas as pd\n{code}"], check=True, cwd=place.parent
+    )
+    telerig("track", place / "runs" / "rise", "--quiet", "--no-report")
+    return place / "results" / "rise"
+
+
+def shrunk(picture: Image.Image) -> Image.Image:
+    """Return a picture at three quarters."""
+    size_px = (picture.width * 3 // 4, picture.height * 3 // 4)
+    return picture.resize(size_px, Image.Resampling.LANCZOS)
 
 
 def telerig(*arguments: str | Path, code: int = 0) -> None:
@@ -139,7 +173,7 @@ def screenshot(browser: str, text: str, size_px: tuple[int, int], work: Path) ->
         ],
         check=True, capture_output=True, timeout=120,
     )  # fmt: skip
-    return Image.open(file).resize((width * 3 // 4, height * 3 // 4), Image.Resampling.LANCZOS)
+    return shrunk(Image.open(file))
 
 
 def folder_graph() -> nx.DiGraph:

@@ -13,14 +13,11 @@ from telerig.arrays import Array
 from telerig.io.report.calibration.rig import camera_outline, rig_outline
 from telerig.io.report.page.figures import KEPT, LEFT_OUT, camera_colour
 from telerig.io.results.folders.calibration import CalibrationResults
-from telerig.io.view.names import RIG, VIEW, need_rerun, of_image, path
+from telerig.io.view.names import DEVIATIONS, MAGNIFIED, RIG, VIEW, need_rerun, of_image, path
 from telerig.io.view.stream import grey_levels, log_image, rgb
 from telerig.rig.camera import Camera
 
 Images = Callable[[str, str], NDArray[Any] | None]
-MAGNIFIED = 1_000.0
-"""Residuals are drawn so many times as long as they are."""
-_DEVIATIONS = 100.0
 _BOX = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
 
 
@@ -47,10 +44,11 @@ def log_calibration(
         for camera in results.camera_names:
             _log_view(stream, results, rejected, camera, view, image, levels[camera])
     plates = outline.plates_mm[:, [0, 1, 2, 3, 0]]
-    grey = [150, 150, 150, 80]
-    stream.log(f"{RIG}/all_poses", rr.LineStrips3D(list(plates), colors=grey), static=True)
+    thin = rr.Radius.ui_points(0.5)
+    poses = rr.LineStrips3D(list(plates), colors=[170, 170, 170], radii=thin)
+    stream.log(f"{RIG}/all_poses", poses, static=True)
     off = results.points_mm - _flat(results.points_mm)
-    arrows = rr.Arrows3D(origins=results.points_mm, vectors=_DEVIATIONS * off,
+    arrows = rr.Arrows3D(origins=results.points_mm, vectors=DEVIATIONS * off,
                          labels=[str(d) for d in results.dot_ids], show_labels=False)  # fmt: skip
     stream.log("target/deviations", arrows, static=True)
 

@@ -10,8 +10,11 @@ from telerig.errors import InputError
 FRAME, TIME, VIEW = "frame", "time", "view"
 """The time lines: frames and seconds of a run, views of a calibration."""
 RIG, SPACE, BODIES, PATHS = "rig", "space", "space/bubbles", "space/paths"
+MAGNIFIED, DEVIATIONS = 1_000.0, 100.0
+"""Residuals, and deviations of the dots, are drawn so many times as long as they are."""
 SHOWN_S = 10.0
 """How much of its curves a live view shows."""
+SPACE_TITLE = "paths; grey: triangulated, and a band of 2 sd"
 PLOTS = {
     "ray_miss_um": "ray miss / µm",
     "step_mm": "way from frame to frame / mm",
@@ -76,12 +79,15 @@ def run_layout(
     if live == TIME:
         begin = rrb.TimeRangeBoundary.cursor_relative(seconds=-SHOWN_S)
         ranges = [rrb.VisibleTimeRange(TIME, start=begin, end=rrb.TimeRangeBoundary.infinite())]
-    images = [rrb.Spatial2DView(origin=of_image(c), name=f"camera {c}") for c in cameras]
+    images = [
+        rrb.Spatial2DView(origin=of_image(c), name=f"{c}: outlines with ids, rays of other cameras")
+        for c in cameras
+    ]
     series = [
         rrb.TimeSeriesView(origin=f"plots/{key}", name=PLOTS[key], time_ranges=ranges)
         for key in plots
     ]
-    middle: list[Any] = [rrb.Spatial3DView(origin=SPACE, name="paths")] if space else []
+    middle: list[Any] = [rrb.Spatial3DView(origin=SPACE, name=SPACE_TITLE)] if space else []
     if spectra:
         title = "spectrum of the shake / (µm/√Hz) over Hz"
         middle.append(rrb.BarChartView(origin="spectra", name=title))
@@ -98,13 +104,15 @@ def calibration_layout(cameras: Sequence[str]) -> Any:
     need_rerun()
     import rerun.blueprint as rrb
 
-    images = [rrb.Spatial2DView(origin=of_image(c), name=f"camera {c}") for c in cameras]
+    words = f"green: kept, red: left out, orange: residual x {MAGNIFIED:g}"
+    images = [rrb.Spatial2DView(origin=of_image(c), name=f"{c}; {words}") for c in cameras]
+    deviations = f"dots off a plane, x {DEVIATIONS:g}"
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(*images),
             rrb.Vertical(
-                rrb.Spatial3DView(origin=RIG, name="rig and poses"),
-                rrb.Spatial3DView(origin="target", name="deviations of the dots, magnified"),
+                rrb.Spatial3DView(origin=RIG, name="rig; grey: poses of all views"),
+                rrb.Spatial3DView(origin="target", name=deviations),
                 row_shares=[2, 1],
             ),
         ),

@@ -118,11 +118,13 @@ def log_results(
     every = range(count)[slice(*frames)] if frames else range(count)
     shown = every[:: -(-len(every) * len(tracks.cameras) // MOST_IMAGES) or 1]
     smoothed = ("height_less_line_mm", "shake_um", "speed_mm_s", "encoder_residual_um")
-    plots = ["ray_miss_um", "step_mm", "outline_chi2", *(() if smoothing is None else smoothed)]
+    plots = ["ray_miss_um", "step_mm", *(() if smoothing is None else smoothed)]
+    found = read_outlines(place / "detections.csv", tracks.cameras)
+    if "chi2_dof" in found and found["chi2_dof"].notna().any():
+        plots.insert(2, "outline_chi2")
     if data is not None and data.accelerometers is not None:
         plots.append("accelerometers_m_s2")
     stream.send_blueprint(run_layout(tracks.cameras, plots, spectra=smoothing is not None))
-    found = read_outlines(place / "detections.csv", tracks.cameras)
     log_run(stream, tracks, smoothing, cameras or (), found, image, list(shown))
     if data is not None:
         log_sensors(stream, data, smoothing)

@@ -231,4 +231,7 @@ def test_one_command_makes_all_pictures(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
     made = {file.name for file in (tmp_path / "made").iterdir()}
     missing = {file.name for file in (ROOT / "docs" / "pictures").iterdir()} - made
-    assert missing == ({"report.png", "batch.png"} if "no browser" in done.stdout else set())
+    may = {"report.png", "batch.png"} if "no browser" in done.stdout else set()
+    if "not installed" in done.stdout:
+        may |= {f"viewer-{name}.png" for name in ("calibration", "join", "run")}
+    assert missing == may

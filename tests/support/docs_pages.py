@@ -37,6 +37,7 @@ NOT_RUN = {
     "figures": "is a layout, not a program",
     "install": "makes an environment; .ci/run runs it literally",
     "plate": "needs images of a plate; a test draws them",
+    "viewer": "opens a window; a test shows them in a browser",
     "slurm": "needs a Slurm cluster; the script that it submits is run",
 }
 """Why a block with this key is not run."""

@@ -24,19 +24,16 @@ from unittest.mock import patch
 import av
 import grimp
 import networkx as nx
-import numpy as np
 import viewer
 from matplotlib.figure import Figure
 from PIL import Image
 
-from telerig.io.report.calibration import dot_fit, rig, target
-from telerig.io.report.calibration import figures as calibration_figures
-from telerig.io.report.run.smoothing import figures
-from telerig.io.report.run.tracking.figures import ray_miss_histogram
-from telerig.io.report.run.tracking.two_rays import two_rays
+from telerig.io.report.calibration import report as calibration_report
+from telerig.io.report.page import figures
+from telerig.io.report.run import report as run_report
 from telerig.io.results.folders.calibration import read_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
-from telerig.io.results.folders.tracking import read_track_results, run_cameras
+from telerig.io.results.folders.tracking import read_track_results
 
 FOLDER = Path(__file__).parent / "pictures"
 DPI = 150
@@ -112,28 +109,31 @@ def telerig(*arguments: str | Path, code: int = 0) -> None:
 
 
 def calibration_pictures(folder: Path) -> Iterator[tuple[str, Any]]:
-    results = read_results(folder)
-    yield "rig", rig.rig_plan(results)
-    yield "coverage", calibration_figures.coverage(results, 0)
-    yield "tilts", calibration_figures.tilts(results)
-    yield "residuals", calibration_figures.residual_field(results, 0)
-    yield "residual-histogram", calibration_figures.residual_histogram(results)
-    yield "target", target.target_pictures(results)[0]
-    yield "dot", dot_fit.dot_pictures(results.dot_example)[-1]
+    titles = {
+        "The rig and all poses of the target": "rig", "Coverage, camera left": "coverage",
+        "Tilts of the target": "tilts", "Residuals, camera left": "residuals",
+        "Distribution of the residuals": "residual-histogram",
+        "Print errors in the plane": "target",
+    }  # fmt: skip
+    return of_page(calibration_report.page_of(read_results(folder), (), folder), titles)
 
 
 def run_pictures(folder: Path) -> Iterator[tuple[str, Any]]:
     tracks = read_track_results(folder)
-    yield "ray-miss", ray_miss_histogram(tracks)
-    cameras, _ = run_cameras(folder, tracks)
-    smoothed = read_smoothing_results(folder, np.array([0.0, -1.0, 0.0]))
-    assert cameras is not None and smoothed is not None
-    yield "two-rays", two_rays(tracks, cameras)
-    up, first = 1, smoothed.cameras[0]
-    yield "closer", figures.closer(smoothed, up)
-    yield "velocity", figures.velocities(smoothed, up)
-    yield "shake", figures.shake_in_time(smoothed, first, "y")
-    yield "shake-spectra", figures.shake_spectra(smoothed, first)
+    titles = {
+        "Ray miss": "ray-miss", "Height of the longest track, before and after": "closer",
+        "Rise velocity": "velocity", "Shake of camera left": "shake",
+        "Spectrum of the shake of camera left": "shake-spectra",
+    }  # fmt: skip
+    smoothed = read_smoothing_results(folder, tracks.up)
+    return of_page(run_report.page_of(tracks, smoothed, (), folder), titles)
+
+
+def of_page(page: Any, titles: dict[str, str]) -> Iterator[tuple[str, Any]]:
+    """Yield name and picture of the figures of a page that have these titles."""
+    for block in (*page.look, *(one for section in page.sections for one in section.contents)):
+        if isinstance(block, figures.Figure) and block.title in titles:
+            yield titles[block.title], figures.drawn(block)
 
 
 def _as_png(figure: Figure, stream: Any, **options: Any) -> None:

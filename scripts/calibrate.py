@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,7 +27,6 @@ from telerig.scripts.console import (
 if TYPE_CHECKING:
     from telerig.estimator.calibration.calibrate import CalibrationRun
     from telerig.estimator.calibration.result.calibration import Calibration
-    from telerig.estimator.dots.dataset_dots import DatasetDots
     from telerig.io.dataset.dataset import Dataset
 
 
@@ -108,10 +106,9 @@ def calibrate(
                     raise InputError(
                         f"{option} goes with --watch", todo="add --watch, or leave it out"
                     )
-            begin = None if write_report is None else write_report.begin
             data = load_dataset(dataset, source=chosen.source)
             used = fingerprints(out or data.results / "calibration", sources(data))
-            run = _at_once(data, quiet, settings, begin)
+            run = _at_once(data, quiet, settings)
         folder = out or data.results / "calibration"
         change = None if earlier is None else compare_calibrations(earlier, run.calibration)
         write_results(
@@ -128,20 +125,13 @@ def calibrate(
         raise typer.Exit(EXIT_REJECTED)
 
 
-def _at_once(
-    data: Dataset,
-    quiet: bool,
-    settings: dict[str, Any],
-    on_dots: Callable[[DatasetDots], object] | None,
-) -> CalibrationRun:
-    """Calibrate the dataset as it is now. on_dots : called when dots are detected."""
+def _at_once(data: Dataset, quiet: bool, settings: dict[str, Any]) -> CalibrationRun:
+    """Calibrate the dataset as it is now."""
     from telerig.estimator.calibration.calibrate import check_options, detect, run_calibration
 
     check_options(**settings, cameras=list(data.rig.cameras))
     with progress(quiet) as stage:
         detected = detect(data, stage=stage, pictures=True)
-        if detected is not None and on_dots is not None:
-            on_dots(detected)
         return run_calibration(data, **settings, stage=stage, detected=detected)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from telerig.estimator.calibration.calibrate import CalibrationRun
 from telerig.io.files.atomic import plain, write_json_atomic
-from telerig.io.machine.parallel import Assistant, assistant
+from telerig.io.machine.parallel import assistant
 from telerig.io.results.calibration import ComparisonFile
 from telerig.io.results.inputs import Input, Source, fingerprints
 from telerig.io.results.manifest import replaced_results
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.dots.dataset_dots import DatasetDots
     from telerig.io.dataset.dataset import Dataset
-    from telerig.io.report.page.figures import Picture
 
 
 def input_files(dataset: Dataset) -> list[Path]:
@@ -53,57 +53,33 @@ def sources(dataset: Dataset) -> list[Path | Source]:
     ]
 
 
-def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
-    """Write the HTML report of a results folder, and return its path.
-
-    dot : pictures of the example dot if they are drawn already; None draws them.
-    """
+def write_report(folder: Path) -> Path:
+    """Write the HTML report of a results folder, and return its path."""
     from telerig.io.report.calibration.report import write_calibration_report
 
-    return write_calibration_report(folder, dot=dot)
-
-
-class ReportBeside:
-    """Write the report of a results folder in a second process, the assistant.
-
-    It draws the pictures that need no calibration while this process calibrates.
-    """
-
-    def __init__(self, call: Assistant) -> None:
-        self._call = call
-        self._dot: Callable[[], list[Picture] | None] = lambda: None
-
-    def begin(self, detected: DatasetDots) -> None:
-        """Start to draw the pictures that need the detected dots only."""
-        self._dot = self._call.begin(_draw_dot, detected.example)
-
-    def __call__(self, folder: Path) -> Path:
-        return self._call(write_report, folder, self._dot())
+    return write_calibration_report(folder)
 
 
 @contextmanager
-def report_beside(wanted: bool) -> Iterator[ReportBeside | None]:
-    """Yield a `ReportBeside`, whose process ends with the context; None if no report is wanted."""
+def report_beside(wanted: bool) -> Iterator[Callable[[Path], object] | None]:
+    """Yield `write_report` in a second process, which loads what it needs meanwhile.
+
+    That process ends with the context. None if no report is wanted.
+    """
     if not wanted:
         yield None
         return
     import pandas  # noqa: F401 - both processes need it, and its import takes 0.2 s
 
     with assistant(_prepare_report) as call:
-        yield ReportBeside(call)
-
-
-def _draw_dot(example: Mapping[str, Any]) -> list[Picture]:
-    from telerig.io.report.calibration.dot_fit import dot_pictures
-
-    return dot_pictures(example)
+        yield partial(call, write_report)
 
 
 def _prepare_report() -> None:
     import telerig.io.report.calibration.report  # noqa: F401
     from telerig.io.report.page.page import prepare_page
 
-    prepare_page("template_calibration.html")
+    prepare_page()
 
 
 def write_results(
@@ -165,7 +141,7 @@ def write_uncertainty(calibration: Calibration, path: Path) -> None:
 
 
 def write_detections(detected: DatasetDots, folder: Path) -> None:
-    """Write `rejected.csv` and, if they were made, overlays and `dot_example.npz` into a folder."""
+    """Write `rejected.csv` and, if they were made, overlays into a folder."""
     from telerig.io.files.csv_table import write_table
 
     write_table(detected.rejected, folder / "rejected.csv")
@@ -173,6 +149,3 @@ def write_detections(detected: DatasetDots, folder: Path) -> None:
         target = folder / "overlays" / image.camera / f"{image.view}.jpg"
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(image.overlay)
-    if detected.example:  # for the picture of the 2004 paper's figure 2
-        with (folder / "dot_example.npz").open("wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **detected.example)

@@ -26,7 +26,6 @@ from telerig.estimator.dots.dataset_dots import (
     ImageDots,
     detect_image,
     detected_together,
-    with_example,
 )
 from telerig.estimator.dots.locate import REJECTED
 from telerig.io.dataset.dataset import Dataset, NoViewsError, View, load_dataset
@@ -255,7 +254,6 @@ def watch(
         tell("stopped; calibrating with the images that have arrived")
     detected = folder.detected()
     assert folder.dataset is not None
-    detected = with_example(folder.dataset, detected)
     run = run_calibration(folder.dataset, detected=detected, **options)
     return folder.dataset, run
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -12,13 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.arrays import Array
 from telerig.errors import DetectionError, InputError
-from telerig.estimator.dots.fit.blurred_ellipse import (
-    PIXEL_VARIANCE_PX2,
-    coverage_on_grid,
-    shape_from_axes,
-)
 from telerig.estimator.dots.fit.candidates import Polarity
 from telerig.estimator.dots.grid.agreement import PossibleNumbers, decided_by_pair
 from telerig.estimator.dots.grid.numbering import (
@@ -177,51 +171,6 @@ def rejected_table(measured: DotMeasurement, index: Any, reason: Any) -> pd.Data
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=REJECTED)
 
 
-REACH = 1.7
-"""Half the width of the example's patch is this many semi-major axes plus 5 px."""
-
-
-def dot_example(
-    image: NDArray[Any], u_px: float, v_px: float, a_px: float, *, polarity: Any
-) -> dict[str, Array] | None:
-    """Fit the dot nearest to a pixel, as an example for the report; None if it is not found.
-
-    Returns "patch" and "model", (h, w) measured and fitted grey levels; "u0" and "v0", the crop's
-    first pixel; the fitted ellipse "u_px", "v_px", "a_px", "b_px" and "angle_rad"; "noise", the
-    standard deviation of a grey level.
-    """
-    half = int(np.ceil(REACH * a_px + 5))
-    v0, u0 = max(0, round(v_px) - half), max(0, round(u_px) - half)
-    patch = image[v0 : round(v_px) + half + 1, u0 : round(u_px) + half + 1].astype(float)
-    found = measure_dots(patch, polarity=polarity).dots
-    if not len(found):
-        return None
-    distance = np.hypot(found["u_px"] + u0 - u_px, found["v_px"] + v0 - v_px)
-    dot = found.iloc[int(np.argmin(distance))]
-    sigma = float(np.sqrt(dot["blur_px"] ** 2 + PIXEL_VARIANCE_PX2))
-    shape = shape_from_axes(dot["a_px"], dot["b_px"], dot["angle_rad"])
-    columns, rows = (np.arange(n, dtype=float) for n in patch.shape[::-1])
-    u, v = np.meshgrid(columns, rows)
-    centre = (dot["u_px"], dot["v_px"])
-    covered, _ = coverage_on_grid(columns, rows, centre, shape, sigma)
-    model = _with_levels(patch, covered, u - dot["u_px"], v - dot["v_px"])
-    numbers = {n: np.array(dot[n]) for n in ("a_px", "b_px", "angle_rad", "noise")}
-    place = {
-        "u0": np.array(float(u0)), "v0": np.array(float(v0)),
-        "u_px": np.array(dot["u_px"] + u0), "v_px": np.array(dot["v_px"] + v0),
-    }  # fmt: skip
-    return {"patch": patch, "model": model, **place, **numbers}
-
-
-def _with_levels(patch: Array, covered: Array, du: Array, dv: Array) -> Array:
-    """Return the patch of best-fitting grey levels and gradients for a known coverage."""
-    one = np.ones_like(du)
-    terms = [one, du, dv, covered, covered * du, covered * dv]
-    design = np.stack([t.ravel() for t in terms], -1)
-    levels, *_ = np.linalg.lstsq(design, patch.ravel(), rcond=None)
-    return np.asarray((design @ levels).reshape(patch.shape))
-
-
 Progress = Callable[[int, int], None]
 
 MEGAPIXELS_FOR_WORKERS = 40
@@ -258,14 +207,12 @@ class DatasetDots:
     """What was found in all images of a dataset, in the order of views and cameras.
 
     dots, rejected : tables of all images, each row with its view and camera.
-    example : the fit of one typical dot, as `dot_example` returns it; empty without overlays.
     """
 
     dots: pd.DataFrame
     rejected: pd.DataFrame
     images: tuple[ImageDots, ...] = ()
     findings: tuple[Finding, ...] = ()
-    example: Mapping[str, Array] = field(default_factory=dict)
 
 
 def detect_dataset(
@@ -280,7 +227,7 @@ def detect_dataset(
 
     progress : is called with (number of images done, number of images).
     workers : number of processes; None chooses it from the number of images.
-    overlays : whether to draw the overlay of each image, and to fit one dot as an example.
+    overlays : whether to draw the overlay of each image.
     meanwhile : is called in this process while the worker processes detect.
 
     Raises InputError for an image that cannot be read, and DetectionError if no image shows the
@@ -297,7 +244,7 @@ def detect_dataset(
         if progress is not None:
             progress(done, len(tasks))
     together = detected_together(dataset, found)
-    return with_example(dataset, together) if overlays else together
+    return together
 
 
 def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
@@ -399,21 +346,6 @@ def _numbered_as(dataset: Dataset, image: ImageDots, choice: int) -> ImageDots:
         return numbered_so
     view = next(v for v in dataset.views if v.name == image.view)
     return _with_overlay(numbered_so, dataset.image(view, image.camera))
-
-
-def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
-    """Return the result with an example added: the fit of the dot with the median chi-square.
-
-    The image of this dot is read again.
-    """
-    order = np.argsort(detected.dots["chi2_dof"].to_numpy())
-    chosen = detected.dots.iloc[int(order[len(order) // 2])]
-    view = next(v for v in dataset.views if v.name == chosen["view"])
-    example = dot_example(
-        dataset.image(view, chosen["camera"]), float(chosen["u_px"]), float(chosen["v_px"]),
-        float(chosen["a_px"]), polarity=dataset.target.polarity,
-    )  # fmt: skip
-    return replace(detected, example=example or {})
 
 
 def _joined(images: list[ImageDots], name: str) -> pd.DataFrame:

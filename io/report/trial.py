@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,18 +12,11 @@ import pandas as pd
 
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import write_text_atomic
+from telerig.io.report import plot
 from telerig.io.report.film.views import outlines_px
 from telerig.io.report.overlays import draw_bubble_overlay
-from telerig.io.report.page.figures import (
-    CAMERA_COLOURS,
-    Curve,
-    Picture,
-    data_uri,
-    draw_curves,
-    drawing,
-)
-from telerig.io.report.page.page import Row, Section, render_sections
-from telerig.io.report.plot.spectrum import shake_spectrum
+from telerig.io.report.page.figures import Figure, Picture, data_uri
+from telerig.io.report.page.page import Page, Row, Section, Verdict, render_page, table
 from telerig.short_text import counted
 
 TERMS = ("Verdict", "Covariance, standard deviation (sd)")
@@ -43,27 +37,23 @@ def write_trial_report(
     `telerig.Tracks`; None without tracks. shake : as in shake.csv; None where it was not smoothed.
     """
     bad = [check for check in checks if check[1] == "failure"]
-    verdict = {
-        "colour": "rejected" if bad else "good",
-        "headline": f"{counted(len(bad), 'thing')} to mend before the run" if bad else "READY",
-        "sentences": [f"{name}: {words}. To do: {todo}." for name, _, words, todo in bad]
-        or ["Nothing that was looked at is beyond its limit."],
-        "warnings": [words for _, status, words, _ in checks if status == "warning"],
-    }
-    rows = tuple(
+    verdict = Verdict(
+        f"{counted(len(bad), 'thing')} to mend before the run" if bad else "READY",
+        "rejected" if bad else "good",
+        tuple(f"{name}: {words}. To do: {todo}." for name, _, words, todo in bad)
+        or ("Nothing that was looked at is beyond its limit.",),
+        tuple(words for _, status, words, _ in checks if status == "warning"),
+    )
+    rows = [
         Row((name, _SIGNS[status], words, todo), strong=status == "failure")
         for name, status, words, todo in checks
-    )
-    pictures = (*_views(run, detections), *_shake(run, shake))
-    page = render_sections(
+    ]
+    head = ("check", "", "found", "to do")
+    page = render_page(Page(
         "telerig doctor of a trial recording", "Trial recording", run.name, verdict,
-        [
-            Section(pictures=pictures),
-            Section("What was looked at", head=("check", "", "found", "to do"), rows=rows,
-                    numbers=(99, 99)),
-        ],
-        TERMS,
-    )  # fmt: skip
+        [*_views(run, detections), *_shake(run, shake)],
+        [Section("checks", "What was looked at", table(head, rows, (99, 99)))], TERMS,
+    ))  # fmt: skip
     file.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(file, page)
 
@@ -91,35 +81,14 @@ def _views(run: RunData, detections: pd.DataFrame | None) -> Iterator[Picture]:
         )  # fmt: skip
 
 
-def _shake(run: RunData, shake: pd.DataFrame | None) -> Iterator[Picture]:
+def _shake(run: RunData, shake: pd.DataFrame | None) -> Iterator[Figure]:
     """Yield each camera's shake in time, and its spectrum."""
     if shake is None:
         return
     for camera in run.cameras:
-        t_s = shake["t_s"].to_numpy(float)
-        with drawing(1.9, legend="above", xlabel="time / s", ylabel="shake / µm") as sheet:
-            draw_curves(
-                sheet,
-                (
-                    Curve(t_s, 1e3 * shake[f"{camera}_{axis}_mm"].to_numpy(float),
-                          CAMERA_COLOURS[k % len(CAMERA_COLOURS)], axis)
-                    for k, axis in enumerate("xyz")
-                ),
-            )  # fmt: skip
-        yield Picture(f"Shake of camera {camera}", sheet.source, "Offset from the carriage.")
-        spectrum = shake_spectrum(shake, camera)
-        if spectrum is None:
-            continue
-        with drawing(
-            1.9, legend="above", grid=True, xlabel="frequency / Hz", ylabel="µm² / Hz",
-            xscale="log", yscale="log",
-        ) as sheet:  # fmt: skip
-            for k, axis in enumerate("xyz"):
-                values = spectrum.density[1:, k]
-                if (values > 0).any():
-                    sheet.axes.plot(spectrum.frequency_hz[1:], values, label=axis,
-                                    color=CAMERA_COLOURS[k % len(CAMERA_COLOURS)])  # fmt: skip
-        yield Picture(
-            f"Spectrum of the shake of camera {camera}", sheet.source,
-            "A narrow peak is a resonance of the rig, which can be stiffened or damped.",
-        )  # fmt: skip
+        yield Figure(f"Shake of camera {camera}", partial(plot.shake, shake, camera),
+                     "Offset from the carriage.", 2.2)  # fmt: skip
+        yield Figure(f"Spectrum of the shake of camera {camera}",
+                     partial(plot.spectrum, shake, camera),
+                     "A narrow peak is a resonance of the rig, which can be stiffened or damped.",
+                     2.2)  # fmt: skip

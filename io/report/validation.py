@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from telerig.io.files.atomic import write_text_atomic
-from telerig.io.report.page.figures import CAMERA_COLOURS, Curve, Picture, draw_curves, drawing
-from telerig.io.report.page.page import Figure, Row, Section, render_sections
+from telerig.io.report import plot
+from telerig.io.report.page.figures import Figure
+from telerig.io.report.page.page import (
+    Block,
+    Page,
+    Row,
+    Section,
+    Tile,
+    Tiles,
+    Verdict,
+    render_page,
+    table,
+    texts,
+)
 from telerig.io.results.validation import (
     HEAD,
     LARGEST_NEES,
@@ -36,12 +47,10 @@ def write_validation_report(folder: Path, out: Path | None = None) -> Path:
 def render(content: ValidationFile) -> str:
     """Return the page as text."""
     passed = content.verdict is Stillness.PASSED
-    verdict = {
-        "colour": "good" if passed else "rejected",
-        "headline": str(content.verdict),
-        "sentences": validation_words(content),
-        "warnings": content.warnings,
-    }
+    verdict = Verdict(
+        str(content.verdict), "good" if passed else "rejected",
+        tuple(validation_words(content)), tuple(content.warnings),
+    )  # fmt: skip
     rows = tuple(
         Row(cells, strong=mark.verdict is Stillness.FAILED)
         for cells, mark in zip(table_rows(content), content.marks)
@@ -52,47 +61,40 @@ def render(content: ValidationFile) -> str:
         "still in the laboratory. A mark fails if the NEES of its position or of its velocity is "
         f"above {LARGEST_NEES:g}, or if the smoothing finds its measurements CONTRADICTED."
     )
-    pictures = tuple(_picture(mark) for mark in content.marks[:_MOST_DRAWN])
-    return render_sections(
-        "telerig validation of a run with marks", "Validation", content.run, verdict,
+    marks: list[Block] = [*texts(lead, small=True), *table(HEAD, rows, (3, 10))]
+    figures = [_figure(mark) for mark in content.marks]
+    return render_page(Page(
+        "telerig validation of a run with marks", "Validation", content.run, verdict, figures[:3],
         [
-            Section(tiles=tuple(_figures(content))),
-            Section("Mark by mark", lead, head=HEAD, rows=rows, numbers=(3, 10)),
-            Section("In time", pictures=pictures),
+            Section("key", "", [Tiles(tuple(_tiles(content)))]),
+            Section("marks", "Mark by mark", marks),
+            Section("time", "Further marks in time", figures[3:_MOST_DRAWN]),
         ],
         TERMS,
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
-def _figures(content: ValidationFile) -> Iterator[Figure]:
+def _tiles(content: ValidationFile) -> Iterator[Tile]:
     for entry in content.overall:
-        yield Figure(
+        yield Tile(
             f"error, {entry.beside}", f"{entry.error_um:.3g} µm",
             f"stated {entry.sd_um:.3g} µm, NEES {entry.nees:.2f}; {entry.unsmoothed_um:.3g} µm "
             "without smoothing",
         )  # fmt: skip
-        yield Figure(
+        yield Tile(
             f"velocity, {entry.beside}", f"{entry.velocity_error_mm_s:.2g} mm/s",
             f"stated {entry.velocity_sd_mm_s:.2g} mm/s, NEES {entry.velocity_nees:.2f}",
         )  # fmt: skip
 
 
-def _picture(mark: WithheldMark) -> Picture:
+def _figure(mark: WithheldMark) -> Figure:
     """Distance from the mean over time, with bands of stated standard deviations."""
-    t = np.array(mark.t_s)
-    axes = "xyz" if len(mark.off_um) == 3 else "uv"
-    with drawing(1.9, legend="above", xlabel="time / s", ylabel="off / µm") as sheet:
-        draw_curves(
-            sheet,
-            (
-                Curve(t, np.array(off), CAMERA_COLOURS[i % len(CAMERA_COLOURS)], axes[i],
-                      np.array(sd))
-                for i, (off, sd) in enumerate(zip(mark.off_um, mark.sd_um_of_time))
-            ),
-        )  # fmt: skip
-    return Picture(
-        f"Mark {mark.mark}, {mark.beside}", sheet.source,
-        f"Distance of the smoothed path from its mean, less the motion that the mark was given, "
-        f"along the axes of the {'rig' if len(mark.off_um) == 3 else 'image'}. It should stay "
-        f"within the bands. Seen by {' and '.join(mark.cameras)}.",
-    )  # fmt: skip
+    space = "rig" if len(mark.off_um) == 3 else "image"
+    return Figure(
+        f"Mark {mark.mark}, {mark.beside}",
+        partial(plot.offsets, mark.t_s, mark.off_um, mark.sd_um_of_time),
+        "Distance of the smoothed path from its mean, less the motion that the mark was given, "
+        f"along the axes of the {space}. It should stay within the bands. Seen by "
+        f"{' and '.join(mark.cameras)}.",
+        1.9,
+    )

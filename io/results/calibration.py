@@ -465,7 +465,6 @@ class ComparisonFile(Record):
 
 
 _UNCERTAINTY = ("points_mm", "calibration_mm2", "measurement_mm2", "sigma_px")
-_DOT_EXAMPLE = ("patch", "model", "u0", "v0", "u_px", "v_px", "a_px", "b_px", "angle_rad", "noise")
 
 
 def read_joint_covariance(file: Path) -> tuple[tuple[str, ...], Array]:
@@ -509,24 +508,6 @@ def read_uncertainty(file: Path) -> dict[str, Array]:
     shapes = [(count, 3), (count, 3, 3), (count, 3, 3), ()]
     if [arrays[name].shape for name in _UNCERTAINTY] != shapes or count < 1:
         raise _broken(file, "its arrays do not fit together")
-    return arrays
-
-
-def read_dot_example(file: Path) -> dict[str, Array]:
-    """Read dot_example.npz, the image of one dot and the model that was fitted to it.
-
-    Returns the arrays by name: patch and model (rows, columns) are the measured and the fitted
-    image; u0, v0 (px) are the image column and row of the patch's first pixel; u_px, v_px, a_px,
-    b_px and angle_rad describe the fitted ellipse. The dictionary is empty when the file does not
-    exist.
-    Raises InputError for a file that cannot be read or whose two images differ in shape.
-    """
-    if not file.is_file():
-        return {}
-    arrays = _floats(file, _DOT_EXAMPLE)
-    patch, model = arrays["patch"], arrays["model"]
-    if patch.ndim != 2 or patch.shape != model.shape or min(patch.shape) < 3:
-        raise _broken(file, f"patch {patch.shape} and model {model.shape} are no pair of images")
     return arrays
 
 

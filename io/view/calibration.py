@@ -10,8 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
-from telerig.io.report.calibration.rig import camera_outline, rig_outline
-from telerig.io.report.page.figures import KEPT, LEFT_OUT, camera_colour
+from telerig.io.report.plot.axes import KEPT, LEFT_OUT, camera_colour
+from telerig.io.report.plot.outline import camera_outline, rig_outline
 from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.view.names import DEVIATIONS, MAGNIFIED, RIG, VIEW, need_rerun, of_image, path
 from telerig.io.view.stream import grey_levels, log_image, rgb
@@ -31,7 +31,7 @@ def log_calibration(
     """
     rr = need_rerun()
     stream.log(RIG, rr.ViewCoordinates.RDF, static=True)
-    outline = rig_outline(results)
+    outline = rig_outline(results.cameras, results.views, results.points_mm)
     log_cameras(stream, RIG, results.cameras, outline.plates_mm.reshape(-1, 3))
     some = list(results.views)[:3]
     levels = {c: grey_levels([i for v in some if (i := image(c, v)) is not None])

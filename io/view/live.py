@@ -24,7 +24,7 @@ from telerig.io.dataset.run import RunData, RunSource, recordings
 from telerig.io.images.read import list_images, read_image
 from telerig.io.recording.clock import unwrap
 from telerig.io.report.film.views import outlines_of, read_outlines
-from telerig.io.report.page.figures import CAMERA_COLOURS, KEPT, LEFT_OUT, MUTED
+from telerig.io.report.plot.axes import COLOURS, KEPT, LEFT_OUT, MUTED
 from telerig.io.rig_file.description import DeviceDescription
 from telerig.io.tables.smoothing import AXES
 from telerig.io.view.names import (
@@ -190,7 +190,7 @@ class LiveView:
         line.add(arrived_s, values)
         some = slice(None, None, -(-len(arrived_s) // _POINTS))
         plot = "encoder_mm" if line.device.kind == "encoder" else "accelerometers_m_s2"
-        for (axis, series), colour in zip(line.measured(values).items(), CAMERA_COLOURS):
+        for (axis, series), colour in zip(line.measured(values).items(), COLOURS):
             name = f"{device} {axis}".strip()
             self._series(plot, name, arrived_s[some], series[some], colour)
         if "t" in values:

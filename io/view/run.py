@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from telerig.arrays import Array, Ints
 from telerig.io.dataset.run import RunData
 from telerig.io.report.film.views import outlines_px
-from telerig.io.report.page.figures import CAMERA_COLOURS, MUTED, NAIVE, SMOOTHED
-from telerig.io.report.plot.axes import colour_of
+from telerig.io.report.plot.axes import COLOURS, MUTED, NAIVE, SMOOTHED, colour_of
 from telerig.io.report.plot.spectrum import shake_spectrum
 from telerig.io.results.bodies import ellipsoids_of
 from telerig.io.results.folders.smoothing import AXES, SmoothingResults
@@ -295,7 +294,7 @@ def _log_shake(stream: Any, smoothing: SmoothingResults) -> None:
             log_spectrum(stream, camera, spectrum, static=True)
         for axis in smoothing.seen(camera):
             values = 1e3 * shake[f"{camera}_{axis}_mm"].to_numpy(float)
-            colour = CAMERA_COLOURS[AXES.index(axis)]
+            colour = COLOURS[AXES.index(axis)]
             _series(stream, shake, "shake_um", f"{camera} {axis}", values, colour)
 
 
@@ -317,7 +316,7 @@ def log_sensors(stream: Any, run: RunData, smoothing: SmoothingResults | None) -
             _readings(stream, run, "encoder_mm", "encoder", t_s, position, MUTED)
     for name, rows in [] if run.accelerometers is None else run.accelerometers.groupby("sensor"):
         t_s = rows["t_s"].to_numpy(float)
-        for axis, colour in zip(AXES, CAMERA_COLOURS):
+        for axis, colour in zip(AXES, COLOURS):
             values = rows[f"a{axis}_m_s2"].to_numpy(float)
             _readings(stream, run, "accelerometers_m_s2", f"{name} {axis}", t_s, values, colour)
 

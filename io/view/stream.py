@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
-from telerig.io.report.page.figures import CAMERA_COLOURS
+from telerig.io.report.plot.axes import COLOURS
 from telerig.io.tables.smoothing import AXES
 from telerig.io.view.names import FRAME, TIME, need_rerun, of_plot, of_spectrum
 from telerig.spectra import Spectrum
@@ -79,7 +79,7 @@ def log_spectrum(stream: Any, name: str, spectrum: Spectrum, static: bool = Fals
     rr = need_rerun()
     seen = (spectrum.frequency_hz > 0) & (spectrum.frequency_hz <= _MOST_HZ)
     axes = AXES if spectrum.density.shape[1] > 1 else ("",)
-    for axis, density, colour in zip(axes, spectrum.density.T, CAMERA_COLOURS):
+    for axis, density, colour in zip(axes, spectrum.density.T, COLOURS):
         if np.any(density[seen] > 0):
             bars = rr.BarChart(
                 np.sqrt(density[seen]), abscissa=spectrum.frequency_hz[seen], color=rgb(colour)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -148,7 +149,7 @@ def sentence(text: str) -> str:
 
 def no_formula(text: str) -> str:
     """Return a text in which matplotlib takes no name of the user's for a formula."""
-    return text.replace("$", r"\$")
+    return re.sub(r"(?<!\\)\$", r"\\$", text)
 
 
 UNITS = {

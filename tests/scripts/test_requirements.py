@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import hashlib
 import os
 import re
 import sys
@@ -16,8 +15,6 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from places import ROOT
-
-from telerig.io.report.page.page import plotly_javascript
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PAGE = (ROOT / "docs/requirements.md").read_text(encoding="utf-8")
@@ -82,16 +79,3 @@ def test_every_file_of_the_package_is_in_the_wheel() -> None:
         if not any(fnmatch(file.name, pattern) for pattern in patterns.get(package, []))
     ]
     assert left == []
-
-
-def test_what_is_shipped_is_what_the_page_says_with_its_licence() -> None:
-    name, release, licence, digest = re.findall(
-        r"^\| `(.+)` \| plotly\.js ([\d.]+),.*\(`(.+)`\) \| `(\w{64})` \|$", PAGE, re.MULTILINE
-    )[0]
-    file = ROOT / "io/report/page" / name
-    assert hashlib.sha256(file.read_bytes()).hexdigest() == digest
-    assert plotly_javascript() == file.read_text(encoding="utf-8")
-    assert f"plotly.js (gl3d - minified) v{release}" in plotly_javascript()[:200]
-    given = [p for pattern in PYPROJECT["project"]["license-files"] for p in ROOT.glob(pattern)]
-    assert [path.name for path in given] == ["LICENSE", licence]
-    assert "MIT" in PYPROJECT["project"]["license"] and "MIT License" in given[1].read_text()

@@ -26,9 +26,7 @@ _PROBE = """<script>addEventListener("load", function () { setTimeout(function (
   console.log("PROBE " + JSON.stringify({scroll: d.scrollWidth, client: d.clientWidth,
     wide: wide.slice(0, 3), small: pale, first: document.querySelector(".status").textContent,
     top: document.querySelector(".status").getBoundingClientRect().top,
-    scenes: document.querySelectorAll("#scene canvas").length,
-    buttons: Array.from(document.querySelectorAll(".modebar-btn")).map(
-      function (b) { return b.dataset.title; }),
+    height: d.scrollHeight,
     broken: Array.from(document.images).filter(function (i) { return !i.naturalWidth; }).length
   }));
 }, 1500); });</script>"""

@@ -17,12 +17,6 @@ from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
 SIGMA_PX, BUMP_MM = 0.01, 0.05
-SECTIONS = [
-    *("verdict", "key", "parameters", "pose", "model", "residuals", "coverage", "worst", "target"),
-    *("overlays", "dot", "rig", "twin", "notes", "more", "origin"),
-]
-OPTIONAL = ("dots.csv", "covariance.npz", "run.json", "dot_example.npz", "overlays")
-
 _edit = partial(edit, "calibration.json")
 
 
@@ -103,19 +97,6 @@ def _tables(
     return residuals, dots
 
 
-def _dot_example() -> dict[str, Any]:
-    v, u = np.mgrid[0:31, 0:41].astype(float)
-    model = 20 + 200 / (1 + np.exp(2 * (np.hypot(u - 20, v - 15) - 8)))
-    numbers = {"u0": 100.0, "v0": 50.0, "u_px": 120.0, "v_px": 65.0, "noise": 1.0}
-    return {
-        "patch": model + 1,
-        "model": model,
-        "a_px": 8.0,
-        "b_px": 8.0,
-        "angle_rad": 0.3,
-    } | numbers
-
-
 def write_calibration_folder(folder: Path, cameras: int) -> Path:
     rng = np.random.default_rng(11)
     rig, views = _cameras(cameras), _views(rng)
@@ -127,7 +108,6 @@ def write_calibration_folder(folder: Path, cameras: int) -> Path:
     names = [f"dot {i}.{axis}_mm" for i in range(15) for axis in "xyz"]
     root = 1e-3 * rng.standard_normal((45, 45))
     np.savez(folder / "covariance.npz", names=np.array(names), covariance=root @ root.T)
-    np.savez(folder / "dot_example.npz", **_dot_example())
     (folder / "run.json").write_text(json.dumps({"packages": {"numpy": "9.9"}, "seed": 3}))
     for camera in rig:
         (folder / "overlays" / camera.name).mkdir(parents=True)

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from telerig.errors import InputError
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report import plot
-from telerig.io.report.page.figures import (
-    CAMERA_COLOURS,
-    LEFT_OUT,
-    Curve,
-    Picture,
-    draw_curves,
-    drawing,
-    svg_text,
+from telerig.io.report.page.figures import Figure
+from telerig.io.report.page.page import (
+    Block,
+    Choice,
+    Page,
+    Row,
+    Section,
+    Tile,
+    Tiles,
+    Verdict,
+    link_to,
+    render_page,
+    table,
+    texts,
 )
-from telerig.io.report.page.page import Figure, Row, drawn_over_cores, link_to, render_page
 from telerig.io.report.plot.axes import colour_of
 from telerig.io.results.batch import (
     BatchFile,
@@ -34,7 +36,7 @@ from telerig.io.results.batch import (
     verdict_of,
 )
 from telerig.io.results.manifest import reading
-from telerig.io.results.smoothing import Verdict
+from telerig.io.results.smoothing import Verdict as Resolved
 from telerig.io.tables.smoothing import BATCH_BUBBLES
 from telerig.short_text import ABSENT, counted, is_number, number
 
@@ -42,19 +44,9 @@ Job = Mapping[str, Any]
 
 KINDS = {"calibrate": "calibrated", "track": "tracked", "smooth": "smoothed"}
 _DONE = "done"
-_COLOUR = {"calibrate": CAMERA_COLOURS[0], "track": CAMERA_COLOURS[1], "smooth": CAMERA_COLOURS[2]}
+TERMS = ("Lens model", "Verdict", "Covariance, standard deviation (sd)", "RMS")
 _LONGEST_WORDS = 600
 _LEFT_OUT, _MOST_LOST = "left out", 4
-
-
-@dataclass(frozen=True)
-class Line:
-    """A dataset's calibration or a run: cells for the page, with links to the reports."""
-
-    name: str
-    link: str
-    cells: tuple[str, ...]
-    failed: bool
 
 
 def write_batch_report(folder: Path, out: Path | None = None) -> Path:
@@ -67,14 +59,15 @@ def write_batch_report(folder: Path, out: Path | None = None) -> Path:
     jobs = [job.content() for job in file.jobs]
     name = file.name or Path(folder).resolve().name
     place = Path(folder) if out is None else Path(out)
-    write_text_atomic(place / "report.html", render(jobs, place, name, bubbles, file.fluid))
+    page = page_of(jobs, place, name, bubbles, file.fluid)
+    write_text_atomic(place / "report.html", render_page(page))
     return place / "report.html"
 
 
-def render(
+def page_of(
     jobs: Sequence[Job], folder: Path, name: str, bubbles: pd.DataFrame, fluid: Mapping[str, Any]
-) -> str:
-    """Return the page as text.
+) -> Page:
+    """Return what the page says.
 
     folder : where it will lie, for the links. name : of the batch. bubbles, fluid : of all runs.
     """
@@ -84,28 +77,32 @@ def render(
     lost = {(j["dataset"], j["run"]) for j in failed if j["run"]}
     datasets = len({j["dataset"] for j in jobs})
     words = f"{len(runs) - len(lost)} of {len(runs)} runs done" if runs else "No runs"
-    drawn = _of_bubbles(bubbles, fluid, names)
     lines: dict[tuple[str, str], dict[str, Job]] = {}
     for job in jobs:
         if job["run"]:
             lines.setdefault((job["dataset"], job["run"]), {})[job["kind"]] = job
-    context = {
-        "name": name,
-        "headline": f"{words}, {datasets} dataset" + ("s" if datasets != 1 else ""),
-        "lost": _lost(failed, names),
-        "colour": _colour(jobs),
-        "words": _words(jobs),
-        "figures": _key_numbers(jobs),
-        "failures": [_failure(j) for j in failed],
-        "calibrations": [_calibration(j, folder, names) for j in jobs if j["kind"] == "calibrate"],
-        "runs": [
-            _run(f"{names[dataset]} / {run}", run, kinds, folder)
-            for (dataset, run), kinds in lines.items()
+    rows = [_run(f"{names[dataset]} / {run}", run, kinds, folder)
+            for (dataset, run), kinds in lines.items()]  # fmt: skip
+    calibrations = [_calibration(j, folder, names) for j in jobs if j["kind"] == "calibrate"]
+    heads = ["dataset", "verdict", "lens model", "views", "dots kept", "RMS / px"]
+    of_runs = ["run", "verdict", "frames", "tracks", "positions", "sd / µm"]
+    sd = "The sd is of the smoothed positions, median over each run, along x, y and z."
+    failures = [_failure(j) for j in failed]
+    headline = f"{words}, {counted(datasets, 'dataset')}"
+    own = _lost(failed, names)
+    verdict = Verdict(headline, _colour(jobs), (_words(jobs),), (f"Failed: {own}.",) if own else ())
+    return Page(
+        "telerig report of a batch", "Batch", name, verdict,
+        sections=[
+            Section("key", "", [Tiles(tuple(_key_numbers(jobs)))]),
+            Section("bubbles", "Bubbles", _of_bubbles(bubbles, fluid, names)),
+            Section("failures", "What failed",
+                    table(["where", "job", "why, and what to do"], failures, (98, 99))),
+            Section("calibrations", "Calibrations", table(heads, calibrations, (2, 99))),
+            Section("runs", "Runs", [*table(of_runs, rows, (2, 99)), *texts(sd if rows else "")]),
         ],
-        "pictures": [p for p in drawn_over_cores(_drawings(jobs)) if p is not None],
-        "bubbles": drawn,
-    }
-    return render_page("template_batch.html", context, "")
+        terms=TERMS,
+    )  # fmt: skip
 
 
 SOUND = ("GOOD", "RESOLVED")
@@ -151,48 +148,33 @@ def _lost(failed: Sequence[Job], names: Mapping[str, str]) -> str:
     return "; ".join(words[:_MOST_LOST]) + (f"; and {more} more" if more > 0 else "")
 
 
-@dataclass(frozen=True)
-class BubblePictures:
-    """What all runs say of bubbles: drawings as SVG, each with a caption, and the runs' colours."""
-
-    count: int
-    pictures: tuple[tuple[str, str, str], ...]
-    runs: tuple[tuple[int, str, str], ...]
-
-
 def _of_bubbles(
     bubbles: pd.DataFrame, fluid: Mapping[str, Any], names: Mapping[str, str]
-) -> BubblePictures | None:
-    """Return pictures of the bubbles of all runs, beside published laws; None without bubbles."""
+) -> list[Block]:
+    """Return the bubbles of all runs beside published laws, with boxes to choose runs."""
     if not len(bubbles):
-        return None
+        return []
     whose = bubbles["dataset"].map(lambda place: names.get(place, place)) + " / " + bubbles["run"]
-    table, liquid = bubbles.assign(whose=whose), fluid or None
+    every, liquid = bubbles.assign(whose=whose), fluid or None
     drawings = (
-        ("Speed against diameter", partial(plot.velocity, table, liquid, by="whose"),
+        ("Speed against diameter", partial(plot.speed, every, liquid, by="whose"),
          "Mean speed along the path against the diameter, and laws of the rise velocity."),
-        ("Drag against Reynolds number", partial(plot.drag, table, liquid, by="whose"),
+        ("Drag against Reynolds number", partial(plot.drag, every, liquid, by="whose"),
          "The laws are for bubbles of these sizes that rise steadily."),
-        ("Aspect ratio against Weber number", partial(plot.aspect, table, by="whose"),
+        ("Aspect ratio against Weber number", partial(plot.aspect, every, by="whose"),
          "Equatorial over polar semi-axis, and Moore's law for pure liquids."),
     )  # fmt: skip
-    pictures = []
-    for title, draw, caption in drawings:
-        try:
-            with drawing(3.2, grid=True) as sheet:
-                draw(axes=sheet.axes)
-                lines = [line for line in sheet.axes.get_lines() if line.get_gid() is None]
-                known = [line for line in lines if not str(line.get_label()).startswith("_")]
-                sheet.axes.legend(handles=known, loc="best")
-        except InputError:  # no bubble of which these numbers are known
-            continue
-        pictures.append((title, svg_text(sheet.source), caption))
     labels = pd.factorize(whose)[1]
-    runs = tuple((k, str(label), colour_of(k)) for k, label in enumerate(labels))
-    return BubblePictures(len(bubbles), tuple(pictures), runs)
+    groups = tuple((k, str(label), colour_of(k)) for k, label in enumerate(labels))
+    lead = (
+        f"{counted(len(bubbles), 'bubble')} of {counted(len(labels), 'run')}, each in the mean "
+        "with one standard deviation; all numbers are in bubbles.csv."
+    )
+    figures = [Figure(title, draw, words, 3.8, inline=True) for title, draw, words in drawings]
+    return [*texts(lead, small=True), *([Choice(groups)] if len(groups) > 1 else []), *figures]
 
 
-def _key_numbers(jobs: Sequence[Job]) -> list[Figure]:
+def _key_numbers(jobs: Sequence[Job]) -> list[Tile]:
     figures = []
     for kind, word in KINDS.items():
         mine = [j for j in jobs if j["kind"] == kind]
@@ -200,13 +182,13 @@ def _key_numbers(jobs: Sequence[Job]) -> list[Figure]:
             counts = Counter(j["status"] for j in mine)
             rest = {s: n for s, n in counts.items() if s != _DONE} | verdict_counts(mine)
             remark = ", ".join(f"{n} {s}" for s, n in rest.items())
-            figures.append(Figure(word, f"{counts[_DONE]} of {len(mine)}", remark or "none failed"))
+            figures.append(Tile(word, f"{counts[_DONE]} of {len(mine)}", remark or "none failed"))
     seconds = [float(j["seconds"]) for j in jobs if is_number(j.get("seconds"))]
     if seconds:
         hosts = len({j.get("host") for j in jobs if j.get("host")})
         machines = f", {hosts} machine" + ("s" if hosts > 1 else "") if hosts else ""
         remark = f"longest job {max(seconds):.0f} s{machines}"
-        figures.append(Figure("work", f"{sum(seconds) / 60:.3g} min", remark))
+        figures.append(Tile("work", f"{sum(seconds) / 60:.3g} min", remark))
     return figures
 
 
@@ -216,21 +198,21 @@ def _failure(job: Job) -> Row:
     return Row((f"{job['dataset']}{run}", f"{job['kind']} {job['status']}", words))
 
 
-def _calibration(job: Job, folder: Path, names: Mapping[str, str]) -> Line:
+def _calibration(job: Job, folder: Path, names: Mapping[str, str]) -> Row:
     found = job.get("figures") or {}
     share: Any = found.get("share_kept")
     cells = (
+        names[job["dataset"]],
         verdict_and_flags(job) or str(job["status"]),
         str(found.get("lens_model") or ABSENT),
         str(found.get("views") or ABSENT),
         f"{100 * share:.1f}%" if is_number(share) else ABSENT,
         _text(found.get("rms_px")),
     )
-    link = _link(job, folder, "calibration")
-    return Line(names[job["dataset"]], link, cells, job["status"] != _DONE)
+    return Row(cells, faint=job["status"] != _DONE, link=_link(job, folder, "calibration"))
 
 
-def _run(name: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
+def _run(name: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Row:
     tracked, smoothed = (kinds.get(k, {}).get("figures") or {} for k in ("track", "smooth"))
     failed = [j for j in kinds.values() if j["status"] != _DONE]
     verdict = verdict_and_flags(kinds.get("smooth", {})) or (
@@ -238,6 +220,7 @@ def _run(name: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
     )
     sd = [smoothed.get(f"s{x}_um") for x in "xyz"]
     cells = (
+        name,
         verdict,
         _text(tracked.get("frames")),
         _text(tracked.get("tracks")),
@@ -245,8 +228,8 @@ def _run(name: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
         ", ".join(map(_text, sd)) if any(map(is_number, sd)) else ABSENT,
     )
     link = _link(next(iter(kinds.values())), folder, run)
-    off = bool(failed) or verdict_of(kinds.get("smooth", {})) == Verdict.CONTRADICTED
-    return Line(name, link, cells, off)
+    off = bool(failed) or verdict_of(kinds.get("smooth", {})) == Resolved.CONTRADICTED
+    return Row(cells, faint=off, link=link)
 
 
 def _text(value: Any) -> str:
@@ -257,62 +240,3 @@ def _link(job: Job, folder: Path, results: str) -> str:
     """Return the link from the batch's page to a report."""
     target = Path(job["dataset"]) / "results" / results / "report.html"
     return link_to(target, folder) if target.is_file() else ""
-
-
-def _drawings(jobs: Sequence[Job]) -> list[Callable[[], Picture | None]]:
-    return [
-        partial(_values, jobs, "calibrate", ("rms_px",), "Calibrations", "residual RMS / px",
-                "One point a dataset: a rig that was touched, or a bad target, stands out."),
-        partial(_values, jobs, "smooth", ("sx_um", "sy_um", "sz_um"), "Smoothed runs",
-                "sd of position / µm", "Median of each run, in the order of the batch: x, y, z."),
-        partial(_times, jobs),
-    ]  # fmt: skip
-
-
-def _values(
-    jobs: Sequence[Job], kind: str, names: Sequence[str], title: str, label: str, caption: str
-) -> Picture | None:
-    mine = [j for j in jobs if j["kind"] == kind]
-    values = np.array([[_float((j.get("figures") or {}).get(n)) for n in names] for j in mine])
-    if not np.isfinite(values).any():
-        return None
-    place = np.arange(1.0, len(mine) + 1)
-    dots = {"marker": "o", "markersize": 3.5, "linestyle": "none"}
-    curves = [
-        Curve(place, values[:, i], CAMERA_COLOURS[i], name.split("_")[0], style=dots)
-        for i, name in enumerate(names)
-    ]
-    none = place[~np.isfinite(values).any(1)]
-    caption += " A red line: no result."
-    return _by_job(title, "in the order of the batch", label, curves, caption, none)
-
-
-def _times(jobs: Sequence[Job]) -> Picture | None:
-    timed = [j for j in jobs if is_number(j.get("seconds"))]
-    curves = []
-    for kind, colour in _COLOUR.items():
-        seconds = np.array([float(j["seconds"]) for j in timed if j["kind"] == kind])
-        dots = {"marker": "o", "markersize": 3.5, "linestyle": "none"}
-        curves.append(Curve(np.arange(1.0, len(seconds) + 1), seconds, colour, kind, style=dots))
-    caption = "Wall time of every job, of those taken from the journal too."
-    return _by_job("Time", "job", "time / s", curves, caption) if timed else None
-
-
-def _by_job(
-    title: str, xlabel: str, ylabel: str, curves: Sequence[Curve], caption: str, none: Any = ()
-) -> Picture:
-    """Return the points from zero over whole numbers of jobs. none : jobs without a result."""
-    from matplotlib.ticker import MaxNLocator
-
-    legend = "above" if len(curves) > 1 else ""
-    with drawing(2.4, legend=legend, grid=True, xlabel=xlabel, ylabel=ylabel) as sheet:
-        draw_curves(sheet, curves)
-        for job in none:
-            sheet.axes.axvline(job, color=LEFT_OUT, lw=0.8)
-        sheet.axes.set_ylim(0, 1.1 * np.nanmax(np.concatenate([c.y for c in curves])))
-        sheet.axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
-    return Picture(title, sheet.source, caption)
-
-
-def _float(value: Any) -> float:
-    return float(value) if is_number(value) else float("nan")

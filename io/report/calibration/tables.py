@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import GeometryError
-from telerig.io.report.page.page import Figure, Row
+from telerig.io.report.page.page import Row, Tile, link_to
 from telerig.io.results.calibration import CameraRecord
 from telerig.io.results.findings import Status
 from telerig.io.results.folders.calibration import CalibrationResults
@@ -17,24 +18,25 @@ from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import LENS_PARAMETERS, PARAMETERS
 from telerig.short_text import ABSENT, number, share, with_sd
+from telerig.statistics import rms
 
 WORST = 15
 _MANY_SD = 3.0
 
 
-def key_numbers(results: CalibrationResults) -> list[Figure]:
+def key_numbers(results: CalibrationResults) -> list[Tile]:
     """Return the numbers that a reader wants first."""
     s = results.statistics
     per_camera = [f"{n} {number(s.get(f'rms_{n}_px'))}" for n in results.camera_names]
     kept, measured = s.get("dots_kept"), s.get("dots_measured")
     figures = [
-        Figure("Residual", f"{number(s.get('rms_px'))} px", f"RMS; {', '.join(per_camera)} px"),
-        Figure(
+        Tile("Residual", f"{number(s.get('rms_px'))} px", f"RMS; {', '.join(per_camera)} px"),
+        Tile(
             "Chi-square",
             f"{number(s.get('chi2_dof'))} per dof",
             f"about 1 if the stated noise is right; {number(s.get('degrees_of_freedom'))} dof",
         ),
-        Figure(
+        Tile(
             "Dots kept",
             share(kept, measured),
             f"{number(kept)} of {number(measured)} in {len(results.views)} views",
@@ -55,22 +57,22 @@ def precision_words(results: CalibrationResults) -> str:
     return f": {words} {number(sd_um)} µm (1 sd per axis)"
 
 
-def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Figure]:
+def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Tile]:
     if len(results.cameras) < 2:
-        return [Figure("In space", "no depth", "one camera never sees the depth along its axis")]
+        return [Tile("In space", "no depth", "one camera never sees the depth along its axis")]
     precision = f"{number(s.get('space_sd_um'))} µm"
     remark = (
         f"1 sd per axis of a triangulated point; dots are {number(s.get('space_rms_um'))} µm RMS "
         f"from the fit, rays miss by {number(s.get('ray_miss_rms_um'))} µm"
     )
-    figures = [Figure("In space", precision, remark)]
+    figures = [Tile("In space", precision, remark)]
     for name, of in s.get("from_first", {"": s}).items():
         angle = with_sd(of.get("axes_angle_deg"), of.get("axes_angle_sd_deg"))
         which = f"of {results.cameras[0].name} and {name}" if name else "between the optical axes"
-        figures.append(Figure("Angle between axes", f"{angle} °", f"1 sd; {which}"))
+        figures.append(Tile("Angle between axes", f"{angle} °", f"1 sd; {which}"))
     if "perspective_centres_distance_mm" in s:
         distance = f"{number(s['perspective_centres_distance_mm'], 6)} mm"
-        figures.append(Figure("Base", distance, "between the centres of perspective"))
+        figures.append(Tile("Base", distance, "between the centres of perspective"))
     return figures
 
 
@@ -252,8 +254,8 @@ def _chance(p_value: float | None) -> str:
 
 
 def worst_rows(results: CalibrationResults) -> list[Row]:
-    """Return the dots that agree least: the down-weighted ones first, then by their residual."""
-    table = results.residuals
+    """Return the dots that were left out or count less, by their residual."""
+    table = results.residuals[results.residuals["weight"] < 1]
     whitened = "whitened_u" in table
     columns = ["whitened_u", "whitened_v"] if whitened else ["du_px", "dv_px"]
     size = np.hypot(*table[columns].to_numpy().T)
@@ -269,6 +271,30 @@ def worst_rows(results: CalibrationResults) -> list[Row]:
         )
         for dot in table.iloc[order[:WORST]].itertuples()
     ]  # fmt: skip
+
+
+def view_rows(results: CalibrationResults, page_folder: Path) -> list[Row]:
+    """Return a row for each view: dots kept of those measured by camera, and the RMS of both axes.
+
+    It links to the picture of the first camera that has one.
+    """
+    rows = []
+    for view, mine in results.residuals.groupby("view", sort=False):
+        counts = [
+            share_of(int(seen["kept"].sum()), len(seen))
+            for name in results.camera_names
+            for seen in (mine[mine["camera"] == name],)
+        ]
+        kept = mine.loc[mine["kept"], ["du_px", "dv_px"]].to_numpy(float)
+        files = [results.overlays.get((name, str(view))) for name in results.camera_names]
+        file = next(filter(None, files), None)
+        link = "" if file is None else link_to(file, page_folder)
+        rows.append(Row((str(view), *counts, number(rms(kept.ravel()))), link=link))
+    return rows
+
+
+def share_of(part: int, whole: int) -> str:
+    return f"{part} of {whole}" if whole else "-"
 
 
 def change_rows(results: CalibrationResults) -> list[Row]:

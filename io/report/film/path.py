@@ -15,7 +15,8 @@ from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.mp4 import Picture, Progress, write_film
-from telerig.io.report.run.tracking.scene import thinned, track_colour
+from telerig.io.report.plot.axes import colour_of
+from telerig.io.report.plot.tracks import thinned
 from telerig.io.results.bodies import ellipsoids_of
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
@@ -405,14 +406,14 @@ def _draw_tracks(page: _Page, path: FilmPath, panel: Panel, matrix: Array, offse
         page.polygons(list(discs), facecolors=faces, edgecolors=edges, linewidths=0.8)
     pieces = np.split(np.arange(len(uv)), np.flatnonzero(path.new)[1:])
     pieces.sort(key=lambda piece: -float(away[piece].mean()))
-    colours = [track_colour(int(path.particle[piece[0]])) for piece in pieces]
+    colours = [colour_of(int(path.particle[piece[0]])) for piece in pieces]
     if panel.band:
         bands = [_band(uv[p], path.sd_mm[p], panel.band, matrix[:2]) for p in pieces]
         page.polygons(bands, facecolors=colours, alpha=0.35, linewidths=0)
     page.lines([uv[piece] for piece in pieces], colours)
     last = np.append(np.diff(path.particle) != 0, True)
     ends = np.array([piece[-1] for piece in pieces if last[piece[-1]]])
-    colours = [track_colour(int(k)) for k in path.particle[ends]]
+    colours = [colour_of(int(k)) for k in path.particle[ends]]
     page.figure.add_artist(CircleCollection(
         [19.0], offsets=uv[ends], offset_transform=page.px, facecolors=colours, linewidths=0
     ))  # fmt: skip
@@ -431,7 +432,7 @@ def _shaded(centres: Array, shapes: Array, particles: Ints) -> tuple[Array, Arra
     ring = half @ np.swapaxes(axes, 1, 2)
     light = 0.35 * ring.min(1)[:, None]
     discs = [centres[:, None] + size * ring + (1 - size) * light for size, _ in _SHADES]
-    colour = np.array([to_rgb(track_colour(int(k))) for k in particles])
+    colour = np.array([to_rgb(colour_of(int(k))) for k in particles])
     faces = [
         np.c_[white + (1 - white) * colour, np.full(len(colour), 0.75)] for _, white in _SHADES
     ]

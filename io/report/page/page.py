@@ -1,33 +1,31 @@
-"""One HTML page that needs no network: template, style, drawings and 3-D scene in one file."""
+"""One HTML page that needs no network: a verdict, three figures and sections, by one template."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from importlib import resources
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 from urllib.parse import quote
 
-import numpy as np
-
-from telerig.arrays import Array
 from telerig.io.machine.parallel import keep_freed_memory, ordered_map, quick_workers
-from telerig.io.report.page.figures import MUTED, Picture, prepare_drawing
+from telerig.io.report.page.figures import Figure, Picture, drawn, prepare_drawing
+from telerig.short_text import flat_rows
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-
-_IN_EVERY_PAGE = ("layout.html", "macros.html", "scene_script.html")
+_TEMPLATE = "page.html"
+_MOST_ROWS = 150
 
 
 @dataclass(frozen=True)
-class Figure:
+class Tile:
     """A key number: its name, the number with its unit, and what to compare it with."""
 
     name: str
@@ -36,42 +34,152 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Tiles:
+    kind: ClassVar[str] = "tiles"
+    tiles: tuple[Tile, ...]
+
+
+@dataclass(frozen=True)
 class Row:
-    """A table row: the cells as text; ``strong`` is set off, ``faint`` set back."""
+    """A table row: the cells as text; ``strong`` is set off, ``faint`` set back.
+
+    link : where the first cell leads; "" for nowhere.
+    """
 
     cells: tuple[str, ...]
     strong: bool = False
     faint: bool = False
+    link: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; without a ``head`` its rows are names and values.
+
+    numbers : first column that holds numbers, and the first one that does not.
+    """
+
+    kind: ClassVar[str] = "table"
+    rows: Sequence[Row]
+    head: Sequence[str] = ()
+    numbers: tuple[int, int] = (1, 99)
+
+
+@dataclass(frozen=True)
+class Text:
+    """Sentences: a paragraph each, or with ``points`` a list; ``small`` as a remark."""
+
+    kind: ClassVar[str] = "text"
+    sentences: tuple[str, ...]
+    points: bool = False
+    small: bool = False
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Boxes that show and hide the groups (number, name, colour) of a section's inline figures."""
+
+    kind: ClassVar[str] = "choice"
+    groups: tuple[tuple[int, str, str], ...]
+
+
+Block = Tiles | Table | Text | Choice | Figure | Picture
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page: heading, a sentence, key numbers, a table and pictures, where given.
+    """A part of a page, which is left out if it has no contents; ``name`` is its anchor."""
 
-    numbers : first column of the table that holds numbers, and the first one that does not.
+    name: str
+    title: str
+    contents: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``colour`` : good, usable or rejected; ``sentences`` : good or bad; ``warnings`` : bad."""
+
+    headline: str
+    colour: str
+    sentences: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page says.
+
+    kind, title, name : what the page is, for its head, and of what.
+    look : the figures that answer the question, beside the verdict.
+    terms : those of the glossary that it explains.
+    outdated : the results that are older than their inputs, in words.
     """
 
-    title: str = ""
-    lead: str = ""
-    tiles: tuple[Figure, ...] = ()
-    head: tuple[str, ...] = ()
-    rows: tuple[Row, ...] = ()
-    numbers: tuple[int, int] = (1, 99)
-    pictures: tuple[Picture, ...] = ()
+    kind: str
+    title: str
+    name: str
+    verdict: Verdict
+    look: Sequence[Figure | Picture] = ()
+    sections: Sequence[Section] = ()
+    terms: Sequence[str] = ()
+    outdated: Sequence[str] = field(default_factory=tuple)
 
 
-def render_sections(
-    kind: str, title: str, name: str, verdict: Mapping[str, Any], contents: Sequence[Section],
-    terms: Sequence[str],
-) -> str:  # fmt: skip
-    """Return a page that is a verdict and sections.
+def render_page(page: Page) -> str:
+    """Return a page as text, its figures drawn on several cores; names are escaped."""
+    figures = [one for one in (*page.look, *_blocks(page)) if isinstance(one, Figure)]
+    pictures = iter(drawn_over_cores([partial(drawn, figure) for figure in figures]))
 
-    kind, title, name : what the page is, for its head, and of what. verdict : colour, headline,
-    sentences and warnings. terms : those of the glossary that it explains.
-    """
-    context = {"kind": kind, "title": title, "name": name, "stale": (), "verdict": verdict,
-               "contents": contents, "terms": terms}  # fmt: skip
-    return render_page("template_sections.html", context, "")
+    def ready(blocks: Iterable[Any]) -> list[Any]:
+        found = [next(pictures) if isinstance(one, Figure) else one for one in blocks]
+        return [one for one in found if one is not None]
+
+    look = ready(page.look)
+    sections = [replace(one, contents=ready(one.contents)) for one in page.sections]
+    context = {
+        "page": page, "look": look, "css": _package_file("report.css"),
+        "sections": [(one, _grouped(one.contents)) for one in sections if one.contents],
+    }  # fmt: skip
+    return _environment().get_template(_TEMPLATE).render(context)
+
+
+def _blocks(page: Page) -> Iterator[Block]:
+    for section in page.sections:
+        yield from section.contents
+
+
+def _grouped(contents: Sequence[Any]) -> list[tuple[str, list[Any]]]:
+    """Return (kind, blocks) with neighbouring pictures together."""
+    kinds = groupby(contents, key=lambda one: getattr(one, "kind", "pictures"))
+    return [(kind, list(blocks)) for kind, blocks in kinds]
+
+
+def texts(*sentences: str, points: bool = False, small: bool = False) -> tuple[Text, ...]:
+    """Return the sentences that are not empty as a block; none without one."""
+    said = tuple(one for one in sentences if one)
+    return (Text(said, points, small),) if said else ()
+
+
+def table(
+    head: Sequence[str], rows: Sequence[Row], numbers: tuple[int, int] = (1, 99)
+) -> tuple[Table, ...]:
+    """Return a table as a block; none without rows."""
+    return (Table(rows, head, numbers),) if rows else ()
+
+
+def pairs(content: Any, file: str) -> tuple[Table, ...]:
+    """Return the leaves of a mapping as a table of names and values, cut after 150 rows."""
+    rows = [Row(pair) for pair in flat_rows(content)]
+    more = len(rows) - _MOST_ROWS
+    rows = rows if more <= 0 else [*rows[:_MOST_ROWS], Row(("and", f"{more} more in {file}"))]
+    return table((), rows)
+
+
+def origin(run: Any, absent: Sequence[str]) -> Section:
+    """Return the section on versions, inputs and options, and on what the folder lacks."""
+    lacks = f"Not in this folder: {'; '.join(absent)}." if absent else ""
+    return Section("origin", "Versions, inputs and options",
+                   [*pairs(run, "run.json"), *texts(lacks, small=True)])  # fmt: skip
 
 
 def link_to(target: Path, page_folder: Path) -> str:
@@ -81,16 +189,6 @@ def link_to(target: Path, page_folder: Path) -> str:
     except ValueError:
         return target.resolve().as_uri()
     return quote(Path(link).as_posix())
-
-
-def render_page(template: str, context: Mapping[str, Any], scene: str) -> str:
-    """Return the page as text; ``context`` is escaped, ``scene`` is what `scene_text` gives."""
-    carried = {
-        "css": _package_file("report.css"),
-        "scene": scene,
-        "plotly": plotly_javascript(),
-    }
-    return _environment().get_template(template).render({**context, **carried})
 
 
 @cache
@@ -114,19 +212,11 @@ def glossary() -> dict[str, str]:
     }
 
 
-@cache
-def plotly_javascript() -> str:
-    """Return plotly.js with the traces in space alone, a file of this package."""
-    return _package_file("plotly-gl3d.min.js")
-
-
-def prepare_page(template: str) -> None:
-    """Load what a page of this template needs, so that rendering it takes a third of the time."""
+def prepare_page() -> None:
+    """Load what a page needs, so that rendering it takes a third of the time."""
     keep_freed_memory()
     prepare_drawing()
-    for name in (template, *_IN_EVERY_PAGE):
-        _environment().get_template(name)
-    plotly_javascript()
+    _environment().get_template(_TEMPLATE)
 
 
 def drawn_over_cores(drawings: Sequence[Callable[[], Any]]) -> list[Any]:
@@ -141,66 +231,3 @@ def _call(drawing: Callable[[], Any]) -> Any:
 
 def _package_file(name: str) -> str:
     return (resources.files("telerig.io.report.page") / name).read_text(encoding="utf-8")
-
-
-Trace = dict[str, Any]
-
-_FEW_TICKS = 6
-
-
-def scene_text(
-    traces: list[Trace],
-    up: Sequence[float] = (0.0, -1.0, 0.0),
-    distance: float = 1.0,
-    ratio: Sequence[float] | None = None,
-) -> str:
-    """Return traces with a layout for them, safe inside a script element.
-
-    up : (3,) unit vector on the screen.
-    distance : of the eye.
-    ratio : of the box' sides, None: true proportions.
-    """
-    axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
-    lower = [-min(0.3 * (distance - 1), 0.12) * float(part) for part in up]
-    view = {
-        "up": dict(zip("xyz", up)),
-        "center": dict(zip("xyz", lower)),
-        "eye": dict(zip("xyz", _eye(up, distance))),
-    }
-    layout: dict[str, Any] = {
-        "scene": axes | {"aspectmode": "data", "camera": view},
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "legend": {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"},
-        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MUTED, "activecolor": "#333333"},
-        "paper_bgcolor": "rgba(0,0,0,0)",
-    }
-    if ratio is not None:
-        layout["scene"] |= {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio))}
-        for name in ("xaxis", "yaxis", "zaxis"):
-            layout["scene"][name] |= {"nticks": _FEW_TICKS}
-    return script_data({"data": traces, "layout": layout})
-
-
-def script_data(content: Any) -> str:
-    """Return data as JSON that is safe inside a script element of a page."""
-    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
-
-
-def xyz(kind: str, points_mm: Array) -> Trace:
-    """Return a plotly trace of points (N, 3), rounded to µm; NaN interrupts a line."""
-    columns = [[None if np.isnan(c) else round(float(c), 3) for c in axis] for axis in points_mm.T]
-    return {"type": kind, **dict(zip("xyz", columns))}
-
-
-def lines(points_mm: Array, colour: str, width: float) -> Trace:
-    return xyz("scatter3d", points_mm) | {
-        "mode": "lines", "line": {"color": colour, "width": width}, "connectgaps": False,
-    }  # fmt: skip
-
-
-def _eye(up: Sequence[float], distance: float) -> list[float]:
-    """Return the position of the eye, above and beside the scene."""
-    axis = int(np.argmax(np.abs(up)))
-    eye = 0.8 * np.array(up, float)
-    eye[[i for i in range(3) if i != axis]] += (0.85, -1.0)
-    return [float(part) for part in distance * eye]

@@ -1,15 +1,46 @@
-"""`telerig.plot`: pictures of results for notebooks and papers, and for the reports.
+"""`telerig.plot`: pictures of results for notebooks and papers, and all pictures of the reports.
 
 In: tables as `telerig` returns and writes them, and optionally the axes to draw on. Out: matplotlib
 axes. Read ``bubbles`` first.
 """
 
-from telerig.io.report.plot.bubbles import aspect, drag, path, sizes, spectra, velocity
-from telerig.io.report.plot.rig import coverage, residuals, shake, uncertainty
+from telerig.io.report.plot.bubbles import (
+    aspect,
+    aspect_over_time,
+    drag,
+    height,
+    path,
+    sizes,
+    speed,
+    velocity,
+)
+from telerig.io.report.plot.rig import (
+    coverage,
+    residual_histogram,
+    residuals,
+    rig,
+    split_half,
+    target_in_image,
+    tilts,
+    uncertainty,
+)
+from telerig.io.report.plot.shake import (
+    accelerometer,
+    offsets,
+    shake,
+    spectra,
+    spectrum,
+    whiteness,
+)
+from telerig.io.report.plot.target import target
+from telerig.io.report.plot.tracking import bubbles_in_frames, marks, ray_miss, ray_miss_along
 
 __all__ = [
-    "aspect", "coverage", "drag", "path", "residuals", "shake", "sizes", "spectra", "uncertainty",
-    "velocity",
+    "accelerometer", "aspect", "aspect_over_time", "bubbles_in_frames", "coverage", "drag",
+    "height", "marks", "offsets", "path", "ray_miss", "ray_miss_along",
+    "residual_histogram", "residuals",
+    "rig", "shake", "sizes", "spectra", "spectrum", "speed", "split_half", "target",
+    "target_in_image", "tilts", "uncertainty", "velocity", "whiteness",
 ]  # fmt: skip
 
 

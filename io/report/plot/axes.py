@@ -1,7 +1,9 @@
-"""What every plot needs: its axes, columns of its table, and the direction up."""
+"""What every plot needs: its axes, colours, columns of its table, curves with bands, directions."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,17 +13,22 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 
 COLOURS = ("#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0")
-"""Of data, and of the components x, y, z."""
+"""Of cameras, and of the components x, y, z."""
 
-MUTED = "#8a8f98"
-
+KEPT, LEFT_OUT, MODEL, MUTED = "#1b7f3b", "#c62828", "#c62828", "#8a8f98"
+SMOOTHED, NAIVE, RTS = "#1f5fa8", "#9aa0a8", "#c2570c"
+BAND_SDS = 2
 
 _MANY_COLOURS = (*COLOURS, "#0a8f8f", "#b8860b", "#ad1457", "#5d4037", "#455a64", "#7cb342")
 
 
 def colour_of(k: int) -> str:
-    """Return the colour of the k-th of many groups; they repeat after ten."""
+    """Return the colour of the k-th of many groups or tracks; they repeat after ten."""
     return _MANY_COLOURS[k % len(_MANY_COLOURS)]
+
+
+def camera_colour(index: int) -> str:
+    return COLOURS[index % len(COLOURS)]
 
 
 def axes_of(axes: Any, **settings: Any) -> Any:
@@ -46,23 +53,98 @@ def columns_of(table: pd.DataFrame, *names: str, made_by: str) -> list[Array]:
     return out
 
 
+def column_or_none(table: pd.DataFrame, name: str) -> Array | None:
+    """Return a column that has finite values; None without one."""
+    values = table[name].to_numpy(float) if name in table else np.zeros(0)
+    return values if np.isfinite(values).any() else None
+
+
 def finite(*columns: Array) -> list[Array]:
     """Return the rows in which all columns are finite. Raises InputError for none."""
     good = np.isfinite(np.stack(columns)).all(0)
     if not good.any():
-        todo = "see `telerig.bubble_table`: some columns need [fluid] in rig.toml, or outlines"
-        raise InputError("there is nothing to draw", where="telerig.plot", todo=todo)
+        raise nothing_to_draw(
+            "see `telerig.bubble_table`: some columns need [fluid] in rig.toml, or outlines"
+        )
     return [column[good] for column in columns]
 
 
-def height_and_sides(table: pd.DataFrame, pattern: str, y_up: bool) -> list[tuple[str, Array]]:
-    """(name, values) of three components for drawing: both horizontal ones, then the vertical, in
-    an order that is right-handed, so that helices keep their sense.
+def nothing_to_draw(todo: str) -> InputError:
+    """Return the error of a figure that would be empty, which a page leaves out."""
+    return InputError("there is nothing to draw", where="telerig.plot", todo=todo)
 
-    pattern : of the columns' names, like "{}_mm". y_up : the vertical is the height, -y, which is
-    positive upwards; otherwise y, which points down in the frame of a camera that stands upright.
-    """
-    x, y, z = columns_of(table, *(pattern.format(a) for a in "xyz"), made_by="trajectories")
-    if y_up:
-        return [("x", x), ("z", z), ("height", -y)]
-    return [("z", z), ("x", x), ("y", y)]
+
+@dataclass(frozen=True)
+class Curve:
+    """A line (N,) of a plot, with a band of ± `BAND_SDS` sd (N,); style : as matplotlib has it."""
+
+    x: Array
+    y: Array
+    colour: str
+    label: str = ""
+    sd: Array | None = None
+    style: Mapping[str, Any] = field(default_factory=dict)
+
+
+def draw_curves(axes: Any, curves: Iterable[Curve]) -> None:
+    """Draw the curves that have finite values, each band below its line; each label stands once."""
+    labels: set[str] = set()
+    for curve in curves:
+        fresh = curve.label if curve.label not in labels else ""
+        if curve.sd is not None and np.isfinite(curve.sd).any():
+            far = BAND_SDS * curve.sd
+            axes.fill_between(
+                curve.x, curve.y - far, curve.y + far, color=curve.colour, alpha=0.25, linewidth=0,
+                label=f"± {BAND_SDS} sd" if fresh else "",
+            )  # fmt: skip
+        if np.isfinite(curve.y).any():
+            style = {"linewidth": 0.9} | dict(curve.style)
+            axes.plot(curve.x, curve.y, color=curve.colour, label=fresh, **style)
+            labels.add(curve.label)
+
+
+@dataclass(frozen=True)
+class Vertical:
+    """The vertical of a rig: axis number and sign, from a name like "-y"."""
+
+    axis: int
+    sign: float
+
+    @classmethod
+    def of(cls, up: str) -> Vertical:
+        """Raises InputError for what is no axis."""
+        if up.lstrip("+-") not in ("x", "y", "z") or len(up) > 2:
+            todo = 'give one of "x", "-x", "y", "-y", "z", "-z"'
+            raise InputError(f"up is {up!r}", where="telerig.plot", todo=todo)
+        return cls("xyz".index(up[-1]), -1.0 if up[0] == "-" else 1.0)
+
+    @property
+    def order(self) -> tuple[int, int, int]:
+        """Both horizontal axes and the vertical one, right-handed, so that helices keep theirs."""
+        one, other = (self.axis + 1) % 3, (self.axis + 2) % 3
+        return (one, other, self.axis) if self.sign > 0 else (other, one, self.axis)
+
+    def name(self, axis: int) -> str:
+        return "height" if axis == self.axis else "xyz"[axis]
+
+    def sign_of(self, axis: int) -> float:
+        return self.sign if axis == self.axis else 1.0
+
+
+def axis_number(axis: str) -> int:
+    """Return 0, 1 or 2. Raises InputError for what is no axis of the rig."""
+    if axis not in ("x", "y", "z"):
+        raise InputError(f"axis is {axis!r}", where="telerig.plot", todo='give "x", "y" or "z"')
+    return "xyz".index(axis)
+
+
+def image_axes(axes: Any, image_size_px: tuple[int, int] | None = None) -> Any:
+    """Set axes to an image's: u right, v down, pixel (0, 0) the centre of the top left pixel."""
+    axes.set(xlabel="u / px", ylabel="v / px", aspect="equal")
+    if image_size_px is not None:
+        width, height = image_size_px
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        axes.spines[["top", "right"]].set_visible(True)
+    elif not axes.yaxis_inverted():
+        axes.invert_yaxis()
+    return axes

@@ -1,4 +1,4 @@
-"""Pictures of bubbles: paths, velocity, drag, sizes, spectra, from the tables of a run."""
+"""Pictures of bubbles: paths, heights, velocities, drag, sizes, from the tables of a run."""
 
 from __future__ import annotations
 
@@ -11,14 +11,22 @@ import pandas as pd
 from telerig.arrays import Array
 from telerig.io.report.plot.axes import (
     COLOURS,
+    LEFT_OUT,
     MUTED,
+    NAIVE,
+    SMOOTHED,
+    Curve,
+    Vertical,
     axes_of,
+    axis_number,
     colour_of,
+    column_or_none,
     columns_of,
+    draw_curves,
     finite,
-    height_and_sides,
+    nothing_to_draw,
 )
-from telerig.io.report.plot.spectrum import velocity_spectrum
+from telerig.io.report.plot.tracks import thinned
 from telerig.io.rig_file.fluid import liquid_of
 from telerig.rig.bubble_physics import (
     Liquid,
@@ -34,6 +42,8 @@ from telerig.rig.bubble_physics import (
 _SUMMARY = "what telerig.bubble_summary returns, or bubble_summary.csv"
 _WAVES_FROM_M = 1.3e-3
 _MOST_CLOUD = 4000
+_MOST_POINTS, _MOST_LINES, _WINDOW = 8_000, 12, 1_000
+_WIDENING, _WIDEST, _FLATTEST = (1, 2, 5, 10, 20), 0.5, 0.02
 
 
 def path(
@@ -41,46 +51,185 @@ def path(
     particles: Iterable[int] | None = None,
     *,
     colour_by: str | None = None,
-    y_up: bool = True,
+    up: str = "-y",
     axes: Any = None,
 ) -> Any:
     """Draw the paths of bubbles in space; returns 3-D axes.
 
-    trajectories : `Smoothing.trajectories`, bubbles.csv or tracks.csv.
+    trajectories : `Smoothing.trajectories`, bubbles.csv or tracks.csv; long ones are thinned.
     particles : which bubbles; None for all.
     colour_by : a column that colours the path, like "slip_mm_s"; None for a colour per bubble.
-    y_up : the vertical axis is the height, -y.
+    up : the axis of the rig that points upwards, drawn as the height; "-y" for upright cameras.
 
+    Slender paths are drawn wider than true, by a factor that stands above them.
     Raises InputError for a table without positions.
     """
-    axes = axes_of(axes, projection="3d")
+    axes, vertical = axes_of(axes, projection="3d"), Vertical.of(up)
+    columns_of(trajectories, "x_mm", "y_mm", "z_mm", made_by="Smoothing.trajectories")
     chosen = trajectories
     if particles is not None:
         chosen = trajectories[trajectories["particle"].isin(list(particles))]
-    named = height_and_sides(chosen, "{}_mm", y_up)
-    whose = chosen["particle"].to_numpy()
-    colours = None if colour_by is None else columns_of(chosen, colour_by, made_by="bubbles.csv")[0]
-    drawn = None
-    for i, k in enumerate(np.unique(whose)):
-        mine = whose == k
-        place = [values[mine] for _, values in named]
-        if colours is None:
-            axes.plot(*place, color=COLOURS[i % 4], linewidth=1.0)
-        else:
-            known = colours[np.isfinite(colours)]
-            limits = {"vmin": known.min(), "vmax": known.max()} if len(known) else {}
-            drawn = axes.scatter(*place, c=colours[mine], s=3, **limits)
-    if drawn is not None:
+    chosen = thinned(chosen, _MOST_POINTS)
+    place = {i: vertical.sign_of(i) * chosen[f"{'xyz'[i]}_mm"].to_numpy(float) for i in range(3)}
+    starts = np.flatnonzero(chosen["new"].to_numpy())
+    if colour_by is None:
+        whose = chosen["particle"].to_numpy()
+        for rows in np.split(np.arange(len(chosen)), starts[1:]) if len(chosen) else ():
+            line = [place[i][rows] for i in vertical.order]
+            axes.plot(*line, color=colour_of(int(whose[rows[0]])), linewidth=1.0)
+    else:
+        (colours,) = columns_of(chosen, colour_by, made_by="bubbles.csv")
+        known = colours[np.isfinite(colours)]
+        limits = {"vmin": known.min(), "vmax": known.max()} if len(known) else {}
+        drawn = axes.scatter(*(place[i] for i in vertical.order), c=colours, s=3, **limits)
         axes.figure.colorbar(drawn, ax=axes, label=colour_by, shrink=0.7, pad=0.12)
-    for side, (name, _) in zip("xyz", named):
-        getattr(axes, f"set_{side}label")(f"{name} / mm")
-    axes.set_aspect("equal")
+    wider = _widening(axes)
+    if wider > 1:
+        axes.set_title(f"horizontally {wider} times as wide as true", fontsize=8, y=0.98)
+    for side, i in zip("xyz", vertical.order):
+        getattr(axes, f"set_{side}label")(f"{vertical.name(i)} / mm")
     for side in "xy":
         axes.locator_params(axis=side, nbins=4)
     return axes
 
 
+def _widening(axes: Any) -> int:
+    """Set true proportions, or of slender paths wider ones; return by how much."""
+    sides = np.array([np.ptp(getattr(axes, f"get_{side}lim")()) for side in "xyz"])
+    wider = max(f for f in _WIDENING if f == 1 or f * sides[:2].max() <= _WIDEST * sides[2])
+    sides[:2] = np.maximum(wider * sides[:2], _FLATTEST * sides.max())
+    for side, drawn in zip("xy", sides / wider):
+        low, high = getattr(axes, f"get_{side}lim")()
+        middle = 0.5 * (low + high)
+        getattr(axes, f"set_{side}lim")(middle - drawn / 2, middle + drawn / 2)
+    axes.set_box_aspect(sides, zoom=0.85)
+    return wider
+
+
+def height(
+    trajectories: pd.DataFrame,
+    particle: int | None = None,
+    *,
+    axis: str = "",
+    up: str = "-y",
+    frames: int = 200,
+    axes: Any = None,
+) -> Any:
+    """Draw a bubble's height less a straight line, with bands of ± 2 sd; returns axes.
+
+    trajectories : `Smoothing.trajectories`, of which the naive path (triangulated point plus
+    encoder) is drawn beside the smoothed one, or tracks.csv. particle : None for the longest track.
+    axis : "x", "y" or "z" instead of the vertical. up : as for `path`. frames : so many from the
+    middle.
+    Raises InputError for a table without positions.
+    """
+    vertical = Vertical.of(up)
+    number = axis_number(axis) if axis else vertical.axis
+    letter, sign = "xyz"[number], vertical.sign_of(number)
+    mine = _of_bubble(trajectories, particle)
+    first = max(0, (len(mine) - frames) // 2)
+    mine = mine.iloc[first : first + frames]
+    t, place = columns_of(mine, "t_s", f"{letter}_mm", made_by="Smoothing.trajectories")
+    good = np.isfinite(place)
+    if not good.any():
+        raise nothing_to_draw("choose a bubble with positions")
+    line = np.polyfit(t[good] - t[0], place[good], 1) if good.sum() > 1 else [0.0, place[good][0]]
+    straight = np.polyval(line, t - t[0])
+    sd = column_or_none(mine, f"s{letter}_mm")
+    variance = column_or_none(mine, f"s{letter}{letter}_mm2")
+    sd = np.sqrt(np.abs(variance)) if sd is None and variance is not None else sd
+    curves = []
+    naive = column_or_none(mine, f"naive_{letter}_mm")
+    if naive is not None:
+        dots = {"linestyle": "none", "marker": ".", "markersize": 4}
+        curves.append(Curve(t, sign * (naive - straight), NAIVE, "before smoothing", style=dots))
+    label = "measured" if naive is None else "smoothed"
+    curves.append(Curve(t, sign * (place - straight), SMOOTHED, label, sd))
+    name = vertical.name(number)
+    axes = axes_of(axes, xlabel="t / s", ylabel=f"{name} less a line / mm")
+    draw_curves(axes, curves)
+    _unseen(axes, mine)
+    return axes
+
+
 def velocity(
+    trajectories: pd.DataFrame,
+    particle: int | None = None,
+    axis: str = "",
+    *,
+    up: str = "-y",
+    axes: Any = None,
+) -> Any:
+    """Draw a bubble's velocity over time, smoothed with its band of ± 2 sd, and naive.
+
+    trajectories : `Smoothing.trajectories`. particle : None for the longest track. axis : "x", "y",
+    "z"; "" for the vertical. up : as for `path`. Returns axes. Raises InputError for a table
+    without velocities.
+    """
+    vertical = Vertical.of(up)
+    number = axis_number(axis) if axis else vertical.axis
+    name, sign = f"v{'xyz'[number]}_mm_s", vertical.sign_of(number)
+    mine = _of_bubble(trajectories, particle)
+    first = max(0, (len(mine) - _WINDOW) // 2)
+    mine = mine.iloc[first : first + _WINDOW]
+    t, speed = columns_of(mine, "t_s", name, made_by="Smoothing.trajectories")
+    finite(speed)
+    naive = column_or_none(mine, f"naive_{name}")
+    curves = [] if naive is None else [Curve(t, sign * naive, NAIVE, "differences of positions")]
+    curves.append(Curve(t, sign * speed, SMOOTHED, "smoothed", column_or_none(mine, f"s{name}")))
+    what = "rise" if number == vertical.axis else f"v{'xyz'[number]}"
+    axes = axes_of(axes, xlabel="t / s", ylabel=f"{what} / (mm/s)")
+    draw_curves(axes, curves)
+    _unseen(axes, mine)
+    return axes
+
+
+def _of_bubble(table: pd.DataFrame, particle: int | None) -> pd.DataFrame:
+    """Return the rows of a bubble by frame. Raises InputError where it has none."""
+    columns_of(table, "particle", made_by="Smoothing.trajectories")
+    if particle is None and len(table):
+        lengths = table["particle"].value_counts(sort=False).sort_index()
+        particle = int(lengths.index[int(np.argmax(lengths.to_numpy()))])
+    mine = table[table["particle"] == particle]
+    if not len(mine):
+        raise nothing_to_draw(f"there is no bubble {particle}")
+    return mine.sort_values(by="frame")
+
+
+def _unseen(axes: Any, mine: pd.DataFrame) -> None:
+    """Mark frames in which no image shows the bubble by red ticks."""
+    if "observed" in mine:
+        t = mine["t_s"].to_numpy(float)[mine["observed"].to_numpy(float) == 0]
+        if len(t):
+            axes.plot(t, np.full(len(t), 0.015), "|", color=LEFT_OUT, markersize=5,
+                      transform=axes.get_xaxis_transform(), zorder=5)  # fmt: skip
+
+
+def aspect_over_time(
+    bubbles: pd.DataFrame, particles: Iterable[int] | None = None, *, axes: Any = None
+) -> Any:
+    """Draw the aspect ratio of bubbles over time, with bands of ± 2 sd; returns axes.
+
+    bubbles : what `telerig.bubble_table` returns, or bubbles.csv. particles : None for the longest
+    tracks. Raises InputError for a table without aspect ratios.
+    """
+    columns_of(bubbles, "t_s", "aspect", made_by="telerig.bubble_table")
+    known = bubbles[np.isfinite(bubbles["aspect"].to_numpy(float))]
+    longest = known["particle"].value_counts().index[:_MOST_LINES]
+    curves = []
+    for particle in longest if particles is None else particles:
+        mine = known[known["particle"] == particle]
+        t, ratio = mine["t_s"].to_numpy(float), mine["aspect"].to_numpy(float)
+        sd = column_or_none(mine, "s_aspect")
+        curves.append(Curve(t, ratio, colour_of(int(particle)), sd=sd))
+    if not curves:
+        raise nothing_to_draw("shapes come from outlines: smooth a run with images")
+    axes = axes_of(axes, xlabel="t / s", ylabel="aspect ratio")
+    draw_curves(axes, curves)
+    return axes
+
+
+def speed(
     summary: pd.DataFrame, fluid: Any = None, *, by: str | None = None, axes: Any = None
 ) -> Any:
     """Draw each bubble's mean speed against its diameter, beside published laws; returns axes.
@@ -94,13 +243,13 @@ def velocity(
     Bars are one standard deviation. Raises InputError for a table without sizes or velocities.
     """
     axes = axes_of(axes, xlabel="equivalent diameter / mm", ylabel="speed along the path / (mm/s)")
-    d, speed = _points(axes, summary, "d_eq_mm", "slip_mm_s", by)
+    d, along = _points(axes, summary, "d_eq_mm", "slip_mm_s", by)
     known_liquid = liquid_of(fluid)
     if known_liquid is not None:
         grid = _grid(d)
         for name, colour, style, values in _laws(grid, known_liquid[0]):
             axes.plot(1e3 * grid, 1e3 * values, style, color=colour, linewidth=1.0, label=name)
-    low, high = float(speed.min()), float(speed.max())
+    low, high = float(along.min()), float(along.max())
     axes.set_ylim(max(0.0, 0.6 * low), 1.35 * high)
     return axes
 
@@ -109,7 +258,7 @@ def drag(table: pd.DataFrame, fluid: Any = None, *, by: str | None = None, axes:
     """Draw drag coefficients against Reynolds numbers, beside published laws; returns axes.
 
     table : what `telerig.bubble_summary` returns (with one standard deviation), or
-    `telerig.bubble_table` (a point per frame). fluid, by : as for `velocity`; the laws are drawn
+    `telerig.bubble_table` (a point per frame). fluid, by : as for `speed`; the laws are drawn
     for bubbles of these sizes that rise steadily, and for a rigid sphere.
     Raises InputError for a table without drag coefficients.
     """
@@ -146,7 +295,7 @@ def drag(table: pd.DataFrame, fluid: Any = None, *, by: str | None = None, axes:
 def aspect(summary: pd.DataFrame, *, by: str | None = None, axes: Any = None) -> Any:
     """Draw aspect ratios against Weber numbers, beside Moore's law of 1965; returns axes.
 
-    summary, by : as for `velocity`. Bars are one standard deviation. Raises InputError for a table
+    summary, by : as for `speed`. Bars are one standard deviation. Raises InputError for a table
     without aspect ratios or Weber numbers.
     """
     axes = axes_of(axes, xlabel="Weber number", ylabel="aspect ratio")
@@ -233,26 +382,4 @@ def sizes(summary: pd.DataFrame, *, bins: int = 20, axes: Any = None) -> Any:
     sauter = float((d**3).sum() / (d**2).sum())
     axes.axvline(d.mean(), color=COLOURS[0], linewidth=1.0, linestyle="--", label="mean")
     axes.axvline(sauter, color=COLOURS[1], linewidth=1.0, linestyle="--", label="Sauter mean")
-    return axes
-
-
-def spectra(
-    trajectories: pd.DataFrame, *, kind: str = "", y_up: bool = True, axes: Any = None
-) -> Any:
-    """Draw the power spectral density of the velocity along each axis; returns axes.
-
-    trajectories : `Smoothing.trajectories` or bubbles.csv: the mean over the longest tracks. kind :
-    "" for the smoothed velocity, "naive_" or "rts_" for the others of trajectories.csv.
-    y_up : the vertical is called height. Raises InputError for tracks below 32 frames.
-    """
-    found = velocity_spectrum(trajectories, kind)
-    axes = axes_of(axes, xlabel="frequency / Hz", ylabel="(mm/s)²/Hz", yscale="log")
-    for i, name in enumerate(("x", "height" if y_up else "y", "z")):
-        axes.plot(
-            found.frequency_hz[1:],
-            found.density[1:, i],
-            color=COLOURS[i],
-            linewidth=1.0,
-            label=name,
-        )
     return axes

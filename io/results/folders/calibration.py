@@ -16,7 +16,6 @@ from telerig.io.files.csv_table import read_table, rows_of
 from telerig.io.results.calibration import (
     CalibrationFile,
     ComparisonFile,
-    read_dot_example,
     read_joint_covariance,
     read_uncertainty,
 )
@@ -34,7 +33,7 @@ KEPT_WEIGHT = 0.5
 
 _FILES = (
     "calibration.json", "residuals.csv", "dots.csv", "covariance.npz", "run.json",
-    "uncertainty.npz", "comparison.json", "dot_example.npz",
+    "uncertainty.npz", "comparison.json",
 )  # fmt: skip
 
 
@@ -48,7 +47,7 @@ class CalibrationResults:
         states covariances.
     component : place in ``joint``, the whole covariance, by name.
     overlays : picture by (camera, view).
-    dot_example, uncertainty : arrays, or empty.
+    uncertainty : arrays, or empty.
     """
 
     file: CalibrationFile
@@ -60,7 +59,6 @@ class CalibrationResults:
     joint: Array
     run: Mapping[str, Any]
     overlays: Mapping[tuple[str, str], Path]
-    dot_example: Mapping[str, Array]
     uncertainty: Mapping[str, Array]
     comparison: ComparisonFile
     absent: tuple[str, ...]
@@ -85,6 +83,17 @@ class CalibrationResults:
         return self.file.statistics
 
     @property
+    def target_covariance(self) -> Array | None:
+        """(3, N, N) of the dots' coordinates x, y, z, in mm²; None where it is not known."""
+        index = np.array(
+            [[self.component.get(f"dot {dot}.{axis}_mm", -1) for dot in self.dot_ids]
+             for axis in "xyz"]
+        )  # fmt: skip
+        if index.size == 0 or index.min() < 0:
+            return None
+        return np.array([self.joint[np.ix_(of, of)] for of in index])
+
+    @property
     def camera_names(self) -> list[str]:
         return [camera.name for camera in self.cameras]
 
@@ -105,7 +114,6 @@ def _read_results(folder: Path) -> CalibrationResults:
     residuals = _residuals(folder, cameras, views, file)
     names, joint = read_joint_covariance(folder / "covariance.npz")
     component = {name: i for i, name in enumerate(names)}
-    example = read_dot_example(folder / "dot_example.npz")
     run = RunFile.read_if_there(folder / "run.json")
     comparison = ComparisonFile.read_if_there(folder / "comparison.json")
     overlays = _overlays(folder / "overlays", cameras, views)
@@ -114,7 +122,6 @@ def _read_results(folder: Path) -> CalibrationResults:
         "covariance.npz (no standard deviations of the target's shape)": bool(joint.size),
         "run.json (no versions, no hashes of what went in)": bool(run.content()),
         "overlays/ (no pictures of the dots that were found)": bool(overlays),
-        "dot_example.npz (no picture of a dot and its fit)": bool(example),
     }
     absent = tuple(text for text, present in words.items() if not present)
     return CalibrationResults(
@@ -127,7 +134,6 @@ def _read_results(folder: Path) -> CalibrationResults:
         joint,
         run.content(),
         overlays,
-        example,
         read_uncertainty(folder / "uncertainty.npz"),
         comparison,
         absent,

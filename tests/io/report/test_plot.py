@@ -55,22 +55,38 @@ def test_a_path_rises_on_the_screen() -> None:
     (line,) = axes.get_lines()
     _, _, height = line.get_data_3d()
     assert height[-1] > height[0] and np.allclose(height, -frames()["y_mm"])
-    assert axes.get_zlabel() == "height / mm"
-    down = telerig.plot.path(frames(), y_up=False)
-    assert np.allclose(down.get_lines()[0].get_data_3d()[2], frames()["y_mm"])
-    for chosen in (axes, down):  # a right-handed helix stays one
+    assert axes.get_zlabel() == "height / mm" and "20 times as wide" in axes.get_title()
+    for up in ("-y", "y", "x", "-x", "z", "-z"):  # a right-handed helix stays one
+        chosen = telerig.plot.path(frames(), up=up)
         names = [getattr(chosen, f"get_{side}label")().split()[0] for side in "xyz"]
-        turned = [
-            {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "height": (0, -1, 0)}[n] for n in names
-        ]
-        assert np.linalg.det(turned) == pytest.approx(1)
+        unit = dict(zip("xyz", np.eye(3))) | {
+            "height": (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
+        }
+        assert np.linalg.det([unit[name] for name in names]) == pytest.approx(1)
     assert len(telerig.plot.path(frames(), particles=[9]).get_lines()) == 0
     coloured = telerig.plot.path(frames(), colour_by="slip_mm_s")
     assert coloured.figure.axes[-1].get_ylabel() == "slip_mm_s"
+    with pytest.raises(InputError, match="up is 'down'"):
+        telerig.plot.path(frames(), up="down")
+
+
+def test_height_and_velocity_stand_beside_what_was_measured() -> None:
+    table = frames().assign(naive_y_mm=lambda t: t["y_mm"] + 0.1, sy_mm=0.01, svy_mm_s=1.0)
+    naive, smooth = telerig.plot.height(table, frames=50).get_lines()
+    np.testing.assert_allclose(smooth.get_ydata(), 0.0, atol=1e-9)
+    np.testing.assert_allclose(naive.get_ydata(), -0.1, atol=1e-9)
+    assert len(smooth.get_xdata()) == 50
+    side = telerig.plot.height(table, axis="x")
+    assert side.get_ylabel() == "x less a line / mm"
+    rise = telerig.plot.velocity(table)
+    np.testing.assert_allclose(rise.get_lines()[0].get_ydata(), -table["vy_mm_s"])
+    assert rise.get_ylabel() == "rise / (mm/s)" and len(rise.collections) == 1
+    with pytest.raises(InputError, match="no bubble 9"):
+        telerig.plot.velocity(table, 9)
 
 
 def test_velocities_lie_on_the_law_that_made_them() -> None:
-    axes = telerig.plot.velocity(summary(), WATER)
+    axes = telerig.plot.speed(summary(), WATER)
     law = next(line for line in axes.get_lines() if line.get_label() == "Mendelson 1967")
     d, speed = law.get_data()
     expected = np.interp(summary()["d_eq_mm"], d, speed)
@@ -78,7 +94,7 @@ def test_velocities_lie_on_the_law_that_made_them() -> None:
     assert axes.get_ylabel() == "speed along the path / (mm/s)"
     names = axes.get_legend_handles_labels()[1]
     assert {"bubbles, ± 1 sd", "Clift 1978, contaminated", "Moore 1965"} <= set(names)
-    assert telerig.plot.velocity(summary()).get_legend_handles_labels()[1] == ["bubbles, ± 1 sd"]
+    assert telerig.plot.speed(summary()).get_legend_handles_labels()[1] == ["bubbles, ± 1 sd"]
 
 
 def test_drag_of_bubbles_and_of_frames() -> None:
@@ -128,6 +144,8 @@ def test_spectra_peak_where_the_bubble_swings() -> None:
     x, height, z = axes.get_lines()
     assert [line.get_label() for line in (x, height, z)] == ["x", "height", "z"]
     assert x.get_xdata()[np.argmax(x.get_ydata())] == pytest.approx(20, abs=4)
+    (one,) = telerig.plot.spectra(frames(), "x").get_lines()
+    np.testing.assert_allclose(one.get_ydata(), x.get_ydata())
     with pytest.raises(InputError, match="32 frames"):
         telerig.plot.spectra(frames(20))
 
@@ -139,7 +157,7 @@ def test_pictures_of_the_rig(tmp_path: Path) -> None:
     dots = dots.assign(camera="left", weight=1.0)
     dots.loc[0, "weight"] = 0.0
     axes = telerig.plot.residuals(dots, "left")
-    assert axes.yaxis_inverted() and axes.collections[0].N == 39
+    assert axes.yaxis_inverted() and [c.N for c in axes.collections] == [39, 1]
     covered = telerig.plot.coverage(dots, "left", (640, 480))
     assert covered.get_xlim() == (-0.5, 639.5) and covered.get_ylim() == (479.5, -0.5)
     for draw in (telerig.plot.residuals, telerig.plot.coverage):
@@ -165,16 +183,16 @@ def test_pictures_of_the_rig(tmp_path: Path) -> None:
         (tmp_path / "cut.npz").write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             telerig.plot.uncertainty(tmp_path / "cut.npz")
-    far = telerig.plot.residuals(dots.assign(du_px=300.0), "left")
-    assert far.get_title() == "left, arrows 0.01 times as long"
 
 
 def test_shake_has_one_sign() -> None:
     table = pd.DataFrame({"t_s": [0.0, 0.1], "left_y_mm": [0.0, 0.02], "sleft_y_mm": 0.001})
-    assert telerig.plot.shake(table, "left").get_lines()[0].get_ydata()[1] == pytest.approx(-20)
-    down = telerig.plot.shake(table, "left", y_up=False)
+    assert telerig.plot.shake(table, "left", "y").get_lines()[0].get_ydata()[1] == pytest.approx(
+        -20
+    )
+    down = telerig.plot.shake(table, "left", "y", up="y")
     assert down.get_lines()[0].get_ydata()[1] == pytest.approx(20)
-    odd = telerig.plot.shake(table.rename(columns=lambda n: n.replace("left", "$_$")), "$_$")
+    odd = telerig.plot.shake(table.rename(columns=lambda n: n.replace("left", "$_$")), "$_$", "y")
     odd.figure.canvas.draw()
     with pytest.raises(InputError, match="left_z_mm"):
         telerig.plot.shake(table, "left", "z")
@@ -194,4 +212,4 @@ def test_given_axes_are_drawn_on() -> None:
     with pytest.raises(InputError, match="d_eq_mm"):
         telerig.plot.sizes(summary().drop(columns="d_eq_mm"), axes=axes)
     with pytest.raises(InputError, match="unknown key"):
-        telerig.plot.velocity(summary(), {**WATER, "sigma": 1.0}, axes=axes)
+        telerig.plot.speed(summary(), {**WATER, "sigma": 1.0}, axes=axes)

@@ -8,7 +8,6 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -94,17 +93,6 @@ def test_the_batch_page_links_to_the_others_from_where_it_lies(
     }
 
 
-def test_rays_are_drawn_or_the_reason_is_given(dataset: Path, tmp_path: Path) -> None:
-    other = (dataset / "results" / "rise" / "report.html").read_text(encoding="utf-8")
-    assert (
-        "drawing of a bubble&#39;s two rays is left out" in other or "two rays is left out" in other
-    )
-    own = write_run(tmp_path / "results" / "rise")
-    command(own)
-    text = (own / "report.html").read_text(encoding="utf-8")
-    assert "Two rays of one bubble" in text and "is left out" not in text
-
-
 def test_an_imported_calibration_does_not_keep_a_dataset_from_its_pages(tmp_path: Path) -> None:
     across = Pose.from_rotvec([0.0, np.pi / 2, 0.0])
     cameras = [Camera.create("left", (512, 400), 10.0),
@@ -129,10 +117,7 @@ def test_pages_in_a_browser_at_desk_and_pocket_width(
         assert seen.layout["wide"] == [] and seen.layout["small"] == 0
         assert seen.layout["broken"] == 0
         assert 0 < seen.layout["top"] < 200 and seen.layout["first"]
-        assert seen.layout["scenes"] == (name != "batch")
-        buttons = seen.layout["buttons"]  # none of them sends the scene to a server
-        assert not any("hare" in title or "loud" in title for title in buttons)
-        assert any("Download" in title for title in buttons) == (name != "batch")
+        assert seen.layout["height"] <= 6000
 
 
 @browser
@@ -154,7 +139,7 @@ def test_the_browser_notices_errors_and_what_is_too_wide(tmp_path: Path) -> None
 def test_pages_on_paper(dataset: Path, tmp_path: Path, name: str) -> None:
     printed = print_pdf(dataset / "results" / name / "report.html", tmp_path)
     pages = len(re.findall(rb"/Type\s*/Page\b(?!s)", printed))
-    assert printed.startswith(b"%PDF") and 1 <= pages <= 30
+    assert printed.startswith(b"%PDF") and 1 <= pages <= 8
     assert len(printed) < 8e6
 
 
@@ -216,7 +201,7 @@ def test_bad_input_is_told_in_words(dataset: Path, tmp_path: Path) -> None:
 def test_the_pages_commands_and_code_run(
     filmed: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Every command of docs/reports.md, with few views, and its Python."""
+    """Every command of docs/reports.md, with few views."""
     text = (ROOT / "docs" / "reports.md").read_text(encoding="utf-8")
     (tmp_path / "tank2").mkdir()
     for name in ("results", "runs"):
@@ -228,9 +213,3 @@ def test_the_pages_commands_and_code_run(
     for line in lines:
         command(*shlex.split(line, comments=True))
     assert Path("films/film/views.mp4").is_file() and Path("films/film/path.mp4").is_file()
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
-    names: dict[str, Any] = {}
-    exec(code, names)
-    row = names["results"].tracks.iloc[3]
-    assert names["pair"].miss_mm == pytest.approx(row["ray_miss_mm"], abs=1e-9)
-    assert "frame 3" in names["picture"].caption

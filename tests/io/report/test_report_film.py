@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from filmed_run import (
     write_run,
 )
 
-from telerig.errors import GeometryError, InputError
+from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.report.film import path as film_path
 from telerig.io.report.film.path import (
@@ -32,8 +30,6 @@ from telerig.io.report.film.path import (
     view_matrix,
     write_path_film,
 )
-from telerig.io.report.run.tracking.scene import scene_widening, track_scene_json
-from telerig.io.report.run.tracking.two_rays import ray_pair, rays_of_row, two_rays, typical_row
 from telerig.io.results.folders.tracking import read_track_results, run_cameras
 
 BLUE = (31, 95, 168)
@@ -189,33 +185,6 @@ def test_no_track_no_film(tmp_path: Path) -> None:
     assert not (tmp_path / "a.mp4").exists()
 
 
-def test_closest_points_are_the_least_squares_ones() -> None:
-    rng = np.random.default_rng(2)
-    for _ in range(20):
-        a, p, b, q = rng.standard_normal((4, 3))
-        pair = ray_pair(a, p, b, q)
-        s, t = np.linalg.lstsq(np.stack([p, -q], 1), b - a, rcond=None)[0]
-        np.testing.assert_allclose(pair.closest_mm, [a + s * p, b + t * q], atol=1e-9)
-        np.testing.assert_allclose(pair.middle_mm, (a + s * p + b + t * q) / 2, atol=1e-9)
-        between = pair.closest_mm[1] - pair.closest_mm[0]
-        assert abs(pair.miss_mm) == pytest.approx(np.linalg.norm(between))
-        assert np.sign(pair.miss_mm) == np.sign(between @ np.cross(p, q))
-    with pytest.raises(GeometryError, match="parallel"):
-        ray_pair([0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, 2])
-
-
-def test_the_drawn_pair_is_the_median_one_and_its_miss_that_of_the_table(run: Path) -> None:
-    results = read_track_results(run)
-    miss = results.tracks["ray_miss_mm"].to_numpy()
-    row = typical_row(results)
-    assert row is not None
-    assert np.sum(np.abs(miss) < abs(miss[row])) == FRAMES // 2
-    assert rays_of_row(results, two_cameras(), row).miss_mm == pytest.approx(miss[row], abs=1e-9)
-    picture = two_rays(results, two_cameras())
-    assert picture is not None
-    assert f"{1e3 * abs(miss[row]):.3g} µm" in picture.caption
-
-
 def test_only_the_runs_own_calibration_counts(run: Path, tmp_path: Path) -> None:
     cameras, why = run_cameras(run, read_track_results(run))
     assert why == "" and cameras is not None and cameras[1].name == "right"
@@ -227,16 +196,3 @@ def test_only_the_runs_own_calibration_counts(run: Path, tmp_path: Path) -> None
     (tmp_path / "a" / "calibration" / "calibration.json").write_text("{")
     with pytest.raises(InputError, match="JSON"):
         run_cameras(alone, read_track_results(alone))
-
-
-def test_the_scene_of_a_slender_path_is_widened_by_what_the_page_says(run: Path) -> None:
-    results = read_track_results(run)
-    assert scene_widening(results) == 1
-    assert json.loads(track_scene_json(results))["layout"]["scene"]["aspectmode"] == "data"
-    tall = replace(results, tracks=results.tracks.assign(y_mm=10 * results.tracks["y_mm"]))
-    scene = json.loads(track_scene_json(tall))["layout"]["scene"]
-    ratio, sides = scene["aspectratio"], np.ptp(tall.points_mm, axis=0)
-    per_mm = [ratio[axis] / side for axis, side in zip("xyz", sides)]
-    assert scene["aspectmode"] == "manual" and scene_widening(tall) > 4
-    assert per_mm[0] == pytest.approx(scene_widening(tall) * per_mm[1], rel=1e-3)
-    assert per_mm[2] == pytest.approx(per_mm[0], rel=1e-3)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import base64
-import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,12 +12,15 @@ import pytest
 
 from telerig.errors import InputError
 from telerig.io.report import trial, validation
-from telerig.io.report.calibration.dot_fit import dot_pictures, edge_distance_px
-from telerig.io.report.calibration.figures import tilt_angles_rad, trust_pictures
-from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
-from telerig.io.report.calibration.target import target_shape
+from telerig.io.report.batch import report as batch
+from telerig.io.report.calibration import report as calibration
 from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page import page
+from telerig.io.report.page.figures import Figure
+from telerig.io.report.plot.outline import common_plane, rig_outline
+from telerig.io.report.plot.rig import tilt_angles_rad
+from telerig.io.report.plot.target import target_shape
+from telerig.io.report.run import report as run
 from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Diagnostics, Target
 from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.results.tracking import TrackingFile
@@ -44,16 +46,16 @@ def _results() -> CalibrationResults:
         file=file, cameras=(left, right), views=views,
         row_column=lattice, residuals=pd.DataFrame(seen, columns=["view", "camera"]),
         component={f"dot {i // 3}.{'xyz'[i % 3]}_mm": i for i in range(45)}, joint=root @ root.T,
-        run={}, overlays={}, dot_example={}, uncertainty={}, comparison=ComparisonFile(), absent=(),
+        run={}, overlays={}, uncertainty={}, comparison=ComparisonFile(), absent=(),
     )  # fmt: skip
 
 
 def test_tilt_is_the_angle_between_axis_and_normal() -> None:
-    views, tilt, direction = tilt_angles_rad(_results(), 0)
-    assert views == ["view00", "view01", "view02"]
+    results = _results()
+    tilt, direction = tilt_angles_rad(results.cameras[0], results.views)
     np.testing.assert_allclose(np.degrees(tilt), [25.0, 25.0, 40.0], atol=1e-9)
     np.testing.assert_allclose(np.cos(direction), [-1.0, 1.0, -1.0], atol=1e-9)
-    _, other, _ = tilt_angles_rad(_results(), 1)
+    other, _ = tilt_angles_rad(results.cameras[1], results.views)
     np.testing.assert_allclose(np.degrees(other), [65.0, 65.0, 50.0], atol=1e-9)
 
 
@@ -76,15 +78,15 @@ def test_uncertainty_is_drawn_in_the_plane_of_both_axes(
     file = found.file.model_copy(update={"diagnostics": Diagnostics()})
     cameras = (found.cameras[0], second)
     found = replace(found, file=file, cameras=cameras, uncertainty=uncertainty)
-    (picture,) = trust_pictures(found)
-    assert f"1.00 to {largest}.00 µm" in picture.caption
-    drawn = base64.b64decode(picture.source.split(",")[1]).decode()
-    assert f">{name} / mm<" in drawn and ">z / mm<" in drawn
+    (figure,) = calibration._maps(found)
+    assert f"1.00 to {largest}.00 µm" in figure.caption
+    axes = figure.draw()
+    assert (axes.get_xlabel(), axes.get_ylabel()) == (f"{name} / mm", "z / mm")
 
 
 def test_target_shape_finds_a_bump_and_its_deviation() -> None:
     results = _results()
-    shape = target_shape(results)
+    shape = target_shape(results.points_mm, results.row_column, results.target_covariance)
     assert shape is not None and shape.in_plane
     design = np.c_[results.row_column, np.ones(15)]
     residual = np.eye(15) - design @ np.linalg.pinv(design)
@@ -94,10 +96,14 @@ def test_target_shape_finds_a_bump_and_its_deviation() -> None:
     np.testing.assert_allclose(shape.sd_um[:, 2], expected)
 
 
+def _outline(results: CalibrationResults) -> Any:
+    return rig_outline(results.cameras, results.views, results.points_mm).cameras
+
+
 def test_outline_of_a_field_is_what_the_image_corners_see() -> None:
     results = _results()
     corners = np.array([[-0.5, -0.5], [511.5, -0.5], [511.5, 511.5], [-0.5, 511.5]])
-    for section in rig_outline(results).cameras[1].field_mm:
+    for section in _outline(results)[1].field_mm:
         np.testing.assert_allclose(results.cameras[1].project(section), corners, atol=1e-9)
 
 
@@ -115,9 +121,9 @@ def test_the_second_camera_is_drawn_where_it_stands(
     found = _results()
     second = replace(found.cameras[1], camera_from_rig=pose)
     results = replace(found, cameras=(found.cameras[0], second))
-    plane = common_plane(results)
+    plane = common_plane(results.cameras)
     np.testing.assert_allclose(plane, [across, (0, 0, 1)], atol=1e-6)
-    first, other = (c.body_mm.reshape(8, 3).mean(0) @ plane.T for c in rig_outline(results).cameras)
+    first, other = (c.body_mm.reshape(8, 3).mean(0) @ plane.T for c in _outline(results))
     assert np.sign(other[0]) == sign and first[1] < -10.0 and abs(first[0]) < 1e-9
     assert second.unproject([256.0, 256.0])[1] @ np.array(across) * sign < 0  # towards the middle
 
@@ -125,46 +131,11 @@ def test_the_second_camera_is_drawn_where_it_stands(
 def test_outline_of_a_perspective_camera_stays_in_front_of_its_centre() -> None:
     results = _results()
     near = results.cameras[0].with_parameters(kappa_per_mm=1 / 30.0)
-    outline = rig_outline(replace(results, cameras=(near,))).cameras[0]
+    outline = _outline(replace(results, cameras=(near,)))[0]
     width_mm = np.linalg.norm(outline.field_mm[:, 1] - outline.field_mm[:, 0], axis=1)
     depth_mm = outline.axis_mm[:, 2] + 30.0
     assert depth_mm.min() > 0
     np.testing.assert_allclose(width_mm / depth_mm, 51.2 / 30.0)
-
-
-def test_scene_holds_every_dot_where_the_pose_puts_it() -> None:
-    results = _results()
-    traces = {t["name"]: t for t in json.loads(scene_json(results))["data"]}
-    dots = np.array([traces["dots"][axis] for axis in "xyz"]).T
-    expected = np.concatenate([pose.apply(results.points_mm) for pose in results.views.values()])
-    np.testing.assert_allclose(dots, expected, atol=6e-4)
-    assert traces["names of the views"]["text"] == ["00", "01", "02"]
-
-
-def _circle_example() -> dict[str, np.ndarray]:
-    v, u = np.mgrid[50:81, 100:141]
-    numbers = {"u0": 100.0, "v0": 50.0, "u_px": 120.0, "v_px": 65.0, "a_px": 8.0, "b_px": 8.0}
-    model = 20 + 200 / (1 + np.exp(2 * (np.hypot(u - 120, v - 65) - 8)))
-    images = {"patch": model + 1, "model": model}
-    return images | {k: np.array(x) for k, x in numbers.items()} | {
-        "angle_rad": np.array(0.3), "noise": np.array(0.5),
-    }  # fmt: skip
-
-
-def test_distance_from_a_circle_is_exact() -> None:
-    v, u = np.mgrid[50:81, 100:141]
-    off_centre = np.hypot(u - 120, v - 65) > 0
-    distance = edge_distance_px(_circle_example())
-    expected = np.hypot(u - 120, v - 65) - 8
-    np.testing.assert_allclose(distance[off_centre], expected[off_centre], atol=1e-9)
-
-
-def test_profile_keeps_clear_of_a_neighbour_and_states_the_misfit() -> None:
-    example = _circle_example()
-    patch = example["patch"].copy()
-    patch[:, :6] = 250
-    *_, profile = dot_pictures(example | {"patch": patch})
-    assert "RMS 1.00 grey values, noise 0.500" in profile.caption
 
 
 def _overlay_tables() -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -216,11 +187,19 @@ def test_records_take_numpy_scalars_and_write_nan_as_null(tmp_path: Path) -> Non
     assert read.rig_change is not None and read.rig_change.moved
 
 
-@pytest.mark.parametrize("smoothing", [False, True])
-@pytest.mark.parametrize("kind", ["calibration", "track", "batch"])
-def test_every_term_of_a_page_is_in_the_glossary(kind: str, smoothing: bool) -> None:
-    template = page._environment().get_template(f"template_{kind}.html")
-    line = next(x for x in page._package_file(template.name or "").splitlines() if "set terms" in x)
-    environment = page._environment()
-    terms = environment.from_string(line).make_module({"smoothing": smoothing}).terms
-    assert all(page.glossary()[term] for term in (*terms, *validation.TERMS, *trial.TERMS))
+@pytest.mark.parametrize("of", [validation, trial, calibration, run, batch])
+def test_every_term_of_a_page_is_in_the_glossary(of: Any) -> None:
+    assert all(page.glossary()[term] for term in of.TERMS)
+
+
+def _nothing(axes: Any) -> Any:
+    raise InputError("there is nothing to draw")
+
+
+def test_a_section_that_says_nothing_is_left_out_and_a_figure_that_cannot_be_drawn() -> None:
+    empty = Figure("none", _nothing)
+    said = [page.Section("a", "A", page.texts("", "words")), page.Section("b", "B", [empty]),
+            page.Section("c", "C", page.table(["x"], []))]  # fmt: skip
+    text = page.render_page(page.Page("k", "t", "n", page.Verdict("V", "good"), [empty], said))
+    assert 'id="a"' in text and "words" in text
+    assert not any(f'id="{name}"' in text for name in ("b", "c", "look"))

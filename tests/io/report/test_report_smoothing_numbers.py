@@ -19,9 +19,9 @@ from smoothed_folder import (
     write_folder,
 )
 
+from telerig.io.report.plot.shake import density_limits
 from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
-from telerig.io.report.run.smoothing.figures import density_limits
-from telerig.io.report.run.smoothing.tables import axis_table, mode_rows
+from telerig.io.report.run.smoothing import axis_table, mode_rows
 from telerig.io.results.folders.smoothing import (
     axis_sd,
     shake_rms_um,

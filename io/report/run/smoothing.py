@@ -7,13 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from telerig.io.report.page.page import Figure, Row
-from telerig.io.report.run.smoothing.bubbles import (
-    bubble_words,
-    summary_rows,
-    swarm_figures,
-)
-from telerig.io.report.run.tracking.tables import Headline
+from telerig.io.report.page.page import Row, Tile
+from telerig.io.report.page.page import Verdict as PageVerdict
 from telerig.io.results.folders.smoothing import (
     AXES,
     SPEED,
@@ -36,7 +31,6 @@ from telerig.io.results.verdict_words import (
     to_resolve,
     words_of_axes,
     words_of_contradiction,
-    words_of_refusals,
     words_of_use,
 )
 from telerig.short_text import (
@@ -49,36 +43,6 @@ from telerig.short_text import (
     share,
     with_sd,
 )
-
-
-def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str, Any]:
-    """Return the variable ``smoothing`` of template_smoothing.html."""
-    verdict = smoothing_verdict(results, tracks)
-    return {
-        "verdict": verdict,
-        "uses": use_rows(results),
-        "refusals": words_of_refusals(results.file),
-        "figures": smoothing_figures(results),
-        "axes": axis_table(results),
-        "judged": bool(results.file.axes),
-        "unseen": unseen_words(results),
-        "mode_heads": MODE_HEADS,
-        "modes": mode_rows(results),
-        "unsure": verdict.colour == "rejected",
-        "residuals": residual_rows(results),
-        "residual_words": residual_words(results),
-        "whiteness_heads": WHITENESS_HEADS,
-        "whiteness": whiteness_rows(results),
-        "whiteness_words": whiteness_words(results),
-        "constants": constant_rows(results),
-        "means": mean_rows(results),
-        "bubble_table": summary_rows(results),
-        "bubble_words": bubble_words(results),
-        "swarm": swarm_figures(results),
-        "model": model_rows(results),
-        "model_words": model_words(results),
-    }
-
 
 _COLOURS = {
     Verdict.RESOLVED: "good",
@@ -97,7 +61,7 @@ _IN_UM = {"mm": ("µm", 1e3)}
 _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 
 
-def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headline:
+def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVerdict:
     """Return the verdict of the smoothing, with a remedy if there is one."""
     file = results.file
     (headline, meaning, _), colour = NOT_JUDGED, "usable"
@@ -124,7 +88,7 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headli
     if warnings and colour == "good":
         colour = "usable"
     known = tuple(dict.fromkeys(s for s in sentences if s))
-    return Headline(headline, colour, known, tuple(warnings))
+    return PageVerdict(headline, colour, known, tuple(warnings))
 
 
 def _stale(results: SmoothingResults, tracks: TrackResults) -> list[str]:
@@ -138,7 +102,7 @@ def _stale(results: SmoothingResults, tracks: TrackResults) -> list[str]:
     ]
 
 
-def smoothing_figures(results: SmoothingResults) -> list[Figure]:
+def smoothing_tiles(results: SmoothingResults) -> list[Tile]:
     """Return the most important numbers."""
     place, speed = axis_sd(results), axis_sd(results, SPEED)
     away, away_speed = taken_away(results), taken_away(results, pattern=SPEED)
@@ -151,14 +115,14 @@ def smoothing_figures(results: SmoothingResults) -> list[Figure]:
     worst = max(shake, key=lambda key: shake[key], default=None)
     where = "the estimate, about its mean" if worst is None else f"camera {worst[0]}, {worst[1]}"
     return [
-        Figure("Position, 1 sd", f"{_largest(place, 1e3)} µm",
+        Tile("Position, 1 sd", f"{_largest(place, 1e3)} µm",
                f"smoothed, median, worst axis{_with_encoder(results)}"),
-        Figure("Velocity, 1 sd", f"{_largest(speed)} mm/s", "smoothed, median, worst axis"),
-        Figure("Taken from positions", f"{_largest(away, 1e3)} µm",
+        Tile("Velocity, 1 sd", f"{_largest(speed)} mm/s", "smoothed, median, worst axis"),
+        Tile("Taken from positions", f"{_largest(away, 1e3)} µm",
                "RMS of unsmoothed (triangulated plus encoder) less smoothed, worst axis"),
-        Figure("Taken from velocities", f"{_largest(away_speed)} mm/s",
+        Tile("Taken from velocities", f"{_largest(away_speed)} mm/s",
                "RMS of unsmoothed (difference over two frames) less smoothed, worst axis"),
-        Figure("Shake", f"{number(None if worst is None else shake[worst], 3)} µm",
+        Tile("Shake", f"{number(None if worst is None else shake[worst], 3)} µm",
                f"RMS, largest: {where}"),
     ]  # fmt: skip
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.io.report.page.page import Figure, Row
+from telerig.io.report.page.page import Row, Tile, Verdict, link_to
 from telerig.io.results.folders.tracking import (
     NORMAL_MEDIAN,
     TrackResults,
@@ -29,23 +29,13 @@ _MATCHED_TOO_FEW = 0.5
 _AMBIGUOUS = "ambiguous"
 
 
-@dataclass(frozen=True)
-class Headline:
-    """``colour`` : good, usable or rejected; ``sentences`` : good or bad; ``warnings`` : bad."""
-
-    headline: str
-    colour: str
-    sentences: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-
-def verdict(results: TrackResults) -> Headline:
+def verdict(results: TrackResults) -> Verdict:
     """How much was found, how well it is known, and what is wrong."""
     points, tracks = len(results.tracks), len(track_lengths(results))
     frames = frame_count(results)
     if not points:
         headline = f"No bubble was followed in {_many(frames, 'frame')}"
-        return Headline(headline, "rejected", (_matched_words(results),), _warnings(results))
+        return Verdict(headline, "rejected", (_matched_words(results),), _warnings(results))
     headline = (
         f"{_many(tracks, 'track')}, {_many(points, 'position')} in space, {_many(frames, 'frame')}"
     )
@@ -53,7 +43,7 @@ def verdict(results: TrackResults) -> Headline:
     common = share_words(results.file.calibration_sd_mm, results.file.extrapolated)
     precision = (_precision_words(results), *common)
     sentences = (_matched_words(results), *precision, _miss_words(results))
-    return Headline(headline, "usable" if warnings else "good", sentences, warnings)
+    return Verdict(headline, "usable" if warnings else "good", sentences, warnings)
 
 
 def _many(count: int, word: str) -> str:
@@ -137,14 +127,14 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
     matched = _matched(results)
     if matched is not None and matched[0] < _MATCHED_TOO_FEW * matched[1]:
         words.append(
-            "More than half of the bubbles have no partner in another camera or no track: look "
-            "at the worst frames below."
+            "More than half of the bubbles have no partner in another camera or no track: see "
+            "the doubtful frames."
         )
     stated = [sentence(text) for text in results.file.warnings]
     return (*stated, *words)
 
 
-def key_numbers(results: TrackResults) -> list[Figure]:
+def key_numbers(results: TrackResults) -> list[Tile]:
     """Return the most important numbers."""
     lengths, tracks = track_lengths(results), results.tracks
     matched = _matched(results) or (None, None)
@@ -158,20 +148,20 @@ def key_numbers(results: TrackResults) -> list[Figure]:
     ambiguous = word_counts(tracks["flags"])[_AMBIGUOUS]
     each = len(tracks) / frames if frames else None
     return [
-        Figure("Tracks", number(len(lengths)),
+        Tile("Tracks", number(len(lengths)),
                f"median length {number(round(median(lengths.astype(float)) or 0))} points, longest "
                f"{number(int(lengths.max())) if len(lengths) else ABSENT}"),
-        Figure("Bubbles in a frame", number(each, 3), f"in space, mean of {number(frames)} frames"),
-        Figure("Matched", share(*matched),
+        Tile("Bubbles in a frame", number(each, 3), f"in space, mean of {number(frames)} frames"),
+        Tile("Matched", share(*matched),
                f"{number(matched[0])} of {number(matched[1])} bubbles in single images"),
-        Figure("Measured position, 1 sd", f"{number(median(results.sd_um.max(axis=1)), 2)} µm",
+        Tile("Measured position, 1 sd", f"{number(median(results.sd_um.max(axis=1)), 2)} µm",
                "along each point's worst axis, median over points; calibration's share left out"),
-        Figure("Ray miss", f"{number(median(np.abs(miss)), 2)} µm",
+        Tile("Ray miss", f"{number(median(np.abs(miss)), 2)} µm",
                f"median; {of_noise}RMS {number(rms(miss), 2)} µm"),
-        Figure("Diameter", f"{number(median(size), 3)} mm", "median, sphere of equal volume"),
-        Figure("Ambiguous", share(ambiguous, len(tracks)),
+        Tile("Diameter", f"{number(median(size), 3)} mm", "median, sphere of equal volume"),
+        Tile("Ambiguous", share(ambiguous, len(tracks)),
                f"{number(ambiguous)} bubbles that another grouping explains almost as well"),
-        Figure("Centre", _centres(results), "of volume, or the mean of the silhouettes"),
+        Tile("Centre", _centres(results), "of volume, or the mean of the silhouettes"),
     ]  # fmt: skip
 
 
@@ -261,14 +251,33 @@ def event_words(results: TrackResults) -> str:
         f"{kind}: {number(n)}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])
     ]
     rest = len(results.events) - MOST_EVENTS
-    text = ", ".join(kinds) + "." if kinds else "Nothing is known of any event."
+    text = ", ".join(kinds) + "." if kinds else ""
     if rest > 0:
         text += f" The first {MOST_EVENTS} are listed, {number(rest)} more are in events.csv."
     return text
 
 
-def worst_words(results: TrackResults) -> dict[str, str]:
-    """Frame as six digits -> why it is shown; in the file's order, pictured frames after that."""
-    worst = {f"{w.frame:06d}": w.why for w in results.file.worst_frames}
-    pictured = sorted({frame for _, frame in results.pictures})
-    return worst | {frame: "" for frame in pictured if frame not in worst}
+def doubtful_rows(results: TrackResults, page_folder: Path) -> list[Row]:
+    """Return a row for each frame that is doubtful for a reason, with links to its pictures."""
+    return [
+        Row((f"frame {frame.frame}, {camera}", frame.why), link=link_to(picture, page_folder))
+        for frame in results.file.worst_frames
+        for camera in results.cameras
+        if frame.why and (picture := results.pictures.get((camera, f"{frame.frame:06d}")))
+    ]
+
+
+def marks_words(results: TrackResults, camera: str) -> str:
+    """Return sentences on the marks that were followed in a camera's images."""
+    table = results.references[results.references["camera"] == camera]
+    in_a_frame, stays = (table.groupby(key).size().to_numpy() for key in ("frame", "mark"))
+    words = (
+        f"{number(len(stays))} marks, {np.median(in_a_frame):.0f} in a frame and each in "
+        f"{np.median(stays):.0f} frames (medians)"
+    )
+    if "sigma_px" in table and table["sigma_px"].notna().any():
+        words += f", measured to {number(median(table['sigma_px'].to_numpy(float)))} px"
+    return (
+        f"{words}. The lines are as parallel as the stage and the shake move all marks alike; one "
+        "that goes its own way is not fixed to the tank."
+    )

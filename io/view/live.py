@@ -47,14 +47,13 @@ from telerig.io.view.run import (
 from telerig.io.view.show import load_for_view, log_results, served
 from telerig.io.view.stream import grey_levels, log_image, log_series, log_spectrum, rgb
 from telerig.rig.camera import Camera
-from telerig.spectra import Spectrum, motion_spectrum, segment, welch_density
+from telerig.spectra import LEAST_FRAMES, Spectrum, motion_spectrum, segment, welch_density
 
 SPECTRUM_S = 5.0
 """Spectra are those of the last seconds."""
 _MEMORY = "1GB"
 _POINTS = 50
 """Readings of a curve that are shown of every half second."""
-_LEAST_READINGS = 64
 
 
 def main() -> None:
@@ -148,7 +147,7 @@ class LiveView:
     def shake(self, t_s: Array, shake_mm: Mapping[str, Array]) -> None:
         """Show the spectra of the cameras' shake (F, 3) after a pass of the smoothing."""
         for camera, values in shake_mm.items():
-            if len(values) >= _LEAST_READINGS:
+            if len(values) >= LEAST_FRAMES:
                 found = Spectrum(*welch_density(t_s, 1e3 * values, segment(len(values))))
                 log_spectrum(self.stream, camera, found, static=True)
 
@@ -278,7 +277,7 @@ class _Line:
         t_s, values = (np.concatenate(parts) for parts in zip(*self.last))
         good = np.diff(t_s, prepend=-np.inf) > 0
         t_s, values = t_s[good], values[good]
-        if len(t_s) < _LEAST_READINGS:
+        if len(t_s) < LEAST_FRAMES:
             return None
         if self.device.kind == "accelerometer":
             return motion_spectrum(t_s, values)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from viewed import entities, needs_rerun
 
 import telerig
-from telerig.errors import InputError
+from telerig.errors import InputError, TelerigWarning
 from telerig.io.view.show import frames_of
 from telerig.io.view.stream import grey_levels
 from telerig.scripts.main import app
@@ -92,6 +92,10 @@ def test_images_of_the_recording_are_in_it_for_chosen_frames(tmp_path: Path) -> 
     whole, some = (tmp_path / f"{name}.rrd" for name in ("all", "some"))
     assert "/images/left/image" in entities(some)
     assert some.stat().st_size < whole.stat().st_size
+    (tmp_path / "runs" / "rise" / "stage.csv").write_text("t_s,position_mm\n0,no number\n")
+    with pytest.warns(TelerigWarning, match=r"stage\.csv"):
+        telerig.view(folder, save=whole)
+    assert "/images/left/image" in entities(whole)
     with pytest.raises(InputError, match="neither a calibration nor a tracked run"):
         telerig.view(tmp_path, save=tmp_path / "none.rrd")
     assert not (tmp_path / "none.rrd").exists()

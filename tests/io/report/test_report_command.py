@@ -79,7 +79,10 @@ def test_pages_made_again_elsewhere_are_the_same(dataset: Path, tmp_path: Path) 
         assert f"written: {again}" in said
         first = (dataset / "results" / name / "report.html").read_text(encoding="utf-8")
         if name != "batch":
-            assert len(again.read_text(encoding="utf-8")) == len(first)
+            second = again.read_text(encoding="utf-8")
+            assert len(re.sub(r'href="[^"]*jpg"', "", second)) == len(
+                re.sub(r'href="[^"]*jpg"', "", first)
+            )
         assert [p.name for p in again.parent.iterdir()] == ["report.html"]
 
 

@@ -104,7 +104,7 @@ def _sheet(figure: Figure) -> tuple[Any, Any]:
         from mpl_toolkits.mplot3d import Axes3D
 
         sheet = Sheet(figsize=size)
-        axes = Axes3D(sheet, rect=(0.02, 0.05, 0.9, 0.95))
+        axes = Axes3D(sheet, rect=(0.02, 0.1, 0.9, 0.9))
         sheet.add_axes(axes)
         return sheet, axes
     sheet = Sheet(figsize=size, layout="constrained")

@@ -27,10 +27,9 @@ from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
     Rejected,
-    dark_noise_share,
     find_blobs,
     implausible_parts,
-    noise_share,
+    noise_shares,
     split_blobs,
 )
 from telerig.estimator.bubbles.outline.crowds import WHOLE, around, resolved_crowd, settled
@@ -196,7 +195,8 @@ def _found(
     shadows: bool,
 ) -> Bubbles:
     ratio, clipped = normalised(image, background)
-    sigma = max(noise_share(ratio, field), 1e-4)
+    noise = noise_shares(ratio, field)
+    sigma = float(noise[0])
     blobs, rejected = find_blobs(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
@@ -206,7 +206,6 @@ def _found(
     parts, slender = _without_slender(parts)
     rejected += slender
     clusters: list[Array] = []
-    noise = np.array([sigma, max(dark_noise_share(ratio, blobs, sigma), 1e-4)])
     start = _start(parts, blobs)
     outlines = fit_outlines(ratio, start, noise, shadows=shadows)
     merged = _merged(outlines, parts)

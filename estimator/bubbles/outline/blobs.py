@@ -32,11 +32,11 @@ from telerig.estimator.images.noise import clipped_sigma, high_pass
 
 _NOISE_SAMPLES = 40_000
 _BAND_ROWS = 16
-_DARK_SHARE, _ENOUGH_DARK = 0.12, 120
+_ENOUGH_LIT, _ENOUGH_DARK, _LEAST_NOISE = 200, 120, 1e-4
 _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
 _DARKEST = 0.05
-_LIT = 0.85
+_LIT, _DARK = 0.85, 0.3
 _LEAST_OUTLINE, _STEEP_SHARE = 5, 0.6
 _MAX_CUT_CENTRE_SHARE = 0.6
 
@@ -70,53 +70,42 @@ class Rejected(NamedTuple):
     reason: str
 
 
-def noise_share(ratio: Float32, field: Bools | None = None) -> float:
-    """Return the noise of the free screen in an image divided by its background.
+def noise_shares(ratio: Float32, field: Bools | None = None) -> Array:
+    """Return the noise (2,) of the free screen and of what is evenly dark before it.
 
-    It is the standard deviation of a pixel, as a share of the background. It is estimated after
+    Both are standard deviations of a pixel, as shares of the background. They are estimated after
     `high_pass`, which removes smooth changes; of a large image only some bands of rows are used.
+    Dark pixels show fewer photons: their noise is at most that of the screen. Structure in the dark
+    makes it too large, not too small.
 
     ratio : image divided by its background. field : (rows, columns) where the screen is; None for
     everywhere.
     """
-    found, lit = [], []
+    found, kinds = [], []
     for first in range(0, max(len(ratio) - _BAND_ROWS, 0) + 1, _band_step(ratio)):
         band = ratio[first : first + _BAND_ROWS]
-        bright = band > _LIT
+        bright, dark = band > _LIT, band < _DARK
         if field is not None:
             bright &= field[first : first + _BAND_ROWS]
         free = cv2.erode(bright.view(np.uint8), np.ones((3, 7), np.uint8))
+        even = cv2.erode(dark.view(np.uint8), np.ones((5, 5), np.uint8), borderValue=0)
         found.append(high_pass(band)[1:-1].ravel())
-        lit.append(free[1:-1].ravel() > 0)
-    response, free = np.concatenate(found), np.concatenate(lit)
-    values = response[free] if np.count_nonzero(free) > 200 else response
-    values = values[:: max(1, values.size // _NOISE_SAMPLES)]
-    return clipped_sigma(values.astype(np.float64), rounds=6)
+        kinds.append((free + 2 * even)[1:-1].ravel())
+    response, kind = np.concatenate(found), np.concatenate(kinds)
+    free, even = response[kind == 1], response[kind == 2]
+    lit = _sigma(free if free.size > _ENOUGH_LIT else response)
+    inside = min(_sigma(even), lit) if even.size > _ENOUGH_DARK else lit
+    return np.maximum([lit, inside], _LEAST_NOISE)
+
+
+def _sigma(values: Float32) -> float:
+    thin = values[:: max(1, values.size // _NOISE_SAMPLES)]
+    return clipped_sigma(thin.astype(np.float64), rounds=6)
 
 
 def _band_step(ratio: Float32) -> int:
     """Return the rows from one band to the next: all of a small image, a quarter of a large one."""
     return _BAND_ROWS - 2 if ratio.size < 4 * _NOISE_SAMPLES else 4 * _BAND_ROWS
-
-
-def dark_noise_share(ratio: Float32, blobs: list[Blob], sigma: float) -> float:
-    """Return the noise of pixels inside the dark rims, where there are fewer photons.
-
-    It is at most ``sigma``, the noise of the screen. It is estimated after `high_pass`, at places
-    where five by five pixels are equally dark. Structure inside the rims makes the estimate too
-    large, not too small.
-    """
-    found = [np.empty(0, np.float32)]
-    for blob in blobs:
-        x, y, width, height = blob.box
-        part = ratio[y : y + height, x : x + width]
-        dark = blob.inner + _DARK_SHARE * (1.0 - blob.inner)
-        even = cv2.erode((part < dark).view(np.uint8), np.ones((5, 5), np.uint8), borderValue=0)
-        found.append(high_pass(part)[even > 0])
-    values = np.concatenate(found)
-    if values.size < _ENOUGH_DARK:
-        return sigma
-    return min(sigma, clipped_sigma(values[: 10 * _NOISE_SAMPLES].astype(np.float64), rounds=6))
 
 
 def find_blobs(
@@ -131,24 +120,50 @@ def find_blobs(
     Returns the regions that may be bubbles, and those that are too small or too faint.
     """
     low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
-    mask = cv2.compare(ratio, low, cv2.CMP_LT)
-    regions, tree = cv2.findContours(mask, cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
+    shadow = ratio < np.float32(low)
+    regions, tree = cv2.findContours(shadow.view(np.uint8), cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
+    depth = np.array(_depths(tree), np.intp)
+    length = np.array([len(region) for region in regions], np.intp)
+    labels, boxes = np.zeros(ratio.shape, np.int32), [(0, 0, 0, 0)]
+    for k in np.argsort(depth, kind="stable").tolist():
+        if depth[k] % 2 == 0 and length[k] >= _LEAST_OUTLINE:
+            cv2.drawContours(labels, regions, k, (len(boxes),), cv2.FILLED)
+            boxes.append(cv2.boundingRect(regions[k]))
+    place = np.flatnonzero(shadow)
+    if not place.size:
+        return [], []
+    own, value = labels.ravel()[place], ratio.ravel()[place]
+    size = np.bincount(own, minlength=len(boxes))
+    order = np.sort(own + np.clip(value, 0.0, 0.999).astype(np.float64))
+    first = np.cumsum(size) - size
+    inner = order[np.minimum(first + (_DARKEST * size).astype(int), own.size - 1)]
+    inner -= np.arange(size.size)
+    small = np.array([max(box[2:]) for box in boxes]) < min_diameter_px
+    faint = inner > 1.0 - min_contrast
+    half = np.where(small | faint, -np.inf, 0.5 * (1.0 + inner)).astype(np.float32)
+    dark = np.zeros(ratio.shape, np.uint8)
+    dark.ravel()[place[value < half[own]]] = 1
+    _close_at_border(dark, labels)
+    outlines, tree = cv2.findContours(dark, cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
     traced: list[_Traced] = []
-    rejected: list[Rejected] = []
-    too_small = f"smaller than {min_diameter_px:g} px"
-    for region, depth in zip(regions, _depths(tree), strict=True):
-        if len(region) < _LEAST_OUTLINE or depth % 2:
+    for outline, level in zip(outlines, _depths(tree), strict=True):
+        width, height = cv2.boundingRect(outline)[2:]
+        if level % 2 or len(outline) < _LEAST_OUTLINE or max(width, height) < min_diameter_px:
             continue
-        x, y, width, height = cv2.boundingRect(region)
-        found: list[_Traced] = []
+        points = outline.reshape(-1, 2)
+        region = int(labels[points[0, 1], points[0, 0]])
+        traced.append(_Traced(points, float(inner[region]), boxes[region], level > 0, region))
+    without = np.arange(len(boxes)) > 0
+    without[[one.region for one in traced]] = False
+    too_small = f"smaller than {min_diameter_px:g} px"
+    rejected = []
+    for k in np.flatnonzero(without).tolist():
+        x, y, width, height = boxes[k]
         reason = too_small
-        if max(width, height) >= min_diameter_px:
-            box = (x, y, width, height)
-            found, reason = _trace(ratio, region, box, low, min_contrast, min_diameter_px)
-        traced += [one._replace(within=depth > 0) for one in found]
-        if not found:
-            radius = 0.5 * float(np.sqrt(width * height))
-            rejected.append(Rejected(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
+        if faint[k] and not small[k]:
+            reason = f"contrast {1.0 - inner[k]:.2f} is below {min_contrast:g}"
+        radius = 0.5 * float(np.sqrt(width * height))
+        rejected.append(Rejected(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
     return _refined(ratio, traced), rejected
 
 
@@ -165,61 +180,28 @@ def _depths(tree: NDArray[np.int32] | None) -> list[int]:
 
 
 class _Traced(NamedTuple):
-    """An outline of pixels (n, 2), the level inside, the box of the region it came from, and
-    whether another region surrounds it."""
+    """An outline of pixels (n, 2), the level inside, the box of the region it came from, whether
+    another region surrounds it, and the number of the region."""
 
-    pixels: NDArray[np.int_]
+    pixels: NDArray[np.int32]
     inner: float
     box: tuple[int, int, int, int]
-    within: bool = False
+    within: bool
+    region: int
 
 
-def _trace(
-    ratio: Float32,
-    region: NDArray[np.int32],
-    box: tuple[int, int, int, int],
-    low: float,
-    min_contrast: float,
-    min_diameter_px: float,
-) -> tuple[list[_Traced], str]:
-    """Return outlines at half depth within one region, or the reason why there is none."""
-    x, y, width, height = box
-    rows, columns = ratio.shape
-    left, top = max(x - 1, 0), max(y - 1, 0)
-    part = ratio[top : min(y + height + 1, rows), left : min(x + width + 1, columns)]
-    own = np.zeros(part.shape, np.uint8)
-    cv2.drawContours(own, [region], -1, 1, cv2.FILLED, offset=(-left, -top))
-    values = part[(own > 0) & (part < low)]
-    place = int(_DARKEST * values.size)
-    inner = float(np.partition(values, place)[place])
-    if inner > 1.0 - min_contrast:
-        return [], f"contrast {1.0 - inner:.2f} is below {min_contrast:g}"
-    half = 0.5 * (1.0 + inner)
-    dark = own & (part < half)
-    at_border = (top == 0, left == 0, top + part.shape[0] == rows, left + part.shape[1] == columns)
-    if any(at_border):
-        _close_at_border(dark, at_border)
-    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    traced = []
-    for outline in outlines:
-        points = outline.reshape(-1, 2)
-        size = int(np.max(np.max(points, axis=0) - np.min(points, axis=0))) + 1
-        if len(points) < _LEAST_OUTLINE or size < min_diameter_px:
-            continue
-        traced.append(_Traced(points + np.array([left, top]), inner, box))
-    return traced, "" if traced else f"smaller than {min_diameter_px:g} px"
-
-
-def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
-    """Join what is dark along the image's edges: a bright centre cut by the edge becomes a hole."""
-    lines = (dark[0], dark[:, 0], dark[-1], dark[:, -1])
-    for line, at_border in zip(lines, sides, strict=True):
-        if not at_border:
-            continue
+def _close_at_border(dark: NDArray[np.uint8], labels: NDArray[np.int32]) -> None:
+    """Join what is dark of a region along the image's edges: a bright centre cut by the edge
+    becomes a hole. Both images are changed."""
+    for edge in (np.s_[0], np.s_[:, 0], np.s_[-1], np.s_[:, -1]):
+        line, own = dark[edge], labels[edge]
         places = np.flatnonzero(line)
         for low, high in zip(places[:-1].tolist(), places[1:].tolist(), strict=True):
-            if 1 < high - low <= _MAX_CUT_CENTRE_SHARE * line.size:
-                line[low:high] = 1
+            if high - low == 1 or own[low] != own[high]:
+                continue
+            extent = np.ptp(places[own[places] == own[low]]) + 1
+            if high - low <= _MAX_CUT_CENTRE_SHARE * extent:
+                line[low:high], own[low:high] = 1, own[low]
 
 
 def _refined(ratio: Float32, traced: list[_Traced]) -> list[Blob]:

@@ -699,12 +699,17 @@ def _expected(
     for camera, _, seen in images.cameras:
         if sensor.camera in (camera, CARRIAGE):
             out += [
-                Expected(d, seen.values[:, k], seen.known)
+                Expected(d, seen.values[:, k], seen.known, whole=sensor.camera == camera)
                 for k, d in enumerate(directions(problem.cameras[camera]))
             ]
     if images.encoder is not None:
         out.append(
-            Expected(problem.axis, images.encoder.values[:, 0], images.encoder.known, whole=False)
+            Expected(
+                problem.axis,
+                images.encoder.values[:, 0],
+                images.encoder.known,
+                whole=sensor.camera == CARRIAGE,
+            )
         )
     for other in problem.accelerometers:
         if other.name != sensor.name and other.name in read:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
+from telerig.estimator.sensors.accelerations import Grid, of_positions, of_readings
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.given import Sensor, unit_of_gravity
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
@@ -20,6 +21,11 @@ _PARTS, _CLEAR_SIGMAS = 8, 4.0
 
 _TILTED_DEG = 20.0
 _FITS_DEG = 15.0
+_CLEAR, _CHANCE_SIGMAS, _INDEPENDENT_S = 0.6, 3.5, 0.025
+"""A correlation counts if it is above 0.6 and above 3.5 times that of independent signals, whose
+values 25 ms apart are independent."""
+
+_STEP_S, _KNOTS, _LEAST_OVERLAP_S = 0.005, 5, 0.3
 
 
 def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> list[Finding]:
@@ -151,3 +157,53 @@ def _tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
     force, upwards = np.asarray(axes, float).T @ np.asarray(gravity, float), np.asarray(up, float)
     across = np.linalg.norm(np.cross(force, upwards))
     return float(np.degrees(np.arctan2(across, force @ upwards)))
+
+
+def check_motion(sensor: Sensor, stage: Array, along: Array) -> list[Finding]:
+    """Return a warning if the carriage's acceleration appears on another axis than stated.
+
+    stage : (E, 2) times (s) and positions (mm). along : (3,) travel axis in the sensor's axes.
+    """
+    found = motion_correlation(sensor.t_s, sensor.reading_m_s2, stage[:, 0], stage[:, 1])
+    if found is None:
+        return []
+    stated, best = float(found @ along), int(np.argmax(np.abs(found)))
+    length = min(sensor.t_s[-1], stage[-1, 0]) - max(sensor.t_s[0], stage[0, 0])
+    bound = max(_CLEAR, _CHANCE_SIGMAS * np.sqrt(_INDEPENDENT_S / length))
+    clear = abs(found[best]) > bound and stated < abs(found[best]) / 2
+    if not (stated < -bound or clear):
+        return []
+    sign = "-" if found[best] < 0 else "+"
+    return [
+        Finding(
+            f"the carriage's acceleration appears along {sign}{'xyz'[best]} of the sensor "
+            f"(correlation {abs(found[best]):.2f}) and not along the direction of travel that "
+            f"follows from its stated axes (correlation {stated:.2f})",
+            sensor.where,
+            f"check axes in rig.toml [accelerometers.{sensor.name}]",
+        )
+    ]
+
+
+def motion_correlation(
+    t_s: ArrayLike, reading: ArrayLike, stage_t_s: ArrayLike, position_mm: ArrayLike
+) -> Array | None:
+    """Return the correlation (3,) of each sensor axis with the carriage's acceleration, or None.
+
+    t_s, reading : (N,), (N, 3) of the sensor. stage_t_s, position_mm : (E,) of the encoder. Returns
+    None if the records overlap by less than 0.3 s, or if the carriage does not accelerate.
+    """
+    t, stage_t = np.asarray(t_s, float), np.asarray(stage_t_s, float)
+    low, high = max(t[0], stage_t[0]), min(t[-1], stage_t[-1])
+    if high - low < _LEAST_OVERLAP_S:
+        return None
+    grid = Grid(float(low), _STEP_S, int((high - low) / _STEP_S) + 1, _KNOTS)
+    carriage = of_positions(grid, stage_t, np.asarray(position_mm, float)[:, None])
+    sensed, there = of_readings(grid, t, reading).at(grid.t_s)
+    known = there & carriage.known
+    if not known.any():
+        return None
+    acceleration, sensed = carriage.values[known, 0], sensed[known]
+    acceleration, sensed = acceleration - acceleration.mean(), sensed - sensed.mean(0)
+    size = np.sqrt((acceleration**2).sum() * (sensed**2).sum(0))
+    return np.asarray(sensed.T @ acceleration / size) if np.all(size > 0) else None

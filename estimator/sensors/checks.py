@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.sensors.accelerometer_checks import check_accelerometer
+from telerig.estimator.sensors.accelerometer_checks import check_accelerometer, check_motion
 from telerig.estimator.sensors.encoder_checks import check_encoder
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.given import Sensor, given_sensors, table_columns
@@ -113,7 +113,11 @@ def read_sensors(
             findings += check_overlap(
                 sensor.t_s, frames, where=sensor.where, code=Code.SENSOR_CLOCK, sensor=sensor.name
             )
-        findings += check_accelerometer(sensor, mounting.up, mounting.gravity_m_s2)
+        found = check_accelerometer(sensor, mounting.up, mounting.gravity_m_s2)
+        if not found and encoder is not None:
+            record = np.stack([encoder.t_s, encoder.position_mm], -1)
+            found = check_motion(sensor, record, sensor.axes @ mounting.axis)
+        findings += found
     return Sensors(encoder, tuple(kept), tuple(findings))
 
 

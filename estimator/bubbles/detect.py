@@ -28,7 +28,7 @@ from telerig.estimator.bubbles.outline.blobs import (
     Part,
     Rejected,
     find_blobs,
-    implausible_parts,
+    implausible_outlines,
     noise_shares,
     split_blobs,
 )
@@ -416,15 +416,13 @@ def _flags(
 def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
     """Return (B,) whether each outline belongs to merged bubbles.
 
-    This is so for blobs that could not be split and for implausible parts. If one part of a blob is
-    implausible, then so are all parts of it of which less than 60 % of the outline is visible.
+    This is so for blobs that could not be split and for implausible outlines. If one part of a blob
+    is implausible, then so are all parts of it of which less than 60 % of the outline is visible.
     """
-    merged: Bools = np.array([part.merged for part in parts], np.bool_) | implausible_parts(
-        outlines, parts
-    )
-    blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
-    suspect = np.array([part.blob in blobs for part in parts], np.bool_)
-    return merged | (suspect & (outlines.coverage < _MOSTLY_SEEN))
+    merged: Bools = np.array([part.merged for part in parts], np.bool_)
+    merged = merged | implausible_outlines(outlines)
+    own = np.array([part.blob for part in parts], np.intp)
+    return np.asarray(merged | (np.isin(own, own[merged]) & (outlines.coverage < _MOSTLY_SEEN)))
 
 
 def _defocused(outlines: Outlines) -> Bools:

@@ -387,7 +387,6 @@ and columns are continued so far beyond its bounding box."""
 _MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
 _ODD, _BAD_FIT = 4.0, 2.0
 """Standard deviations of the shapes of an image, and chi2_dof, beyond which it is no bubble."""
-_LARGEST_GROWTH, _LONG = 1.6, 2.3
 
 
 @dataclass(frozen=True)
@@ -581,19 +580,3 @@ def implausible_outlines(outlines: Outlines) -> Bools:
     radius = radius_px(outlines)
     odd = (shape_oddity(outlines) > _ODD) & (outlines.chi2_dof > _BAD_FIT)
     return np.asarray(odd | (outlines.misfit_px > _MISFIT_PX + _MISFIT_SHARE * radius))
-
-
-def implausible_parts(outlines: Outlines, parts: list[Part]) -> Bools:
-    """Return which parts (B,) are wrong.
-
-    They have an implausible outline (`implausible_outlines`), or their fit ended far from its
-    start, because the region was divided wrongly.
-    """
-    began = np.array([part.ellipse for part in parts]).reshape(-1, 5)
-    ended = outlines.ellipse
-    growth = np.sqrt(ended[:, 2] * ended[:, 3] / (began[:, 2] * began[:, 3]))
-    jump = np.hypot(ended[:, 0] - began[:, 0], ended[:, 1] - began[:, 1])
-    moved = np.maximum(growth, 1.0 / growth) > _LARGEST_GROWTH
-    moved |= (jump > 0.3 * began[:, 3] + 1.0) | (ended[:, 2] > _LONG * ended[:, 3])
-    moved &= np.array([part.shared for part in parts], dtype=np.bool_)
-    return np.asarray(implausible_outlines(outlines) | moved)

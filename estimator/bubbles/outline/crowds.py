@@ -92,8 +92,7 @@ def resolved_crowd(
     if large:
         rims = Rims.concat([rims, rims_along(ratio, sigma, np.stack(large))])
     every = Rims.concat([sure, rims])
-    owners = sole_owners(every, every.agreement, len(sure))
-    heart = typical_heart(every.take(owners), min_diameter_px)
+    heart = typical_heart(every, min_diameter_px)
     kept, evidence = are_bubbles(every, heart, min_contrast)
     kept[: len(sure)] = True
     every = every.take(kept)

@@ -57,7 +57,9 @@ def outcome(target: Target, file: Path, work: Path) -> tuple[str, str]:
     try:
         with warnings.catch_warnings(record=True) as warned, _limited_memory():
             warnings.simplefilter("always")
-            warnings.filterwarnings("ignore", ".*(there is no manifest.json|; it is used)")
+            warnings.filterwarnings(
+                "ignore", ".*(there is no manifest.json|; it is used|images are in colour)"
+            )
             try:
                 _refuse_not_finite(target.read(file), "the result")
                 result, words = "read", ""

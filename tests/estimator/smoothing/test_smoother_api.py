@@ -195,9 +195,7 @@ def test_a_negative_variance_is_refused_and_rounding_is_not() -> None:
     for least, refused in ((-1e-12, False), (-1e-3, True)):
         bubbles = good.copy()
         bubbles[2, 1, 1] = least
-        found = Covariances(
-            good, bubbles, good, np.arange(4), good, good, none, none, good, good
-        )  # fmt: skip
+        found = Covariances(good, bubbles, good, good, none, none, good, good)
         expected: Any = pytest.raises(CalibrationError, match="a bubble has a negative")
         with expected if refused else nullcontext():
             _check_variances(found)

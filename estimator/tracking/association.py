@@ -6,17 +6,20 @@ new": log P_D / (1 - P_D) + log N(innovation) - log(density of new ones) + log r
 It is the same for points that several cameras see, for what one camera alone sees (a point whose
 depth is unknown), and for predictions from smoothed tracks.
 
-Tracks that compete for measurements form a cluster; each of its branches is one way to continue
-all of them, with its log weight relative to the best. Branches with the same recent pairings are
-merged (weights added, the better past kept), improbable ones dropped. A track on which all
-branches agree leaves the cluster. When the window is over, the best branch is taken if the
+Confirmed tracks that compete for what several cameras see are in conflict: hypotheses say how all
+of them continue, each with its log weight relative to the best. Those with the same recent pairings
+are merged (weights added, the better past kept), improbable ones dropped. A track on which all
+hypotheses agree leaves the conflict. When the window is over, the best hypothesis is taken if the
 runner-up is far enough behind; else the tracks that differ are broken.
+
+Every other pairing has to be clear, or it is not made: those of tracks that are not confirmed, with
+what no confirmed track may have, and those of confirmed tracks with what one camera alone sees.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -32,11 +35,12 @@ from telerig.estimator.bubbles.pairing.evidence import (
 from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
     POSITION,
+    STATES,
     Common,
     FrameMeasurements,
-    Track,
+    Scan,
+    States,
     TrackerSettings,
-    update_tracks,
 )
 from telerig.estimator.tracking.ranked_ways import alternatives
 
@@ -50,12 +54,10 @@ _CERTAIN = 1e12
 """Score of a pairing by an id that came with the data."""
 
 
-def expected(tracks: Sequence[Track]) -> Prediction:
+def expected(states: States) -> Prediction:
     """Return where tracks are expected, without the error that all bubbles have in common."""
-    ids = np.array([t.particle for t in tracks], np.int64)
-    points = np.array([t.x[POSITION] for t in tracks]).reshape(-1, 3)
-    spread = np.array([t.p[POSITION, POSITION] for t in tracks]).reshape(-1, 3, 3)
-    return Prediction(ids, points, spread, np.array([t.d_eq_mm for t in tracks], float))
+    spread = states.p[:, POSITION, POSITION]
+    return Prediction(states.track, states.points_mm, spread, states.sizes_mm[:, 0])
 
 
 def gated_pairs(
@@ -98,6 +100,9 @@ def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
     """Return the assignment with the largest total score: columns (rows,), -1 for none."""
     out = np.full(rows, -1)
     if not len(row):
+        return out
+    if max(np.bincount(row).max(), np.bincount(column).max()) < 2:  # nothing competes
+        out[row[score > 0]] = column[score > 0]
         return out
     cost = np.zeros((rows, int(column.max()) + 1))
     cost[row, column] = np.minimum(-score, 0.0)
@@ -171,432 +176,325 @@ def joint_scores(pairs: Evidence, ways: Sequence[Sequence[int]], common: Common)
 _MERGE_FRAMES = 2
 """Hypotheses that agree on so many last frames are one."""
 
-Entry = tuple[int, int]
-"""A frame, and the column of a track's measurement in it, -1 for none."""
-
-Recent = tuple[tuple[Entry, ...], ...]
-"""For each track of a conflict, its last entries."""
-
-History = dict[int, list[Entry]]
-"""For each track, by its id, the entries since the conflict began."""
-
-
-@dataclass
-class Branch:
-    """Holds one hypothesis about tracks that compete for the same measurements.
-
-    weight : log-likelihood ratio to the best hypothesis, 0 for the best one itself.
-    tracks : the tracks as they are under this hypothesis, in the same order in every hypothesis.
-    history : the measurements of each track.
-    """
-
-    weight: float
-    tracks: list[Track]
-    history: History = field(default_factory=dict)
-
-
-@dataclass
-class Cluster:
-    """Holds a group of tracks that compete for the same measurements (a conflict).
-
-    branches : the hypotheses, best first. A track without competitors forms a group of its own,
-        with one hypothesis and no history.
-    """
-
-    branches: list[Branch]
-
-    @staticmethod
-    def of(track: Track) -> Cluster:
-        return Cluster([Branch(0.0, [track])])
-
-    @property
-    def tracks(self) -> list[Track]:
-        return self.branches[0].tracks
-
-    @property
-    def open(self) -> bool:
-        return len(self.branches) > 1
-
-    @property
-    def since_frame(self) -> int:
-        starts = [h[0][0] for h in self.branches[0].history.values() if h]
-        return min(starts, default=np.iinfo(np.int64).max)
-
-
-@dataclass(frozen=True)
-class Decided:
-    """Hold a track about which a conflict is decided.
-
-    A conflict is a run of frames in which several tracks compete for the same measurements.
-
-    kept : its measurements in the conflict; of a track that is cut those before it is ambiguous.
-    new : of a track that is cut, the measurements at the end that unambiguously belong together and
-        form a new track, which this one becomes; those in between belong to no track. None for a
-        track that goes on.
-    """
-
-    track: Track
-    kept: list[Entry]
-    new: list[Entry] | None = None
-
-
-def recent(entries: Sequence[Entry], depth: int) -> list[Entry]:
-    """Return the last ``depth`` of a track's entries (frame, column) with a measurement."""
-    return [e for e in entries if e[1] >= 0][-depth:]
-
-
-def merged(
-    scored: Iterable[tuple[float, Recent, int]], settings: TrackerSettings
-) -> list[tuple[float, int]]:
-    """Merge hypotheses with equal keys, and leave out improbable ones.
-
-    scored : (log weight, key, index) of each hypothesis.
-    Returns (log weight, index of the most probable of the merged ones), best first; the weight of
-    the best one is 0. There are ``max_hypotheses`` of them, and those that alone give a track one
-    of its measurements.
-    """
-    groups: dict[Recent, list[tuple[float, int]]] = {}
-    for weight, key, index in scored:
-        groups.setdefault(key, []).append((weight, index))
-    out = []
-    for key, members in groups.items():
-        weights = np.array([w for w, _ in members])
-        top = int(weights.argmax())
-        total = weights[top] + np.log(np.exp(weights - weights[top]).sum())
-        out.append((float(total), members[top][1], key))
-    out.sort(key=lambda item: -item[0])
-    best = out[0][0]
-    kept, seen = list[tuple[float, int]](), set[tuple[int, Entry]]()
-    for weight, index, key in out:
-        own = {(track, entry) for track, entries in enumerate(key) for entry in entries}
-        if weight < best - settings.prune_log_ratio:
-            break
-        if len(kept) < settings.max_hypotheses or not own <= seen:
-            kept.append((weight - best, index))
-            seen |= own
-    return kept
-
-
-def merge_key(histories: Iterable[Sequence[Entry]]) -> Recent:
-    """Return the most recent measurements of all tracks of a hypothesis.
-
-    Hypotheses with equal recent measurements are merged.
-    """
-    return tuple(tuple(h[-_MERGE_FRAMES:]) for h in histories)
-
-
-def disputed(branches: Sequence[Branch], depth: int) -> set[int]:
-    """Return the ids of tracks about whose last measurements the hypotheses disagree.
-
-    Two hypotheses give such a track different measurements, or give one measurement to it and to
-    another track. depth : number of last measurements that count.
-    """
-    columns: dict[tuple[int, int], set[int]] = {}
-    claims: dict[tuple[int, int], set[int]] = {}
-    for branch in branches:
-        for particle, entries in branch.history.items():
-            for frame, column in recent(entries, depth):
-                columns.setdefault((particle, frame), set()).add(column)
-                claims.setdefault((frame, column), set()).add(particle)
-    out = {particle for (particle, _), found in columns.items() if len(found) > 1}
-    return out.union(*(found for found in claims.values() if len(found) > 1))
-
-
-def decide(
-    cluster: Cluster, frame: int, settings: TrackerSettings, *, at_once: bool = False
-) -> tuple[Cluster | None, list[Decided]]:
-    """Decide which tracks of a conflict are safe in this frame; all of them if ``at_once``.
-
-    Returns the tracks that remain undecided, None if there are none, and the others.
-    """
-    branches, still = cluster.branches, None
-    over = at_once or frame - cluster.since_frame + 1 >= settings.window_frames
-    open_ids, close = set[int](), branches
-    if cluster.open and not over:
-        open_ids = disputed(branches, _MERGE_FRAMES)
-        still = _remaining(cluster, open_ids, settings)
-        open_ids = open_ids if still else set()
-    elif cluster.open:
-        close = [b for b in branches if b.weight >= -settings.margin_log_ratio]
-        open_ids = disputed(close, 1)
-    safe = [
-        Decided(t, branches[0].history.get(t.particle, []))
-        for t in cluster.tracks
-        if t.particle not in open_ids
-    ]
-    if still is not None:
-        return still, safe
-    return None, safe + _break(close, [t for t in cluster.tracks if t.particle in open_ids])
-
-
-def _remaining(cluster: Cluster, open_ids: set[int], settings: TrackerSettings) -> Cluster | None:
-    if not open_ids:
-        return None
-    branches = [
-        Branch(
-            b.weight,
-            [t for t in b.tracks if t.particle in open_ids],
-            {p: h for p, h in b.history.items() if p in open_ids},
-        )
-        for b in cluster.branches
-    ]
-    scored = (
-        (b.weight, merge_key([b.history[t.particle] for t in b.tracks]), i)
-        for i, b in enumerate(branches)
-    )
-    out = []
-    for weight, index in merged(scored, settings):
-        branches[index].weight = weight
-        out.append(branches[index])
-    return Cluster(out) if len(out) > 1 else None
-
-
-def _break(close: list[Branch], tracks: list[Track]) -> list[Decided]:
-    if not tracks:
-        return []
-    paths = [[b.history[t.particle] for t in tracks] for b in close]
-    start = _agreed_links_from(paths)
-    out = []
-    for track, best, mine in zip(tracks, paths[0], zip(*paths)):
-        same = [len(set(entries)) == 1 for entries in zip(*mine)]
-        agreed = best[: same.index(False)] if False in same else best
-        kept = [e for e in agreed if e[0] < start]
-        out.append(Decided(track, kept, [e for e in best if e[0] >= start and e[1] >= 0]))
-    return out
-
-
-def _agreed_links_from(paths: list[list[list[Entry]]]) -> int:
-    """Return the first frame from which all branches tie the same measurements together."""
-    frames = sorted({frame for path in paths for h in path for frame, _ in h})
-    by_frame = [[dict(h) for h in path] for path in paths]
-    start = frames[-1]
-    for earlier, later in zip(frames[-2::-1], frames[:0:-1]):
-        links = [sorted((h.get(earlier, -1), h.get(later, -1)) for h in path) for path in by_frame]
-        if any(link != links[0] for link in links):
-            break
-        start = earlier
-    return start
-
-
 _SLACK_LOG_RATIO = 6.0
 """What the common shift of a frame may change of the order of hypotheses."""
 
+_BEFORE = -2
+"""Stands in a hypothesis for a frame in which a track was not yet in the conflict."""
+
 
 @dataclass(frozen=True)
-class Scan:
-    """One frame: its number, its time and its measurements."""
+class Conflict:
+    """B hypotheses about T tracks that compete for the same measurements, best first.
 
-    frame: int
-    t_s: float
-    measured: FrameMeasurements
-    settings: TrackerSettings
-
-
-class Association:
-    """The possible pairings of tracks and measurements in one frame.
-
-    It also holds the shift of all bubbles that follows from the best pairings. A track that has no
-    measurement of several cameras in these may have one of a camera alone, if no other pairing of
-    them is nearly as likely.
+    weight : (B,) log-likelihood ratios to the best hypothesis.
+    rows : (B, T) the tracks' states.
+    frames : (F,) since the conflict began.
+    taken : (B, T, F) the tracks' measurements in these frames, -1 for none.
     """
 
-    def __init__(self, clusters: Sequence[Cluster], scan: Scan, common: Common) -> None:
-        self.clusters, self.scan, self.prior = clusters, scan, common
-        rows = [
-            (c, b, t)
-            for c, cluster in enumerate(clusters)
-            for b, branch in enumerate(cluster.branches)
-            for t in branch.tracks
-        ]
-        self.cluster_of = np.array([c for c, _, _ in rows], int)
-        first = np.array([b == 0 for _, b, _ in rows], bool)
-        self.row_of = {id(t): i for i, (_, _, t) in enumerate(rows)}
-        self.tracks = [t for _, _, t in rows]
-        measured, where = scan.measured, expected(self.tracks)
-        misses = np.array([t.misses for t in self.tracks], int)
-        ids = [t.particle if t.given else NO_PARTICLE for t in self.tracks]
-        own = np.array(ids, int)[:, None] == measured.particle
-        pairs = gated_pairs(where, measured, own & ~measured.alone, common, scan.settings, misses)
-        self.common, chosen = assigned_with_shift(pairs, len(rows), first, common)
-        self.picked = np.flatnonzero(first[pairs.row] & (chosen[pairs.row] == pairs.column))
-        closed = np.array([not c.open for c in clusters], bool)[self.cluster_of]
-        missed = own & measured.alone & (closed & (chosen < 0))[:, None]
-        if missed.any():
-            alone = gated_pairs(where, measured, missed, self.common, scan.settings, misses)
-            best, clear = clear_assignment(alone, len(rows), self.common.shift_mm, scan.settings)
-            given = clear[alone.row] & (best[alone.row] == alone.column)
-            pairs = Evidence.concat([pairs, alone.take(given)])
-        self.pairs = pairs
-        self.owner = self.cluster_of[self.pairs.row]
-        self.edges = self._allowed()
+    weight: Array
+    rows: Ints
+    frames: Ints
+    taken: Ints
 
-    def mean_gain(self) -> Array | None:
-        """Return the mean Kalman gain (12, 3) of all bubbles that several cameras measure; None if
-        there is none."""
-        if not len(self.picked):
-            return None
-        p = np.array([self.tracks[i].p for i in self.pairs.row[self.picked].tolist()])
-        gains = p[..., POSITION] @ self.pairs.information[self.picked]
-        return np.asarray(gains.mean(0))
+    def of(self, hypotheses: Ints | Bools, tracks: Bools) -> Conflict:
+        """Return some of the hypotheses about some of the tracks."""
+        rows, taken = self.rows[hypotheses][:, tracks], self.taken[hypotheses][:, tracks]
+        known = (taken != _BEFORE).any((0, 1))
+        return Conflict(self.weight[hypotheses], rows, self.frames[known], taken[..., known])
 
-    def _allowed(self) -> Ints:
-        """Pairings inside their gate, the common shift estimated from the other clusters alone."""
-        pairs, owner = self.pairs, self.owner
-        information = np.zeros((len(self.clusters), 3, 3))
-        np.add.at(information, owner[self.picked], pairs.information[self.picked])
-        pull = np.zeros((len(self.clusters), 3))
-        left = pairs.innovation_mm - self.prior.shift_mm
-        pulls = np.einsum("eij,ej->ei", pairs.information, left)
-        np.add.at(pull, owner[self.picked], pulls[self.picked])
-        prior = self.prior.covariance_mm2
-        others = information.sum(0) - information
-        outside = prior @ np.linalg.inv(np.eye(3) + others @ prior)
-        shift = np.einsum("cij,cj->ci", outside, pull.sum(0) - pull)[owner]
-        total = np.linalg.inv(pairs.covariance_mm2 + outside[owner])
-        off = left - shift
-        near = np.einsum("ei,eij,ej->e", off, total, off) <= gate2(3)
-        return np.flatnonzero(near | (pairs.constant == _CERTAIN))
+    def disputed(self, depth: int) -> Bools:
+        """Return about which tracks (T,) the hypotheses disagree, by their last measurements.
 
-    def components(self) -> list[tuple[list[int], list[int]]]:
-        """Return the groups of tracks that compete for measurements of this frame.
-
-        Each is given by the indices of the earlier groups that it joins, and the indices of its
-        pairings.
+        Two hypotheses give such a track different measurements, or give one measurement to it and
+        to another track. depth : number of last measurements that count.
         """
-        owner, columns = self.owner[self.edges].tolist(), self.pairs.column[self.edges].tolist()
-        label, first = list(range(len(self.clusters))), dict[int, int]()
-        for cluster, column in zip(owner, columns):
-            low, high = sorted((label[cluster], label[first.setdefault(column, cluster)]))
-            if low != high:
-                label = [low if own == high else own for own in label]
-        groups: dict[int, tuple[list[int], list[int]]] = {}
-        for cluster, group in enumerate(label):
-            groups.setdefault(group, ([], []))[0].append(cluster)
-        for edge, cluster in zip(self.edges.tolist(), owner):
-            groups[label[cluster]][1].append(edge)
-        return list(groups.values())
+        seen = self.taken >= 0
+        recent = seen & (np.cumsum(seen[..., ::-1], axis=2)[..., ::-1] <= depth)
+        largest = np.where(recent, self.taken, -1).max(0)
+        least = np.where(recent, self.taken, np.iinfo(np.int64).max).min(0)
+        out = (recent.any(0) & (largest != least)).any(1)
+        _, track, frame = np.nonzero(recent)
+        claims = np.unique(np.stack([frame, self.taken[recent], track]), axis=1)
+        _, first, many = np.unique(claims[:2], axis=1, return_inverse=True, return_counts=True)
+        out[claims[2, many[first.ravel()] > 1]] = True
+        return np.asarray(out)
+
+    def merged(self, settings: TrackerSettings) -> Conflict:
+        """Return the hypotheses with those joined whose recent measurements are equal.
+
+        Of the joined ones the most probable is kept, with the weight of all. There are
+        ``max_hypotheses``, best first, and those that alone give a track one of its measurements;
+        improbable ones are left out.
+        """
+        recent = self.taken[:, :, -_MERGE_FRAMES:].reshape(len(self.weight), -1)
+        _, group = np.unique(recent, axis=0, return_inverse=True)
+        order = np.lexsort([-self.weight, group.ravel()])
+        top = order[np.unique(group.ravel()[order], return_index=True)[1]]
+        peak = self.weight[top]
+        joint = np.bincount(group.ravel(), np.exp(self.weight - peak[group.ravel()]))
+        total = peak + np.log(joint)
+        total, best = total - total.max(), np.argsort(-total, kind="stable")
+        kept, seen = list[int](), np.zeros((recent.shape[1], recent[top].max() + 3), bool)
+        place = np.arange(recent.shape[1])
+        for k in best[total[best] >= -settings.prune_log_ratio].tolist():
+            own = recent[top[k]] - _BEFORE
+            if len(kept) < settings.max_hypotheses or not seen[place, own].all():
+                kept.append(k)
+                seen[place, own] = True
+        found = self.of(top[kept], np.ones(self.rows.shape[1], bool))
+        return replace(found, weight=total[kept])
+
+    def decided(
+        self, frame: int, settings: TrackerSettings, *, at_once: bool
+    ) -> tuple[Conflict | None, Conflict, Conflict]:
+        """Return what remains undecided in this frame, None if there is nothing; the tracks that
+        are safe; and those that have to be cut.
+
+        at_once : decide about all tracks.
+        """
+        every, still = np.ones(len(self.weight), bool), None
+        unsure, close = np.zeros(self.rows.shape[1], bool), every
+        if len(self.weight) > 1:
+            if at_once or frame - self.frames[0] + 1 >= settings.window_frames:
+                close = self.weight >= -settings.margin_log_ratio
+                unsure = self.of(close, ~unsure).disputed(1)
+            else:
+                unsure = self.disputed(_MERGE_FRAMES)
+                still = self.of(every, unsure).merged(settings) if unsure.any() else None
+                still = still if still is not None and len(still.weight) > 1 else None
+                unsure &= still is not None
+        return still, self.of(every, ~unsure), self.of(close, unsure & (still is None))
+
+    def broken(self) -> tuple[Ints, int]:
+        """Return for each track (T,) the number of frames in which all hypotheses agree, and the
+        frame from which on they tie the same measurements together."""
+        if not self.taken.size:
+            return np.zeros(0, np.int64), 0
+        taken = np.maximum(self.taken, -1)
+        links = np.sort(taken[..., :-1] * (taken.max() + 2) + taken[..., 1:], axis=1)
+        alike = (links == links[0]).all((0, 1))
+        start = len(alike) - int(np.append(alike[::-1], False).argmin())
+        agreed = np.append((taken == taken[0]).all(0), np.zeros((taken.shape[1], 1), bool), axis=1)
+        return np.minimum(agreed.argmin(1), start), start
+
+
+@dataclass(frozen=True)
+class Advanced:
+    """Hold the tracks after a frame.
+
+    states, columns : (K,) of the tracks that go on, with their measurements in the frame, -1 for
+        none. Those of the conflicts follow those of tracks without rivals.
+    single : number of tracks without rivals.
+    conflicts : the groups of tracks that compete, which may have one hypothesis.
+    free : (M,) measurements of several cameras that no track may have.
+    shift : the shift of this frame, which the states contain. common : the error that is left.
+    """
+
+    states: States
+    columns: Ints
+    single: int
+    conflicts: list[Conflict]
+    free: Bools
+    shift: Common
+    common: Common
+
+
+@dataclass(frozen=True)
+class _Pairings:
+    """Hold the possible pairings of confirmed tracks with what several cameras see in one frame.
+
+    owner : (K,) for each state the conflict of its track, or a number of its own.
+    picked : the best pairings, by which the common shift is known. prior : what it was before.
+    gain : (12, 3) mean Kalman gain of the bubbles that are measured.
+    """
+
+    states: States
+    scan: Scan
+    pairs: Evidence
+    owner: Ints
+    picked: Evidence
+    prior: Common
+    gain: Array
+
+    def near(self) -> Evidence:
+        """Return those inside the gate when the shift is estimated from other tracks alone."""
+        pairs, many = self.pairs, int(self.owner.max(initial=-1)) + 1
+        of_picked, owner = self.owner[self.picked.row], self.owner[pairs.row]
+        information, pull = np.zeros((many, 3, 3)), np.zeros((many, 3))
+        np.add.at(information, of_picked, self.picked.information)
+        left = self.picked.innovation_mm - self.prior.shift_mm
+        np.add.at(pull, of_picked, (self.picked.information @ left[..., None])[..., 0])
+        prior = self.prior.covariance_mm2
+        outside = prior @ np.linalg.inv(np.eye(3) + (information.sum(0) - information) @ prior)
+        shift = (outside @ (pull.sum(0) - pull)[..., None])[..., 0][owner]
+        off = pairs.innovation_mm - self.prior.shift_mm - shift
+        total = np.linalg.inv(pairs.covariance_mm2 + outside[owner])
+        inside = np.einsum("ei,eij,ej->e", off, total, off) <= gate2(3)
+        return pairs.take(inside | (pairs.constant == _CERTAIN))
 
     def outside(self, members: Sequence[int]) -> Common:
-        """Return the shift of this frame that all bubbles share, without those of some clusters.
+        """Return the shift of this frame that all bubbles share, without those of some owners."""
+        others = self.picked.take(~np.isin(self.owner[self.picked.row], members))
+        return self.prior.informed(others.innovation_mm, others.covariance_mm2)
 
-        members : indices of the clusters (bubbles whose pairings compete) to leave out.
+    def grown(
+        self, before: Sequence[Conflict], pairs: Evidence, outside: Common
+    ) -> tuple[Conflict, list[Common]]:
+        """Return the likely ways to continue some groups of tracks together, and the shift of the
+        frame in each of them.
+
+        pairs : their possible pairings. outside : the shift without them. The rows of the result
+        are those of the states before the frame.
         """
-        others = self.picked[~np.isin(self.owner[self.picked], members)]
-        return self.prior.informed(
-            self.pairs.innovation_mm[others], self.pairs.covariance_mm2[others]
-        )
+        settings = self.scan.settings
+        score = pairs.scores(outside.shift_mm)
+        options: dict[int, list[tuple[int, float]]] = {}
+        edge_of = {}
+        for e, at in enumerate(zip(pairs.row.tolist(), pairs.column.tolist())):
+            options.setdefault(at[0], []).append((at[1], float(score[e])))
+            edge_of[at] = e
+        old = joined(before, settings.max_hypotheses)
+        tables = [(weight, [options.get(row, []) for row in rows])
+                  for weight, rows in zip(old.weight.tolist(), old.rows.tolist())]  # fmt: skip
+        within = settings.prune_log_ratio + _SLACK_LOG_RATIO
+        ways = alternatives(tables, within, _JOINTLY_SCORED * settings.max_hypotheses)
+        came, now = np.array([k for k, *_ in ways]), np.array([taken for _, taken, _ in ways])
+        rows = old.rows[came]
+        used = [[edge_of[at] for at in zip(own, taken) if at[1] >= 0]
+                for own, taken in zip(rows.tolist(), now.tolist())]  # fmt: skip
+        weight = old.weight[came] + joint_scores(pairs, used, outside)
+        frames = np.append(old.frames, self.scan.frame)
+        taken = np.concatenate([old.taken[came], now[..., None]], axis=2)
+        # the rows are the numbers of the ways, until it is known which of them are kept
+        places = np.arange(rows.size).reshape(rows.shape)
+        found = Conflict(weight, places, frames, taken).merged(settings)
+        kept = found.rows[:, 0] // rows.shape[1]
+        commons = []
+        for own in (used[k] for k in kept):
+            commons.append(outside.informed(pairs.innovation_mm[own], pairs.covariance_mm2[own]))
+        return replace(found, rows=rows[kept]), commons
 
 
-def grown(
-    found: Association, members: Sequence[int], edges: Sequence[int], mean_gain: Array
-) -> list[Branch]:
-    """Return the likely ways to continue some groups of tracks together, best first.
-
-    Those with the same recent measurements are merged. The tracks are updated with their
-    measurements, and with the shift of all bubbles that follows from them and from the others.
-
-    members : indices of the groups. edges : indices of the pairings that are possible for them.
-    mean_gain : (12, 3) mean Kalman gain of the bubbles.
-    """
-    scan, settings, pairs = found.scan, found.scan.settings, found.pairs
-    outside = found.outside(members)
-    score = pairs.scores(outside.shift_mm)
-    options: dict[int, list[tuple[int, float]]] = {}
-    edge_of = {}
-    for e in edges:
-        row, column = int(pairs.row[e]), int(pairs.column[e])
-        options.setdefault(row, []).append((column, float(score[e])))
-        edge_of[row, column] = e
-    every = _joint([found.clusters[m].branches for m in members], settings.max_hypotheses)
-    of_rows = [[found.row_of[id(t)] for b in parents for t in b.tracks] for parents in every]
-    start = [sum(b.weight for b in parents) for parents in every]
-    tables = [(own, [options.get(r, []) for r in rows]) for own, rows in zip(start, of_rows)]
-    within = settings.prune_log_ratio + _SLACK_LOG_RATIO
-    ways = alternatives(tables, within, _JOINTLY_SCORED * settings.max_hypotheses)
-    used = [[edge_of[at] for at in zip(of_rows[k], taken) if at[1] >= 0] for k, taken, _ in ways]
-    joint = joint_scores(pairs, used, outside).tolist()
-    raw = []
-    for (k, taken, _), score_of in zip(ways, joint):
-        before = [(t.particle, b.history.get(t.particle, [])) for b in every[k] for t in b.tracks]
-        history = {p: [*old, (scan.frame, c)] for (p, old), c in zip(before, taken)}
-        raw.append((start[k] + score_of, history))
-    scored = ((weight, merge_key(h.values()), i) for i, (weight, h) in enumerate(raw))
-    out = []
-    for weight, i in merged(scored, settings):
-        (k, taken, _), own = ways[i], used[i]
-        common = outside.informed(pairs.innovation_mm[own], pairs.covariance_mm2[own])
-        tracks = [t.copy() for b in every[k] for t in b.tracks]
-        continue_tracks(tracks, taken, scan, common, mean_gain)
-        out.append(Branch(weight, tracks, raw[i][1]))
-    return out
-
-
-def _joint(groups: Sequence[Sequence[Branch]], most: int) -> list[tuple[Branch, ...]]:
+def joined(groups: Sequence[Conflict], most: int) -> Conflict:
     """Return the ``most`` likely joint hypotheses of groups of tracks, one of each group.
 
     A hypothesis of a group that is in none of them follows with the best ones of the others.
     """
-    every: list[tuple[Branch, ...]] = [()]
+    every, weight = np.zeros((1, 0), np.int64), np.zeros(1)
     for group in groups:  # what is not among the first of some groups cannot be with further ones
-        joined = ((*branches, branch) for branches in every for branch in group)
-        every = sorted(joined, key=lambda branches: -sum(b.weight for b in branches))[:most]
-    used = {id(branch) for branches in every for branch in branches}
-    best = tuple(group[0] for group in groups)
-    return every + [
-        (*best[:g], branch, *best[g + 1 :])
+        many = len(group.weight)
+        total = (weight[:, None] + group.weight).ravel()
+        order = np.argsort(-total, kind="stable")[:most]
+        every = np.column_stack([every[order // many], order % many])
+        weight = total[order]
+    unused = [
+        (g, b)
         for g, group in enumerate(groups)
-        for branch in group
-        if id(branch) not in used
+        for b in np.setdiff1d(np.arange(len(group.weight)), every[:, g]).tolist()
     ]
+    more = np.zeros((len(unused), len(groups)), np.int64)
+    for row, (g, b) in zip(more, unused):
+        row[g] = b
+    every = np.concatenate([every, more])
+    frames = np.unique(np.concatenate([group.frames for group in groups]))
+    taken = []
+    for group, own in zip(groups, every.T):
+        padded = np.full((*group.rows[own].shape, len(frames)), _BEFORE)
+        padded[..., np.searchsorted(frames, group.frames)] = group.taken[own]
+        taken.append(padded)
+    return Conflict(
+        sum((group.weight[own] for group, own in zip(groups, every.T)), np.zeros(len(every))),
+        np.concatenate([group.rows[own] for group, own in zip(groups, every.T)], axis=1),
+        frames, np.concatenate(taken, axis=1),
+    )  # fmt: skip
 
 
-def continue_tracks(
-    tracks: Sequence[Track], columns: Sequence[int], scan: Scan, common: Common, mean_gain: Array
-) -> None:
-    """Update tracks in place with their measurements in a frame.
-
-    columns : for each track the index of its measurement, -1 for none.
-    common : the shift that all bubbles share.
-    mean_gain : (n, 3) mean Kalman gain of the bubbles.
-    """
-    measured, at = scan.measured, np.array(columns, np.int64)
-    points, covariances = np.full((len(at), 3), np.nan), np.full((len(at), 3, 3), np.nan)
-    points[at >= 0] = measured.points_mm[at[at >= 0]]
-    covariances[at >= 0] = measured.covariance_mm2[at[at >= 0]]
-    update_tracks(tracks, points, covariances, common.shift, mean_gain, common.covariance_mm2)
-    for track, column in zip(tracks, columns):
-        if column >= 0:
-            d_eq = float("nan") if measured.alone[column] else float(measured.d_eq_mm[column])
-            track.saw(scan.frame, scan.t_s, d_eq)
+def _components(owner: Ints, column: Ints, conflicts: int) -> list[tuple[list[int], list[int]]]:
+    """Return the groups of tracks that compete for measurements of a frame, each given by owners
+    and by the indices of its pairings; owners below ``conflicts`` compete already."""
+    label = {one: one for one in [*range(conflicts), *owner.tolist()]}
+    first: dict[int, int] = {}
+    for one, to in zip(owner.tolist(), column.tolist()):
+        low, high = sorted((label[one], label[first.setdefault(to, one)]))
+        if low != high:
+            label = {own: low if group == high else group for own, group in label.items()}
+    groups: dict[int, tuple[list[int], list[int]]] = {}
+    for one, group in label.items():
+        groups.setdefault(group, ([], []))[0].append(one)
+    for edge, one in enumerate(owner.tolist()):
+        groups[label[one]][1].append(edge)
+    return list(groups.values())
 
 
-def advance(
-    clusters: Sequence[Cluster], scan: Scan, common: Common
-) -> tuple[list[Cluster], Common, Array | None]:
+def advance(states: States, conflicts: Sequence[Conflict], scan: Scan, common: Common) -> Advanced:
     """Continue all tracks with the measurements of a frame, without deciding conflicts.
 
-    Tracks that compete with no other track are updated in place.
-
+    states : where tracks are expected; those that are in no conflict have no rivals.
     common : what is known of the shift that all bubbles share.
-
-    Returns the groups of tracks after this frame, the shift that all bubbles share, and the mean
-    gain (n, 3) or None.
     """
-    found = Association(clusters, scan, common)
-    mean_gain = found.mean_gain()
-    gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
-    score = found.pairs.scores(found.common.shift_mm)
-    out, alone, columns = [], [], []
-    for members, edges in found.components():
-        first = clusters[members[0]]
-        if len(members) == 1 and not first.open and len(edges) < 2:
-            (track,) = first.tracks
-            good = [e for e in edges if score[e] > 0]
-            column = int(found.pairs.column[good[0]]) if good else -1
-            alone.append(track)
-            columns.append(column)
-            out.append(Cluster([Branch(0.0, [track], {track.particle: [(scan.frame, column)]})]))
-            continue
-        out.append(Cluster(grown(found, members, edges, gain)))
-    continue_tracks(alone, columns, scan, found.common, gain)
-    return out, found.common, mean_gain
+    many, measured, settings = len(states), scan.measured, scan.settings
+    owner, best = np.arange(many) + len(conflicts), np.ones(many, bool)
+    for c, conflict in enumerate(conflicts):
+        owner[conflict.rows], best[conflict.rows[1:]] = c, False
+    confirmed, single = states.track > NO_PARTICLE, owner >= len(conflicts)
+    ids = np.where(states.given, states.track, NO_PARTICLE)
+    misses = scan.frame - states.seen_frame - 1
+    allowed = ids[:, None] == measured.particle
+    allowed &= confirmed[:, None] | ~measured.alone
+    pairs = gated_pairs(expected(states), measured, allowed, common, settings, misses)
+    sure = confirmed[pairs.row] & ~measured.alone[pairs.column]
+    firm, weak = pairs.take(sure), pairs.take(~sure)
+    gain, now = np.zeros((STATES, 3)), common
+    for some in (firm, weak.take(~measured.alone[weak.column])):
+        now, chosen = assigned_with_shift(some, many, best, common)
+        picked = some.take(best[some.row] & (chosen[some.row] == some.column))
+        if len(picked.row):
+            gain = (states.p[picked.row][:, :, POSITION] @ picked.information).mean(0)
+            break
+    found = _Pairings(states, scan, firm, owner, picked, common, gain)
+    near = found.near()
+    columns = np.full(many, -1)
+    rival = ~single[near.row] | (np.bincount(near.row, minlength=many)[near.row] > 1)
+    rival |= np.bincount(near.column, minlength=len(measured))[near.column] > 1
+    good = ~rival & (near.scores(now.shift_mm) > 0)
+    columns[near.row[good]] = near.column[good]
+    near = near.take(rival)
+    free = ~measured.alone & (measured.particle == NO_PARTICLE)
+    free[columns[columns >= 0]] = False
+    later, commons = list[Conflict](), list[list[Common]]()
+    for members, edges in _components(owner[near.row], near.column, len(conflicts)):
+        before = [conflicts[m] if m < len(conflicts) else _alone(m - len(conflicts))
+                  for m in members]  # fmt: skip
+        one, shifts = found.grown(before, near.take(edges), found.outside(members))
+        later.append(one)
+        commons.append(shifts)
+        single[one.rows] = False
+        taken = one.taken[..., -1]
+        free[taken[taken >= 0]] = False
+    open_ = np.where(confirmed[weak.row], columns[weak.row] < 0, free[weak.column])
+    weak = weak.take(open_ & single[weak.row])
+    given, clear = clear_assignment(weak, many, now.shift_mm, settings)
+    columns = np.where(clear, given, columns)
+    free[given[clear]] = False
+    alone = np.flatnonzero(single & (confirmed | clear | (given < 0)))
+    parents = np.concatenate([alone, *(one.rows.ravel() for one in later)])
+    taken = np.concatenate([columns[alone], *(one.taken[..., -1].ravel() for one in later)])
+    each = [now] * len(alone) + [
+        own for one, shifts in zip(later, commons) for own in shifts for _ in one.rows[0]
+    ]
+    shift = np.array([own.shift for own in each]).reshape(-1, STATES)
+    unsure = np.array([own.covariance_mm2 for own in each]).reshape(-1, 3, 3)
+    states = states.take(parents).updated(scan, taken, shift, unsure, gain)
+    at = len(alone)
+    for k, one in enumerate(later):
+        places = at + np.arange(one.rows.size).reshape(one.rows.shape)
+        later[k], at = replace(one, rows=places), at + one.rows.size
+    return Advanced(states, taken, len(alone), later, free, now, now.applied(gain))
+
+
+def _alone(row: int) -> Conflict:
+    """Return a track without rivals as a conflict with one hypothesis and no past."""
+    none = np.zeros(0, np.int64)
+    return Conflict(np.zeros(1), np.array([[row]]), none, np.zeros((1, 1, 0), np.int64))

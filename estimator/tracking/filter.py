@@ -5,25 +5,24 @@ The state of a bubble has 12 components in the rig frame: position (mm), velocit
 acceleration (mm/s^2) and drift velocity (mm/s), three components each. The velocity is relative to
 the laboratory once an encoder has given the stage's speed, and relative to the rig before that.
 
-The error of a bubble is its own error plus the common error. `Track.p` is the covariance of the own
-error, which is independent between bubbles; `Common` carries the error that shake and stage give to
-all bubbles alike. Both follow the same equation of motion, so that a prediction keeps this form.
-The Kalman gain is the matrix by which a filter multiplies the measured minus the predicted position
-to correct its state. An update keeps the form if all bubbles have the same gain; a gain that
-differs from the mean adds its share to the own error. Differences between bubbles are free of the
-common error.
+The error of a bubble is its own error plus the common error. `States.p` is the covariance of the
+own error, which is independent between bubbles; `Common` carries the error that shake and stage
+give to all bubbles alike. Both follow the same equation of motion, so that a prediction keeps this
+form. The Kalman gain is the matrix by which a filter multiplies the measured minus the predicted
+position to correct its state. An update keeps the form if all bubbles have the same gain; a gain
+that differs from the mean adds its share to the own error. Differences between bubbles are free of
+the common error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array, Bools, Ints
+from telerig.arrays import Array, Bools, Ints, Rows
 from telerig.errors import InputError
 from telerig.factors.bubble_motion import lateral_motion, rise_motion
 from telerig.factors.state_space import exact_step
@@ -365,119 +364,111 @@ class StageMotion:
 _SIZE_GAIN = 0.25
 """Weight of a new diameter in a track's running mean."""
 
-_IDENTITY = np.eye(STATES)
+
+@dataclass(frozen=True)
+class Scan:
+    """One frame: its number, its time and its measurements."""
+
+    frame: int
+    t_s: float
+    measured: FrameMeasurements
+    settings: TrackerSettings
 
 
-@dataclass
-class Track:
-    """Hold the state of one bubble that is followed.
+@dataclass(frozen=True)
+class States(Rows):
+    """K states of bubbles that are followed. A track has one for each hypothesis about it.
 
-    x, p : (12,) state and (12, 12) covariance of its own error; arrays are replaced, never changed.
-    particle : id of the track, -1 as long as it has none.
-    given : whether the id came with the data; such a track follows its id alone.
-    d_eq_mm : running mean of the equivalent diameter, NaN if unknown.
-    d_last_mm : last measured diameter.
-    d_before_mm : running mean before the last measurement.
-    born_frame : frame of the first measurement.
-    seen_frame, seen_t_s : frame and time of the last measurement.
-    misses : number of frames since the last measurement.
-    history : (frame, index of the measurement) for each measurement of a track that is not
-        confirmed.
-    parent : id and former diameter (mm) of the nearest track at this track's birth; None if no
-        track was near enough to touch it.
-    near : the same for the nearest track at the time when this track was first missed; None while
-        the track is seen.
+    x, p : (K, 12), (K, 12, 12) states and the covariances of their own errors.
+    track : (K,) ids of the tracks; below `NO_PARTICLE` until they are confirmed.
+    given : (K,) whether the id came with the data; such a track follows its id alone.
+    sizes_mm : (K, 3) running means of the equivalent diameter, the same before the last
+        measurement, and the last measured diameter; NaN where unknown.
+    born_frame, seen_frame, seen_t_s : (K,) frames of the first and last measurements, and its time.
+    hits : (K,) numbers of measurements.
     """
 
     x: Array
     p: Array
-    particle: int = NO_PARTICLE
-    given: bool = False
-    d_eq_mm: float = float("nan")
-    d_last_mm: float = float("nan")
-    d_before_mm: float = float("nan")
-    born_frame: int = 0
-    seen_frame: int = 0
-    seen_t_s: float = 0.0
-    misses: int = 0
-    history: list[tuple[int, int]] = field(default_factory=list)
-    parent: tuple[int, float] | None = None
-    near: tuple[int, float] | None = None
+    track: Ints
+    given: Bools
+    sizes_mm: Array
+    born_frame: Ints
+    seen_frame: Ints
+    seen_t_s: Array
+    hits: Ints
+
+    @staticmethod
+    def born(
+        scan: Scan, columns: Ints, tracks: Ints, velocity_mm_s: Array, encoder: bool
+    ) -> States:
+        """Return new tracks (K,) at measurements of a frame, with a velocity (3,) and the
+        covariance of `birth_covariance`."""
+        measured, settings, many = scan.measured, scan.settings, len(columns)
+        x = np.zeros((many, STATES))
+        x[:, POSITION], x[:, VELOCITY] = measured.points_mm[columns], velocity_mm_s
+        p = np.tile(birth_covariance(settings, np.zeros((3, 3)), encoder), (many, 1, 1))
+        p[:, POSITION, POSITION] = measured.covariance_mm2[columns]
+        size = measured.d_eq_mm[columns]
+        now = np.full(many, scan.frame)
+        return States(
+            x, p, tracks, measured.particle[columns] != NO_PARTICLE,
+            np.stack([size, np.full(many, np.nan), size], -1), now, now.copy(),
+            np.full(many, scan.t_s), np.ones(many, np.int64),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.x)
 
     @property
-    def point_mm(self) -> Array:
-        """Position (3,) in the rig frame."""
-        return self.x[POSITION]
+    def points_mm(self) -> Array:
+        """Positions (K, 3) in the rig frame."""
+        return self.x[:, POSITION]
 
-    def copy(self) -> Track:
-        """Return a copy that can be changed without changing this track."""
-        return replace(self, history=list(self.history))
+    def predicted(self, step: Transition, found_mm_s: Array, control: Array) -> States:
+        """Return the states in the next frame.
 
-    def saw(self, frame: int, t_s: float, d_eq_mm: float) -> None:
-        """Record that the track was measured in a frame.
-
-        d_eq_mm : measured equivalent diameter, NaN if unknown.
+        found_mm_s : (3,) added to the velocities before the step. control : (12,) added after it.
         """
-        self.seen_frame, self.seen_t_s, self.misses, self.near = frame, t_s, 0, None
-        if np.isfinite(d_eq_mm):
-            self.d_last_mm, self.d_before_mm = d_eq_mm, self.d_eq_mm
-            if np.isfinite(self.d_eq_mm):
-                self.d_eq_mm += _SIZE_GAIN * (d_eq_mm - self.d_eq_mm)
-            else:
-                self.d_eq_mm = d_eq_mm
+        x = self.x.copy()
+        x[:, VELOCITY] += found_mm_s
+        p = step.matrix @ self.p @ step.matrix.T + step.noise
+        return replace(self, x=x @ step.matrix.T + control, p=p)
 
+    def updated(
+        self, scan: Scan, columns: Ints, shift: Array, common_mm2: Array, mean_gain: Array
+    ) -> States:
+        """Return the states after a frame in which each has a measurement, or none.
 
-def predict_tracks(tracks: Sequence[Track], step: Transition, control: Array) -> None:
-    """Move the states of all tracks to the next frame.
-
-    step : the transition over the time between the frames.
-    control : (12,) vector that is added to the states because of the stage's motion.
-    """
-    if not tracks:
-        return
-    x = np.array([t.x for t in tracks]) @ step.matrix.T + control
-    p = step.matrix @ np.array([t.p for t in tracks]) @ step.matrix.T + step.noise
-    for track, own_x, own_p in zip(tracks, x, p):
-        track.x, track.p = own_x, own_p
-
-
-def update_tracks(
-    tracks: Sequence[Track],
-    points_mm: Array,
-    covariances_mm2: Array,
-    shift: Array,
-    mean_gain: Array,
-    common_mm2: Array,
-) -> None:
-    """Update K tracks by measured positions, or for a frame in which they have none.
-
-    points_mm, covariances_mm2 : (K, 3), (K, 3, 3); NaN for tracks without a measurement.
-    shift : (12,) shift of this frame, common to all bubbles.
-    mean_gain : (12, 3) mean Kalman gain of the bubbles that were measured.
-    common_mm2 : (3, 3) covariance of the common position error.
-    """
-    if not tracks:
-        return
-    x = np.array([t.x for t in tracks]) + shift
-    p = np.array([t.p for t in tracks])
-    seen: Bools = np.asarray(np.isfinite(points_mm).all(1))
-    gain = np.zeros((len(tracks), STATES, 3))
-    own, noise = p[seen], covariances_mm2[seen]
-    gain[seen] = own[..., POSITION] @ np.linalg.inv(own[:, POSITION, POSITION] + noise)
-    left = points_mm[seen] - x[seen][:, POSITION]
-    x[seen] += (gain[seen] @ left[..., None])[..., 0]
-    kept = np.tile(_IDENTITY, (len(own), 1, 1))
-    kept[..., POSITION] -= gain[seen]
-    p[seen] = kept @ own @ _t(kept) + gain[seen] @ noise @ _t(gain[seen])  # Joseph's form
-    unequal = mean_gain - gain
-    p += unequal @ common_mm2 @ _t(unequal)
-    for track, own_x, own_p, measured in zip(tracks, x, p, seen.tolist()):
-        track.x, track.p = own_x, own_p
-        track.misses += not measured
-
-
-def _t(matrices: Array) -> Array:
-    return np.swapaxes(matrices, -1, -2)
+        columns : (K,) indices of the measurements, -1 for none.
+        shift, common_mm2 : (K, 12), (K, 3, 3) shift of the frame, common to all bubbles, and the
+            covariance of the common position error, under each hypothesis.
+        mean_gain : (12, 3) mean Kalman gain of the bubbles that were measured.
+        """
+        measured, seen, at = scan.measured, columns >= 0, columns[columns >= 0]
+        x, p = self.x + shift, self.p.copy()
+        gain = np.zeros((len(self), STATES, 3))
+        own, noise = p[seen], measured.covariance_mm2[at]
+        gain[seen] = own[..., POSITION] @ np.linalg.inv(own[:, POSITION, POSITION] + noise)
+        left = measured.points_mm[at] - x[seen][:, POSITION]
+        x[seen] += (gain[seen] @ left[..., None])[..., 0]
+        kept = np.tile(np.eye(STATES), (len(own), 1, 1))
+        kept[..., POSITION] -= gain[seen]
+        p[seen] = kept @ own @ kept.mT + gain[seen] @ noise @ gain[seen].mT  # Joseph's form
+        unequal = mean_gain - gain
+        p += unequal @ common_mm2 @ unequal.mT
+        size = np.full(len(self), np.nan)
+        size[seen] = np.where(measured.alone[at], np.nan, measured.d_eq_mm[at])
+        mean = self.sizes_mm[:, 0]
+        grown = np.where(np.isfinite(mean), mean + _SIZE_GAIN * (size - mean), size)
+        sizes = np.where(
+            np.isfinite(size)[:, None], np.stack([grown, mean, size], -1), self.sizes_mm
+        )
+        return replace(
+            self, x=x, p=p, sizes_mm=sizes, hits=self.hits + seen,
+            seen_frame=np.where(seen, scan.frame, self.seen_frame),
+            seen_t_s=np.where(seen, scan.t_s, self.seen_t_s),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ The ids of a frame stay open while a conflict or a birth may change them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,17 +15,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.evidence import Prediction
-from telerig.estimator.tracking.association import (
-    Cluster,
-    Scan,
-    advance,
-    assigned_with_shift,
-    clear_assignment,
-    continue_tracks,
-    decide,
-    expected,
-    gated_pairs,
-)
+from telerig.estimator.tracking.association import Conflict, advance, expected
 from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
     POSITION,
@@ -36,13 +26,12 @@ from telerig.estimator.tracking.filter import (
     FrameMeasurements,
     FrameResult,
     Motion,
+    Scan,
     StageMotion,
-    Track,
+    States,
     TrackerSettings,
     TrackEvent,
     Transition,
-    birth_covariance,
-    predict_tracks,
     transition,
 )
 
@@ -61,14 +50,20 @@ class OpenFrames:
         """Add a frame with so many measurements, without ids."""
         self._frames[frame] = (t_s, np.full(count, NO_PARTICLE))
 
-    def write(self, entries: Iterable[tuple[int, int]], particle: int) -> None:
-        """Set the id of a track in some frames.
-
-        entries : (frame, index of the measurement); the index is -1 where the track was missed.
-        """
-        for frame, column in entries:
+    def write(self, track: int, frames: Ints, columns: Ints) -> None:
+        """Set the id of a track's measurements, -1 for none, in some frames."""
+        for frame, column in zip(frames.tolist(), columns.tolist()):
             if column >= 0:
-                self._frames[frame][1][column] = particle
+                self._frames[frame][1][column] = track
+
+    def seen(self, frame: int, tracks: Ints, columns: Ints) -> None:
+        """Set the ids of the measurements of K tracks (K,), -1 for none, in a frame."""
+        self._frames[frame][1][columns[columns >= 0]] = tracks[columns >= 0]
+
+    def rename(self, old: int, new: int) -> None:
+        """Replace the id of a track."""
+        for _, track in self._frames.values():
+            track[track == old] = new
 
     def close(
         self, before_frame: int, alive: set[int]
@@ -82,6 +77,7 @@ class OpenFrames:
         out, events = [], []
         for frame in [f for f in self._frames if f < before_frame]:
             t_s, particle = self._frames.pop(frame)
+            particle = np.maximum(particle, NO_PARTICLE)
             out.append(FrameIds(frame, particle))
             for p in sorted({*particle.tolist()} - {NO_PARTICLE}):
                 missed = frame - self._seen.get(p, frame - 1) - 1
@@ -97,118 +93,50 @@ class OpenFrames:
 _TOUCHING = 1.5
 """Largest distance of two centres, in diameters, of bubbles that may have been one."""
 
+Beside = tuple[int, float] | None
+"""Id and diameter (mm), before its last measurement, of the track beside another one."""
 
-def extend(
-    tentative: Sequence[Track], scan: Scan, free: Bools, common: Common, mean_gain: Array | None
-) -> tuple[list[Track], Common, Array | None]:
-    """Continue the tentative tracks with the measurements ``free`` (M,), which no other track uses.
 
-    Tracks for which two measurements fit almost equally well are given up.
+def beside(states: States, points_mm: Array, own: Ints) -> list[Beside]:
+    """Return for each point (N, 3) the nearest of some tracks whose bubble could touch one there.
 
-    common : the error that all bubbles have in common.
-    mean_gain : (12, 3) mean Kalman gain of the confirmed tracks; None if no confirmed track was
-        measured. The tentative tracks then determine the common shift.
-
-    Returns the tracks that continue, the common error, and the mean gain (None if no track was
-    measured).
+    own : (N,) ids of tracks that do not count.
     """
-    many = len(tentative)
-    if not many:
-        return [], common, mean_gain
-    allowed = np.tile(free, (many, 1))
-    pairs = gated_pairs(expected(tentative), scan.measured, allowed, common, scan.settings)
-    if mean_gain is None:
-        common, _ = assigned_with_shift(pairs, many, np.ones(many, bool), common)
-    chosen, clear = clear_assignment(pairs, many, common.shift_mm, scan.settings)
-    picked = np.flatnonzero(chosen[pairs.row] == pairs.column)
-    if mean_gain is None and len(picked):
-        p = np.array([tentative[r].p[:, POSITION] for r in pairs.row[picked]])
-        mean_gain = (p @ pairs.information[picked]).mean(0)
-    gain = np.zeros((STATES, 3)) if mean_gain is None else mean_gain
-    going = np.flatnonzero((chosen < 0) | clear).tolist()
-    out, columns = [tentative[i] for i in going], chosen[going].tolist()
-    continue_tracks(out, columns, scan, common, gain)
-    for track, column in zip(out, columns):
-        if column >= 0:
-            track.history.append((scan.frame, column))
-    return out, common, mean_gain
+    known = states.take(np.isfinite(states.sizes_mm[:, 0]))
+    if not len(known) or not len(points_mm):
+        return [None] * len(points_mm)
+    away = np.linalg.norm(known.points_mm - points_mm[:, None], axis=2)
+    away[known.track == own[:, None]] = np.inf
+    nearest = away.argmin(1)
+    size, before, _ = known.sizes_mm[nearest].T
+    before = np.where(np.isfinite(before), before, size)
+    touching = away.min(1) <= _TOUCHING * size
+    found = zip(known.track[nearest].tolist(), before.tolist(), touching.tolist())
+    return [(track, d_mm) if near else None for track, d_mm, near in found]
 
 
-def hopeless(track: Track, frame: int, settings: TrackerSettings) -> bool:
-    """Return whether a tentative track was missed too often to be confirmed."""
-    missed = frame - track.born_frame + 1 - len(track.history)
-    return missed > settings.confirm_frames - settings.confirm_hits
-
-
-def related(kind: str, track: Track, confirmed: Sequence[Track], scan: Scan) -> list[TrackEvent]:
+def related(
+    kind: str, noted: Beside, one: States, confirmed: States, scan: Scan
+) -> list[TrackEvent]:
     """Return a "split" event if a newly confirmed track is a part of the track beside which it was
     born, or a "merge" event if a lost track is a part of the one beside which it was lost.
 
     There is none unless the volumes before and after agree within the tolerance.
+
+    one : the track. noted : the track beside it.
     """
-    noted = track.parent if kind == "split" else track.near
-    other = next((t for t in confirmed if noted is not None and t.particle == noted[0]), None)
-    if noted is None or other is None:
+    if noted is None or not (mine := confirmed.track == noted[0]).any():
         return []
-    whole, *parts = (
-        (noted[1], other.d_last_mm, track.d_last_mm)
-        if kind == "split"
-        else (other.d_last_mm, noted[1], track.d_eq_mm)
-    )
+    mean, _, last = one.sizes_mm[0].tolist()
+    other = float(confirmed.sizes_mm[mine.argmax(), 2])
+    whole, *parts = (noted[1], other, last) if kind == "split" else (other, noted[1], mean)
     off = abs(parts[0] ** 3 + parts[1] ** 3 - whole**3)
     if not off <= scan.settings.balance_tolerance * whole**3:
         return []
-    both, one = f"{parts[0]:.2f} and {parts[1]:.2f} mm", f"{whole:.2f} mm"
-    before, after = (one, both) if kind == "split" else (both, one)
-    ids = other.particle, track.particle
+    both, single = f"{parts[0]:.2f} and {parts[1]:.2f} mm", f"{whole:.2f} mm"
+    before, after = (single, both) if kind == "split" else (both, single)
+    ids = noted[0], int(one.track[0])
     return [TrackEvent(kind, scan.frame, scan.t_s, ids, f"d_eq {before} became {after}")]
-
-
-def ended(
-    tracks: Sequence[Track], confirmed: Sequence[Track], scan: Scan
-) -> tuple[set[int], list[TrackEvent]]:
-    """Find the tracks that have been unseen for too long.
-
-    tracks : the tracks to examine; one that has just been lost notes the nearest confirmed track.
-    confirmed : all confirmed tracks.
-
-    Returns the ids of the ended tracks, and their "death" and "merge" events.
-    """
-    dead, events = set(), []
-    unseen_now = [t for t in tracks if t.seen_frame != scan.frame]
-    neighbours = Neighbours(confirmed if unseen_now else ())
-    for track in unseen_now:
-        if track.near is None:
-            track.near = neighbours.beside(track.point_mm, track)
-        unseen, frames = scan.t_s - track.seen_t_s, scan.frame - track.seen_frame
-        if unseen > scan.settings.gap_s and frames > scan.settings.gap_frames:
-            dead.add(track.particle)
-            events += related("merge", track, confirmed, scan)
-            reason = f"not seen since frame {track.seen_frame}, {unseen:.3f} s"
-            events.append(TrackEvent("death", scan.frame, scan.t_s, (track.particle,), reason))
-    return dead, events
-
-
-class Neighbours:
-    """Find which of some tracks is beside a point."""
-
-    def __init__(self, tracks: Sequence[Track]) -> None:
-        self._tracks = [t for t in tracks if np.isfinite(t.d_eq_mm)]
-        self._points_mm = np.array([t.point_mm for t in self._tracks]).reshape(-1, 3)
-
-    def beside(self, point_mm: Array, own: Track | None = None) -> tuple[int, float] | None:
-        """Return the nearest track, other than ``own``, whose bubble could touch one at a point.
-
-        It is given as its id and its former diameter in mm; None if no track is near enough.
-        """
-        away = np.sqrt(((self._points_mm - point_mm) ** 2).sum(1))
-        for k in away.argsort()[:2].tolist():
-            track = self._tracks[k]
-            if track is not own:
-                before = track.d_before_mm if np.isfinite(track.d_before_mm) else track.d_eq_mm
-                near = away[k] <= _TOUCHING * track.d_eq_mm
-                return (track.particle, before) if near else None
-        return None
 
 
 class Tracker:
@@ -242,13 +170,19 @@ class Tracker:
         self.axis: tuple[float, float, float] = (unit[0], unit[1], unit[2])
         self.settings = TrackerSettings() if settings is None else settings
         self.next_id = first_id
-        self.clusters: list[Cluster] = []
-        self.tentative: list[Track] = []
+        nothing = FrameMeasurements.create(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        self._nothing = Scan(0, 0.0, nothing, self.settings)
+        none = np.zeros(0, np.int64)
+        self.states = States.born(self._nothing, none, none, np.zeros(3), True)
+        self.conflicts: list[Conflict] = []
         self.common = Common()
         self.stage = StageMotion()
         self.frames = OpenFrames()
         self.last: tuple[int, float] | None = None
         self.events: list[TrackEvent] = []
+        self._unconfirmed = NO_PARTICLE
+        self._parents: dict[int, Beside] = {}
+        self._lost: dict[int, Beside] = {}
 
     def predict(self, t_s: float, position_mm: float | None = None) -> Prediction:
         """Return the expected positions of the confirmed tracks in the rig frame; the tracker is
@@ -260,16 +194,12 @@ class Tracker:
         Raises InputError when t_s is not later than the last frame's time.
         """
         tracks = self._confirmed()
-        if not tracks or self.last is None:
+        if not len(tracks) or self.last is None:
             return expected(tracks)
         step, control, found = self._motion(replace(self.stage), t_s, position_mm)
-        x = np.array([t.x for t in tracks])
-        x[:, VELOCITY] += found
-        x = x @ step.matrix.T + control
-        p = np.array([t.p for t in tracks]) + self.common.covariance
-        p = step.matrix @ p @ step.matrix.T + step.noise + step.common_noise
-        points, covariances = x[:, POSITION], p[:, POSITION, POSITION]
-        return replace(expected(tracks), points_mm=points, covariance_mm2=covariances)
+        both = replace(tracks, p=tracks.p + self.common.covariance).predicted(step, found, control)
+        noise = step.common_noise[POSITION, POSITION]
+        return replace(expected(both), covariance_mm2=both.p[:, POSITION, POSITION] + noise)
 
     def update(
         self,
@@ -292,10 +222,16 @@ class Tracker:
         self.frames.begin(frame, t_s, len(measured))
         self.events = []
         scan = Scan(frame, t_s, measured, self.settings)
-        grown, common, gain = advance(self.clusters, scan, self.common)
-        claimed = self._decide(grown, scan)
-        moved = None if motion is None else motion.shifted(common.shift, common.covariance_mm2)
-        self._births(scan, claimed, common, gain)
+        found = advance(self.states, self.conflicts, scan, self.common)
+        moved = (
+            None
+            if motion is None
+            else motion.shifted(found.shift.shift, found.shift.covariance_mm2)
+        )
+        self.states, self.conflicts, self.common = found.states, found.conflicts, found.common
+        self.frames.seen(frame, self.states.track[: found.single], found.columns[: found.single])
+        self._decide(scan, self._single)
+        self._births(scan, np.flatnonzero(found.free))
         self._deaths(scan)
         final = self._close(self._open_since(frame))
         return FrameResult(tuple(self.events), final, moved)
@@ -310,28 +246,35 @@ class Tracker:
         if self.last is None:
             return None
         self.events = []
-        nothing = FrameMeasurements.create(np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        scan = Scan(*self.last, nothing, self.settings)
-        self._decide(self.clusters, scan, at_once=True)
-        self.tentative = []
+        scan = replace(self._nothing, frame=self.last[0], t_s=self.last[1])
+        self._decide(scan, self._single, at_once=True)
         final = self._close(scan.frame + 1)
         return FrameResult(tuple(self.events), final)
 
     def _close(self, before_frame: int) -> tuple[FrameIds, ...]:
-        final, gaps = self.frames.close(before_frame, {t.particle for t in self._confirmed()})
+        final, gaps = self.frames.close(before_frame, {*self.states.track.tolist()})
         self.events += gaps
         return final
 
-    def _confirmed(self) -> list[Track]:
-        return [t for c in self.clusters for t in c.tracks]
+    @property
+    def _single(self) -> Bools:
+        """Which states are those of tracks without rivals (K,)."""
+        out = np.ones(len(self.states), bool)
+        for conflict in self.conflicts:
+            out[conflict.rows] = False
+        return out
 
-    def _every(self) -> list[Track]:
-        return [*(t for c in self.clusters for b in c.branches for t in b.tracks), *self.tentative]
+    def _confirmed(self) -> States:
+        """Return the confirmed tracks, by the best hypothesis."""
+        best = self._single & (self.states.track > NO_PARTICLE)
+        for conflict in self.conflicts:
+            best[conflict.rows[0]] = True
+        return self.states.take(best)
 
     def _open_since(self, frame: int) -> int:
-        starts = [c.since_frame for c in self.clusters if c.open]
-        starts += [t.born_frame for t in self.tentative]
-        return min([frame + 1, *starts])
+        born = self.states.born_frame[self.states.track < NO_PARTICLE]
+        starts = [conflict.frames[0] for conflict in self.conflicts]
+        return int(min([frame + 1, *starts, *born]))
 
     def _check(self, frame: int, t_s: float) -> None:
         if not np.isfinite(t_s):
@@ -364,106 +307,111 @@ class Tracker:
             self.stage.step(position_mm, t_s, 0.0)
             return None
         step, control, found = self._motion(self.stage, t_s, position_mm)
-        every = self._every()
-        self.common = self.common.predicted(step) if every else Common()
-        if found.any():
-            for track in every:
-                track.x = track.x + np.pad(found, (3, STATES - 6))
-        predict_tracks(every, step, control)
+        self.common = self.common.predicted(step) if len(self.states) else Common()
+        self.states = self.states.predicted(step, found, control)
         return Motion(step.matrix, step.noise, step.matrix[:, VELOCITY] @ found + control)
 
-    def _new(self, scan: Scan, column: int) -> Track:
-        """Start a tentative track at a measurement, with the mean rise if velocities are the lab's.
-
-        The nearest confirmed track is noted as a possible parent.
-        """
-        measured, in_lab = scan.measured, self.stage.in_lab
-        x = np.zeros(STATES)
-        x[POSITION] = measured.points_mm[column]
-        x[VELOCITY] = np.array(self.axis) * (self.settings.rise_mm_s if in_lab else 0.0)
-        p = birth_covariance(self.settings, measured.covariance_mm2[column], in_lab)
-        out = Track(x, p, born_frame=scan.frame, history=[(scan.frame, column)])
-        out.saw(scan.frame, scan.t_s, float(measured.d_eq_mm[column]))
-        out.parent = Neighbours(self._confirmed()).beside(out.point_mm)
-        return out
-
-    def _event(self, kind: str, scan: Scan, particles: tuple[int, ...], reason: str) -> None:
-        self.events.append(TrackEvent(kind, scan.frame, scan.t_s, particles, reason))
+    def _event(self, kind: str, scan: Scan, particles: Sequence[int], reason: str) -> None:
+        self.events.append(TrackEvent(kind, scan.frame, scan.t_s, tuple(particles), reason))
 
     def _take_id(self) -> int:
         self.next_id += 1
         return self.next_id - 1
 
-    def _decide(self, grown: Sequence[Cluster], scan: Scan, *, at_once: bool = False) -> Ints:
-        """Decide the conflicts that can be decided; the columns that some track claims."""
-        claimed, out = [], []
-        for cluster in grown:
-            histories = [h for b in cluster.branches for h in b.history.values()]
-            claimed += [c for h in histories for f, c in h[-1:] if f == scan.frame and c >= 0]
-            still, decided = decide(cluster, scan.frame, self.settings, at_once=at_once)
-            waited, old, new = dict[int, int](), [], []
-            for one in decided:
-                track = one.track
-                self.frames.write(one.kept, track.particle)
-                if one.new is None:
-                    waited |= {track.particle: len(one.kept)} if len(one.kept) > 1 else {}
-                else:
-                    old.append(track.particle)
-                if one.new:
-                    track.particle = self._take_id()
-                    self.frames.write(one.new, track.particle)
-                    new.append(track.particle)
-                if one.new != []:
-                    out.append(Cluster.of(track))
+    def _keep(self, kept: Bools) -> None:
+        """Forget the other states (K,), of which none is in a conflict."""
+        places = np.cumsum(kept) - 1
+        self.states = self.states.take(kept)
+        self.conflicts = [replace(c, rows=places[c.rows]) for c in self.conflicts]
+
+    def _decide(self, scan: Scan, kept: Bools, *, at_once: bool = False) -> None:
+        """Decide which tracks of the conflicts are safe in this frame; all of them if ``at_once``.
+
+        kept : (K,) states of the tracks without rivals.
+        """
+        conflicts, self.conflicts, track = self.conflicts, [], self.states.track
+        for conflict in conflicts:
+            still, best, close = conflict.decided(scan.frame, self.settings, at_once=at_once)
+            waited, old, new = list[int](), list[int](), list[int]()
+            kept[best.rows[0]] = True
+            for row, taken in zip(best.rows[0].tolist(), best.taken[0]):
+                self.frames.write(int(track[row]), best.frames, taken)
+                waited += [int(track[row])] if (taken >= NO_PARTICLE).sum() > 1 else []
+            agreed, start = close.broken()
+            for row, taken, many in zip(close.rows[0].tolist(), close.taken[0], agreed.tolist()):
+                self.frames.write(int(track[row]), close.frames[:many], taken[:many])
+                old.append(int(track[row]))
+                if (taken[start:] >= 0).any():
+                    track[row], kept[row] = self._take_id(), True
+                    self.frames.write(int(track[row]), close.frames[start:], taken[start:])
+                    new.append(int(track[row]))
             if waited:
-                reason = f"conflict of {max(waited.values())} frames decided"
-                self._event("resolved", scan, tuple(waited), reason)
+                reason = f"conflict of {len(best.frames)} frames decided"
+                self._event("resolved", scan, waited, reason)
             if old:
-                behind = -cluster.branches[1].weight
+                behind = -conflict.weight[1]
                 reason = (
                     f"continuation not safe: the log-likelihood ratio to the runner-up is "
                     f"{behind:.1f}, less than {self.settings.margin_log_ratio:g}"
                 )
-                self._event("break", scan, (*old, *new), reason)
+                self._event("break", scan, [*old, *new], reason)
             if still is not None:
-                out.append(still)
-        self.clusters = out
-        return np.unique(np.array(claimed, np.int64))
+                kept[still.rows] = True
+                self.conflicts.append(still)
+        self._keep(kept)
 
-    def _births(self, scan: Scan, claimed: Ints, common: Common, gain: Array | None) -> None:
-        """Tentative tracks go on, are confirmed or given up; what is left starts new ones."""
-        measured = scan.measured
-        free = ~measured.alone & (measured.particle == NO_PARTICLE)
-        free[claimed] = False
-        going, common, gain = extend(self.tentative, scan, free, common, gain)
-        self.common = common.applied(np.zeros((STATES, 3)) if gain is None else gain)
-        free[[c for t in going for f, c in t.history[-1:] if f == scan.frame]] = False
-        fresh = [self._new(scan, column) for column in np.flatnonzero(free).tolist()]
-        self.tentative = []
-        for track in [*going, *fresh]:
-            if len(track.history) >= self.settings.confirm_hits:
-                track.particle = self._take_id()
-                self._confirm(track, scan, f"first seen in frame {track.history[0][0]}")
-            elif not hopeless(track, scan.frame, self.settings):
-                self.tentative.append(track)
-        given = {t.particle for t in self._confirmed() if t.given}
-        for column in np.flatnonzero(measured.particle != NO_PARTICLE).tolist():
-            particle = int(measured.particle[column])
-            if particle not in given:
-                track = replace(self._new(scan, column), particle=particle, given=True)
-                self.next_id = max(self.next_id, particle + 1)
-                self._confirm(track, scan, "id given with the data")
+    def _births(self, scan: Scan, free: Ints) -> None:
+        """Start tracks at free measurements; those that were seen often enough are confirmed, and
+        those that were missed too often are given up."""
+        given = scan.measured.particle
+        known = self.states.track[self.states.given]
+        named = np.flatnonzero((given != NO_PARTICLE) & ~np.isin(given, known))
+        self._unconfirmed -= len(free)
+        new = self._unconfirmed + np.arange(len(free))[::-1]
+        columns, tracks = np.concatenate([free, named]), np.concatenate([new, given[named]])
+        if len(columns):
+            in_lab = self.stage.in_lab
+            velocity = np.array(self.axis) * (self.settings.rise_mm_s if in_lab else 0.0)
+            born = States.born(scan, columns, tracks, velocity, in_lab)
+            found = beside(self._confirmed(), born.points_mm, tracks)
+            self._parents |= zip(tracks.tolist(), found)
+            self.frames.seen(scan.frame, tracks, columns)
+            self.states = States.concat([self.states, born])
+        now_named = self.states.given & np.isin(self.states.track, given[named])
+        for row in np.flatnonzero(now_named).tolist():
+            self.next_id = max(self.next_id, int(self.states.track[row]) + 1)
+            self._confirm(scan, row, "id given with the data")
+        states, settings = self.states, self.settings
+        tentative = states.track < NO_PARTICLE
+        for row in np.flatnonzero(tentative & (states.hits >= settings.confirm_hits)).tolist():
+            old, states.track[row] = int(states.track[row]), self._take_id()
+            self.frames.rename(old, int(states.track[row]))
+            self._parents[int(states.track[row])] = self._parents[old]
+            self._confirm(scan, row, f"first seen in frame {states.born_frame[row]}")
+        missed = scan.frame - states.born_frame + 1 - states.hits
+        spare = settings.confirm_frames - settings.confirm_hits
+        self._keep((states.track > NO_PARTICLE) | (missed <= spare))
+        waiting = self.states.track[self.states.track < NO_PARTICLE].tolist()
+        self._parents = {track: self._parents[track] for track in waiting}
 
-    def _confirm(self, track: Track, scan: Scan, reason: str) -> None:
-        self.frames.write(track.history, track.particle)
-        self._event("birth", scan, (track.particle,), reason)
-        self.events += related("split", track, self._confirmed(), scan)
-        track.history, track.parent = [], None
-        self.clusters.append(Cluster.of(track))
+    def _confirm(self, scan: Scan, row: int, reason: str) -> None:
+        one = self.states.take([row])
+        track = int(one.track[0])
+        self._event("birth", scan, (track,), reason)
+        self.events += related("split", self._parents[track], one, self._confirmed(), scan)
 
     def _deaths(self, scan: Scan) -> None:
-        closed = [c.tracks[0] for c in self.clusters if not c.open]
-        dead, found = ended(closed, self._confirmed(), scan)
-        self.events += found
-        if dead:
-            self.clusters = [c for c in self.clusters if c.tracks[0].particle not in dead]
+        """End the tracks without rivals that have been unseen for too long."""
+        states, settings, confirmed = self.states, self.settings, self._confirmed()
+        unseen = self._single & (states.track > NO_PARTICLE) & (states.seen_frame != scan.frame)
+        lost = states.take(unseen)
+        nearest = beside(confirmed, lost.points_mm, lost.track)
+        self._lost = {t: self._lost.get(t) or new for t, new in zip(lost.track.tolist(), nearest)}
+        waited_s, frames = scan.t_s - states.seen_t_s, scan.frame - states.seen_frame
+        dead = unseen & (waited_s > settings.gap_s) & (frames > settings.gap_frames)
+        for row in np.flatnonzero(dead).tolist():
+            one, track = states.take([row]), int(states.track[row])
+            self.events += related("merge", self._lost.pop(track), one, confirmed, scan)
+            reason = f"not seen since frame {states.seen_frame[row]}, {waited_s[row]:.3f} s"
+            self._event("death", scan, (track,), reason)
+        self._keep(~dead)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from telerig.estimator.tracking.association import Branch, _joint, merged
+from telerig.estimator.tracking.association import Conflict, joined
 from telerig.estimator.tracking.filter import TrackerSettings
 from telerig.estimator.tracking.ranked_ways import Options, Way, alternatives
 
@@ -77,20 +77,49 @@ def test_seven_tracks_with_seven_nearly_equal_options_each() -> None:
         assert {taken[row] for _, taken, _ in found} >= set(range(7))
 
 
+def conflict(weight: list[float], taken: list[list[list[int]]]) -> Conflict:
+    """Hypotheses (B,) about the measurements (B, T, F) of tracks; their rows are numbers."""
+    columns = np.array(taken)
+    many, tracks, frames = columns.shape
+    rows = np.arange(many * tracks).reshape(many, tracks)
+    return Conflict(np.array(weight), rows, np.arange(frames), columns)
+
+
 def test_a_hypothesis_that_alone_disputes_a_track_is_kept() -> None:
     settings = TrackerSettings(max_hypotheses=5)
-    others = [(-0.1 * k, (((0, 1),), ((0, 10 + k),)), k) for k in range(8)]
-    alone = (-2.0, (((0, 2),), ((0, 10),)), 99)
-    improbable = (-9.5, (((0, 3),), ((0, 10),)), 100)
-    kept = merged([*others, alone, improbable], settings)
-    assert [index for _, index in kept] == [0, 1, 2, 3, 4, 5, 6, 7, 99]
-    same = [(-0.1 * k, (((k % 2, 1),), ((0, 10 + k // 2 % 2),)), k) for k in range(9)]
-    assert len(merged(same[:4], settings)) == 4
-    assert [index for _, index in merged(others[:3], settings)] == [0, 1, 2]
+    weight = [-0.1 * k for k in range(8)]
+    others = [[[1], [10 + k]] for k in range(8)]
+    kept = conflict([*weight, -2.0, -9.5], [*others, [[2], [10]], [[3], [10]]]).merged(settings)
+    assert kept.taken.tolist() == [*others, [[2], [10]]]
+    assert kept.weight == pytest.approx([*weight, -2.0])
+    assert kept.rows.tolist() == [[2 * k, 2 * k + 1] for k in range(9)]
+
+
+def test_hypotheses_with_equal_recent_measurements_are_one() -> None:
+    taken = [[[5, 1, 1]], [[6, 1, 1]], [[6, 2, 1]]]
+    found = conflict([0.0, -0.5, -1.0], taken).merged(TrackerSettings())
+    assert found.taken.tolist() == [taken[0], taken[2]] and found.rows.tolist() == [[0], [2]]
+    total = np.logaddexp(0.0, -0.5)
+    assert found.weight == pytest.approx([0.0, -1.0 - total])
+
+
+def test_what_the_hypotheses_dispute_is_cut_where_they_begin_to_agree_again() -> None:
+    """The first two tracks exchange the measurements of frame 1, the third one is safe."""
+    one = [[0, 1, 1, 3], [1, 0, 0, 0], [2, 2, 2, 2]]
+    two = [[0, 0, 1, 3], [1, 1, 0, 0], [2, 2, 2, 2]]
+    found = conflict([0.0, -1.0], [one, two])
+    assert found.disputed(2).tolist() == [False, False, False]
+    assert found.disputed(3).tolist() == [True, True, False]
+    agreed, start = found.broken()
+    assert agreed.tolist() == [1, 1, 2] and start == 2
 
 
 def test_every_hypothesis_of_each_group_takes_part_in_a_joint_one() -> None:
-    groups = [[Branch(-weight, []) for weight in (0.0, 0.1, far)] for far in (5.0, 4.0, 6.0)]
-    found = _joint(groups, 4)
-    weights = [sum(branch.weight for branch in one) for one in found]
-    assert weights == pytest.approx([0.0, -0.1, -0.1, -0.1, -5.0, -4.0, -6.0])
+    groups = [
+        conflict([0.0, -0.1, -far], [[[k, g]] for k in range(3)])
+        for g, far in enumerate((5.0, 4.0, 6.0))
+    ]
+    found = joined(groups, 4)
+    assert found.weight == pytest.approx([0.0, -0.1, -0.1, -0.1, -5.0, -4.0, -6.0])
+    assert found.taken[:, :, 1].tolist() == [[0, 1, 2]] * 7
+    assert found.taken[4:, :, 0].tolist() == [[2, 0, 0], [0, 2, 0], [0, 0, 2]]

@@ -62,10 +62,10 @@ def test_two_bubbles_under_shake_are_the_dense_gaussian_posterior() -> None:
         tracker.update(i, t, FrameMeasurements.create(z[i], r, particle=[4, 9]), 0.0)
     mean, covariance = _dense_posterior(settings, times, z, r)
     n = len(mean) // 2
-    first, second = (c.tracks[0] for c in tracker.clusters)
-    assert first.x == pytest.approx(mean[:n], rel=1e-6, abs=1e-7)
-    assert second.x == pytest.approx(mean[n:], rel=1e-6, abs=1e-7)
-    own, common = first.p, tracker.common.covariance
+    first, second = tracker.states.x
+    assert first == pytest.approx(mean[:n], rel=1e-6, abs=1e-7)
+    assert second == pytest.approx(mean[n:], rel=1e-6, abs=1e-7)
+    own, common = tracker.states.p[0], tracker.common.covariance
     assert own + common == pytest.approx(covariance[:n, :n], rel=1e-6, abs=1e-6)
     assert common == pytest.approx(covariance[:n, n:], rel=1e-6, abs=1e-6)
 
@@ -119,7 +119,7 @@ def test_steady_state_is_the_riccati_solution() -> None:
     predicted = solve_discrete_are(matrix.T, h.T, noise, r)
     gain = predicted @ h.T @ np.linalg.inv(h @ predicted @ h.T + r)
     steady = predicted - gain @ h @ predicted
-    found = tracker.clusters[0].tracks[0].p[driven]
+    found = tracker.states.p[0][driven]
     assert found == pytest.approx(steady, rel=1e-5, abs=1e-6)
 
 

@@ -142,7 +142,7 @@ def test_readings_that_fail_for_a_while_are_bridged() -> None:
     tracker = Tracker()
     ids, events = run(tracker, frames, stage=read)
     assert kinds(events) == ["birth"] * 2 and ids[0].tolist() == ids[-1].tolist()
-    velocity = np.array([track.x[3:6] for c in tracker.clusters for track in c.tracks])
+    velocity = tracker.states.x[:, 3:6]
     assert velocity.mean(0) == pytest.approx(280 * UP, abs=12)
 
 

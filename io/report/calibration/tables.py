@@ -53,8 +53,8 @@ def precision_words(results: CalibrationResults) -> str:
     sd_um, status = results.statistics.get("space_sd_um"), results.file.verdict.status
     if len(results.cameras) < 2 or sd_um is None or status == Status.REJECTED:
         return ""
-    words = "points in space are good to" if status == Status.GOOD else "points in space state"
-    return f": {words} {number(sd_um)} µm (1 sd per axis)"
+    words = "are good to" if status == Status.GOOD else "have a stated error of"
+    return f": points in space {words} {number(sd_um)} µm (1 sd per axis)"
 
 
 def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Tile]:

@@ -64,13 +64,12 @@ _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVerdict:
     """Return the verdict of the smoothing, with a remedy if there is one."""
     file = results.file
-    (headline, meaning, _), colour = NOT_JUDGED, "usable"
+    (headline, meaning, _), colour, good = NOT_JUDGED, "usable", ""
     if file.verdict is not None:
-        colour = _COLOURS[file.verdict]
+        colour, good = _COLOURS[file.verdict], number_words(file.axes, file.vertical)
         headline, meaning = VERDICT_WORDS[file.verdict].headline, consequence_words(file)
-        headline = f"{number_words(file.axes, file.vertical)} {headline}".strip()
     of_axes = words_of_axes(file)
-    sentences = [meaning, *map(words_of_contradiction, file.contradictions)]
+    sentences = [good, meaning, *map(words_of_contradiction, file.contradictions)]
     sentences += of_axes or [file.words]
     if file.rig_change is not None and file.rig_change.words:
         sentences.append(f"Rig: {file.rig_change.words}.")

@@ -3,7 +3,8 @@
 Usage: python benchmarks/readme.py [--write]
 
 Each sentence is a function here that takes its numbers from `results/`, so that a figure stands in
-one place, the page that its study wrote. --write puts the sentences into the README.
+one place, the page that its study wrote. --write puts the sentences into the README. Pages that an
+earlier version of a study wrote may lack figures: they are named.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def table(name: str, heading: str = "") -> pd.DataFrame:
     for title, found in tables(name).items():
         if title.startswith(heading):
             return found
-    raise SystemExit(f"results/{name}.md has no table under '{heading}': run the study again")
+    raise SystemExit(f"results/{name}.md has no table under '{heading}'")
 
 
 def number(words: str) -> float:
@@ -76,7 +77,7 @@ def said(name: str, pattern: str) -> tuple[str, ...]:
     """The groups of a pattern in a page."""
     found = re.search(pattern, text(name))
     if not found:
-        raise SystemExit(f"results/{name}.md does not say '{pattern}': run the study again")
+        raise SystemExit(f"results/{name}.md does not say '{pattern}'")
     return found.groups()
 
 
@@ -336,7 +337,16 @@ SENTENCES: tuple[Callable[[], str], ...] = (
 
 
 def block() -> str:
-    return "\n".join([BEGIN, "", *(f"- {sentence()}" for sentence in SENTENCES), "", END])
+    """The README's part with all sentences. SystemExit names the pages that lack a figure."""
+    made, missing = [], []
+    for sentence in SENTENCES:
+        try:
+            made.append(f"- {sentence()}")
+        except (SystemExit, LookupError, StopIteration, ValueError) as error:
+            missing.append(f"{sentence.__name__}: {error}")
+    if missing:
+        raise SystemExit("run these studies again (benchmarks/all.py):\n" + "\n".join(missing))
+    return "\n".join([BEGIN, "", *made, "", END])
 
 
 def main() -> int:

@@ -109,7 +109,7 @@ _WEAK_DAMPING, _SLOW_HZ = 0.02, 5.0
 
 
 def number_words(axes: Mapping[str, AxisVerdict], vertical: str) -> str:
-    """Return what every verdict says first: how much of the shake is removed along the vertical,
+    """Return the numbers of a verdict: how much of the shake is removed along the vertical,
     and to what the paths are good.
 
     axes : the verdicts by axis.

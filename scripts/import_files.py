@@ -93,15 +93,19 @@ def accelerometer(
         Path, typer.Option(help="DATASET/runs/NAME, whose accelerometer.csv is written.")
     ],
     sensor: Annotated[str, typer.Option(help="Name of the sensor in rig.toml.")],
-    channels: Annotated[
+    columns: Annotated[
         str | None,
-        typer.Option(help="Channels of x, y and z, by name or by number from 0: ch1,ch2,ch3."),
-    ] = None,
-    time: Annotated[
-        str | None, typer.Option(help="Name or number (from 0) of the channel of times.")
+        typer.Option(
+            help="Columns of times, x, y and z, by name or by number from 0: Time,ch1,ch2,ch3; "
+            "three without times, with --rate-hz."
+        ),
     ] = None,
     time_unit: Annotated[
-        str | None, typer.Option(help="Unit of the times: s, ms, us, ns, min or h.")
+        str | None,
+        typer.Option(
+            help="Unit of the times, s, ms, us, ns, min or h, or the form of time stamps, "
+            "'%Y-%m-%d %H:%M:%S.%f'."
+        ),
     ] = None,
     rate_hz: Annotated[
         float | None, typer.Option(help="Sampling rate, for a file without times.")
@@ -132,8 +136,8 @@ def accelerometer(
     _check_run(run)
     layout = layout_from(
         {
-            "channels": channels, "time": time, "time_unit": time_unit, "rate_hz": rate_hz,
-            "start_s": start_s, "unit": unit, "scale_m_s2": scale, "group": group,
+            "columns": columns, "time_unit": time_unit, "rate_hz": rate_hz, "start_s": start_s,
+            "unit": unit, "scale_m_s2": scale, "group": group,
         }
     )  # fmt: skip
     found = import_accelerations(file, sensor, layout)

@@ -92,7 +92,9 @@ CAMERA_IMPORTERS = {
 }
 _BINARY = "importing.binary_recordings"
 RECORDINGS = {
-    ".csv": Format("CSV", "importing.logger_text:read_logger_text", "readings in columns"),
+    ".csv": Format(
+        "CSV", "importing.logger_text:read_logger_text", "readings in columns", options=("columns",)
+    ),
     ".wav": Format("WAV", f"{_BINARY}:read_wav", "channels of a sound file"),
     ".mat": Format("MAT", f"{_BINARY}:read_mat", "vectors of MATLAB"),
     ".tdms": Format("TDMS", f"{_BINARY}:read_tdms", "LabVIEW", options=("group",), extra="tdms"),

@@ -184,18 +184,11 @@ def _matlab_7_3(file: Path, t_s: Any, axes: Any) -> None:
 def _loggers_texts(folder: Path, axes: Any) -> None:
     """Stamps with decimal commas; a counter below comments; a line of units; two bytes a letter."""
     cells = [[f"{value:.5f}" for value in row] for row in axes]
-    stamps = [
-        f"09.03.2024;23:59:{59.97 + i / 1000:06.3f}"
-        if i < 30
-        else f"10.03.2024;00:00:{i / 1e3:06.3f}"
-        for i in range(len(axes))
-    ]
-    rows = [";".join([stamp, *row]).replace(".", ",") for stamp, row in zip(stamps, cells)]
-    rows = [row.replace(",03,2024", ".03.2024") for row in rows]
-    head = "Logger;7\nAbtastrate;1000\nDatum;Uhrzeit;Acc X [mg];Acc Y [mg];Acc Z [mg]\n"
-    stamped = head + "\n".join(rows) + "\n"
-    (folder / "stamps.txt").write_text(stamped, "utf-8-sig")
-    (folder / "wide.txt").write_text(stamped, "utf-16")
+    clock = [f"10.03.2024 00:00:{i / 1e3:06.3f}" for i in range(len(axes))]
+    rows = [";".join([t, *(c.replace(".", ",") for c in row)]) for t, row in zip(clock, cells)]
+    (folder / "stamps.txt").write_text("Logger;7\nZeit;X;Y;Z\n" + "\n".join(rows), "utf-8-sig")
+    times = [f"{i};" + ";".join(row) for i, row in enumerate(cells)]
+    (folder / "wide.txt").write_text("\n".join(["Logger", "Time;X;Y;Z", *times]), "utf-16")
     rows = [f"{i},{','.join(row)}" for i, row in enumerate(cells)]
     head = "# data_rate = 1 kHz, range 4 g\n;Headers,count,Ax,Ay,Az\n"
     (folder / "counter.txt").write_text(head + "\n".join(rows) + "\n;switched off\n")

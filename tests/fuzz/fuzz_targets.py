@@ -185,7 +185,7 @@ def _accelerometer(file: Path) -> Any:
     from telerig.io.exchange.importing.accelerometer import Layout, read_accelerations
 
     unit = {".wav": {"scale_m_s2": 20.0}, ".mat": {"unit": "g"}}.get(file.suffix, {})
-    more = {"time": "t", "channels": ("ax", "ay", "az")} if file.suffix == ".mat" else {}
+    more = {"time_unit": "s"} if file.suffix == ".mat" else {}
     return read_accelerations(file, "arm", Layout(**unit, **more))
 
 
@@ -196,7 +196,11 @@ def _loggers_text(file: Path) -> Any:
     from telerig.io.exchange.importing.accelerometer import Layout, import_accelerations
     from telerig.io.exchange.importing.sensor_table import sensor_toml
 
-    found = import_accelerations(file, "arm", Layout(unit="g"))
+    more: dict[str, Any] = {
+        "stamps": {"columns": (0, 1, 2, 3), "time_unit": "%d.%m.%Y %H:%M:%S.%f"},
+        "counter": {"columns": (0, 1, 2, 3), "rate_hz": 1000.0},
+    }.get(file.stem, {"time_unit": "ms"})
+    found = import_accelerations(file, "arm", Layout(unit="g", **more))
     tomllib.loads(sensor_toml("arm", found.table, ["left", "right"]))
     return found.table
 

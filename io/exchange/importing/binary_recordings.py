@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.exchange.importing.recording import Recording
+from telerig.io.exchange.importing.recording import EXPORT_AGAIN, Recording
 from telerig.io.machine.parallel import isolated
-
-EXPORT_AGAIN = "export the recording again from the program that made it, or give another file"
 
 
 @contextmanager

@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 
+EXPORT_AGAIN = "export the recording again from the program that made it, or give another file"
+
 
 @dataclass(frozen=True)
 class Recording:
     """Hold the channels of a sensor's file before they are converted.
 
     where : the file, for errors.
-    channels : raw values (samples,) by the channel's name; text if a channel has no numbers.
+    channels : raw values (samples,) by the channel's name; text if they come from a text file.
     units : units by the channel's name, for channels that state a unit apart from their name.
     rate_hz : sampling rate that the file states, or None.
     offset_s : time of the first sample.

@@ -56,8 +56,8 @@ def test_csv_of_loggers(tmp_path: Path) -> None:
     )
     check(readings(german, unit="g", start_s=2.5), start_s=2.5)
     tabs = write_text(tmp_path / "c.txt", ["clock\tch1\tch2\tch3"], "\t")
-    check(readings(tabs, unit="g", time="clock", channels=("ch1", "ch2", "ch3")))
-    check(readings(tabs, rate_hz=RATE_HZ, scale_m_s2=GRAVITY, channels=(1, 2, 3)))
+    check(readings(tabs, unit="g", time_unit="s", columns=("clock", "ch1", "ch2", "ch3")))
+    check(readings(tabs, rate_hz=RATE_HZ, scale_m_s2=GRAVITY, columns=(1, 2, 3)))
 
 
 def test_wav(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_wav_of_eight_bits_has_its_zero_in_the_middle(tmp_path: Path) -> None:
 def test_mat(tmp_path: Path) -> None:
     names = {"time": T_S, "ax": TRUE_M_S2[:, 0], "ay": TRUE_M_S2[:, 1], "az": TRUE_M_S2[:, 2]}
     savemat(tmp_path / "a.mat", names)
-    check(readings(tmp_path / "a.mat", unit="m/s2"))
+    check(readings(tmp_path / "a.mat", unit="m/s2", time_unit="s"))
     savemat(tmp_path / "b.mat", {"acc": TRUE_M_S2 * 1000})
     check(readings(tmp_path / "b.mat", unit="mm/s2", rate_hz=RATE_HZ))
     (tmp_path / "c.mat").write_bytes(b"nothing")
@@ -95,7 +95,7 @@ def test_mat_with_structs(tmp_path: Path) -> None:
         "Acc_Z": TRUE_M_S2[:, 2],
     }
     savemat(tmp_path / "a.mat", {"logger": {**logger, "name": "arm"}})
-    check(readings(tmp_path / "a.mat", unit="m/s2", time="logger.t"))
+    check(readings(tmp_path / "a.mat", unit="m/s2", time_unit="s"))
 
 
 def test_mat_of_version_7_3(tmp_path: Path) -> None:
@@ -110,9 +110,9 @@ def test_mat_of_version_7_3(tmp_path: Path) -> None:
     head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
     content = (tmp_path / "a.mat").read_bytes()
     (tmp_path / "a.mat").write_bytes(head.ljust(512, b"\0") + content[512:])
-    check(readings(tmp_path / "a.mat", unit="m/s2"))
+    check(readings(tmp_path / "a.mat", unit="m/s2", time_unit="s"))
     with pytest.raises(InputError, match=r"data\.acc_x, data\.acc_y, data\.acc_z"):
-        readings(tmp_path / "a.mat", unit="m/s2", channels=("name", "x", "y"))
+        readings(tmp_path / "a.mat", unit="m/s2", columns=("name", "x", "y"))
     (tmp_path / "b.mat").write_bytes(head.ljust(512, b"\0") + content[512:700])
     with pytest.raises(InputError, match="no MAT file"):
         readings(tmp_path / "b.mat")
@@ -148,13 +148,13 @@ def test_units_and_channels_are_never_guessed(tmp_path: Path) -> None:
         readings(path)
     with pytest.raises(InputError, match="give one of them"):
         readings(path, unit="g", scale_m_s2=2.0)
-    with pytest.raises(InputError, match="has no channel nope"):
-        readings(path, unit="g", channels=("ax", "ay", "nope"))
+    with pytest.raises(InputError, match="has no line with the columns ax, ay, nope"):
+        readings(path, unit="g", columns=("ax", "ay", "nope"))
     other = write_text(tmp_path / "b.csv", ["clock,p,q,r"], ",")
-    with pytest.raises(InputError, match="which channels are x, y and z"):
+    with pytest.raises(InputError, match="which columns are x, y and z"):
         readings(other, unit="g")
-    with pytest.raises(InputError, match="neither times nor a sampling rate"):
-        readings(other, unit="g", channels=("p", "q", "r"))
+    with pytest.raises(InputError, match="--rate-hz"):
+        readings(other, unit="g", columns=("p", "q", "r"))
 
 
 def test_the_unit_g_is_the_standard_one() -> None:
@@ -186,7 +186,7 @@ def test_merging_keeps_other_sensors(tmp_path: Path) -> None:
     run = tmp_path / "accelerometer.csv"
     for name in ("left", "right"):
         assert merge_accelerations(read_accelerations(path, name, Layout(unit="g")), run) == []
-    halved = read_accelerations(path, "left", Layout(unit="g", channels=("ay", "ax", "az")))
+    halved = read_accelerations(path, "left", Layout(unit="g", columns=("t_s", "ay", "ax", "az")))
     assert merge_accelerations(halved, run) == ["left"]
     table = read_accelerometer_csv(run, ["left", "right"])
     assert (table["sensor"] == "left").sum() == (table["sensor"] == "right").sum() == len(T_S)
@@ -195,7 +195,7 @@ def test_merging_keeps_other_sensors(tmp_path: Path) -> None:
 
 
 def test_layout_from_words_of_a_command_line() -> None:
-    found = layout_from({"channels": "2, 3,z", "scale_m_s2": "98,97.5,99", "unit": None})
-    assert found == Layout(channels=(2, 3, "z"), scale_m_s2=(98.0, 97.5, 99.0))
+    found = layout_from({"columns": "2, 3,z", "scale_m_s2": "98,97.5,99", "unit": None})
+    assert found == Layout(columns=(2, 3, "z"), scale_m_s2=(98.0, 97.5, 99.0))
     with pytest.raises(InputError, match="no number"):
         layout_from({"scale_m_s2": "much"})

@@ -12,6 +12,8 @@ NO_COVARIANCE = (
 
 TELECENTRIC = 1e-3
 """Relative change of the scale over the depth of the views below which a lens is telecentric."""
+_SIGNIFICANT = 3.0
+"""Standard deviations from which on a change of the scale is one."""
 ORDINARY = 0.01
 """Slope of a corner ray beyond which a lens is an ordinary one: no telecentric lens errs by 0.6
 degrees."""
@@ -36,9 +38,12 @@ def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
             "depth"
         )
         if abs(change) < 100 * TELECENTRIC:
-            words.append(f"camera {name} is telecentric: {amount}")
+            kind = "telecentric"
+        elif abs(change) < _SIGNIFICANT * sd:
+            kind = "telecentric as far as these views can show it"
         else:
-            words.append(f"camera {name} is not quite telecentric: {amount}")
+            kind = "not quite telecentric"
+        words.append(f"camera {name} is {kind}: {amount}")
     return words
 
 

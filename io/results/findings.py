@@ -52,8 +52,8 @@ class Kind:
 _FALSE_ALARM = 1e-3
 _NOTE, _USABLE = Status.GOOD, Status.USABLE
 _DEVIATE = (
-    "the dots deviate from the model {text} by {scatter_px:.2g} px (standard deviation of u and of "
-    "v), but the noise of the images explains only {image_noise_px:.2g} px"
+    "the dots deviate from the lens model {text} by {scatter_px:.2g} px (standard deviation of u "
+    "and of v), but the noise of the images explains only {image_noise_px:.2g} px"
 )
 _HALVES = (
     "of two calibrations, one from {first:.0f} and one from the other {second:.0f} views, points "

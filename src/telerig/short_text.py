@@ -200,7 +200,7 @@ def flat_rows(content: Any, path: str = "") -> Iterator[tuple[str, str]]:
         for i, value in enumerate(content):
             yield from flat_rows(value, f"{path}[{i}]")
     elif isinstance(content, list):
-        yield path, ", ".join(_leaf(item) for item in content)
+        yield path, ", ".join(_leaf(item) for item in content) or "none"
     else:
         yield path, _leaf(content)
 

@@ -150,9 +150,9 @@ class PairModel:
             ),
         }
         return [
-            f"The run gives {self.pairs:.1f} pairs. The two rays of a pair miss each other by "
+            f"The run gives {self.pairs:.0f} pairs. The two rays of a pair miss each other by "
             f"{raw:.2f} px RMS along the axis that the cameras share, less what all pairs of a "
-            f"frame have in common, and on average by {offset:+.2f} ± {error:.2f} px.",
+            f"frame have in common, and on average by {offset:+.3f} ± {error:.2g} px.",
             *(text for finding, text in texts.items() if finding in {*self.findings} - {*without}),
         ]
 

@@ -40,6 +40,7 @@ from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.thresholds import CONSIDERED_P_VALUE, UNDETERMINED
 from telerig.factors.calibration import State
 from telerig.rig.lens_parameters import AUTO, GROUPS, INDEX, groups_of, joint_name, name_of, ordered
+from telerig.short_text import number
 
 _TILT = [INDEX["tilt_x"], INDEX["tilt_y"]]
 _SHAPE = [INDEX["aspect"], INDEX["skew"]]
@@ -250,11 +251,12 @@ def _words(
     if added:
         last = f"{', '.join(added[-1].added)} of camera {cameras[added[-1].camera]!r}"
         words += (
-            f"lowest information criterion; chi-square is {sum(s.gain for s in added):.3g} smaller "
-            f"than with the model {joint_name([name_of(x) for x in steps[0].lenses], cameras)}"
+            f"lowest information criterion; chi-square is {number(sum(s.gain for s in added))} "
+            "smaller than with the model "
+            f"{joint_name([name_of(x) for x in steps[0].lenses], cameras)}"
         )
         if len(added) > 1:
-            words += f", {added[-1].gain:.3g} of it by the parameters added last ({last})"
+            words += f", {number(added[-1].gain)} of it by the parameters added last ({last})"
     else:
         words += "no further parameter lowers chi-square by more than its penalty"
     if any("kappa" in lens and free for lens, free in zip(chosen, auto)):
@@ -262,7 +264,7 @@ def _words(
         without = tuple(x - {"kappa", "centre"} if free else x for x, free in zip(whole, auto))
         words += (
             "; kappa = 0 is rejected: the scale changes with depth, and chi-square would be at "
-            f"least {quadratic.rise(without):.3g} larger without it"
+            f"least {number(quadratic.rise(without))} larger without it"
         )
     for camera, lens, intrinsics in zip(cameras, chosen, rich.intrinsics):
         if "affine" in lens:

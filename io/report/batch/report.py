@@ -95,9 +95,9 @@ def page_of(
         "telerig report of a batch", "Batch", name, verdict,
         sections=[
             Section("key", "", [Tiles(tuple(_key_numbers(jobs)))]),
-            Section("bubbles", "Bubbles", _of_bubbles(bubbles, fluid, names)),
             Section("failures", "What failed",
                     table(["where", "job", "why, and what to do"], failures, (98, 99))),
+            Section("bubbles", "Bubbles", _of_bubbles(bubbles, fluid, names), open=True),
             Section("calibrations", "Calibrations", table(heads, calibrations, (2, 99))),
             Section("runs", "Runs", [*table(of_runs, rows, (2, 99)), *texts(sd if rows else "")]),
         ],
@@ -158,7 +158,9 @@ def _of_bubbles(
     every, liquid = bubbles.assign(whose=whose), fluid or None
     drawings = (
         ("Speed against diameter", partial(plot.speed, every, liquid, by="whose"),
-         "Mean speed along the path against the diameter, and laws of the rise velocity."),
+         "Mean speed along the path against the diameter"
+         + (", and laws of the rise velocity." if liquid else ". For laws of the rise velocity and "
+            "for drag, describe the liquid under [fluid] in rig.toml, and run the batch again.")),
         ("Drag against Reynolds number", partial(plot.drag, every, liquid, by="whose"),
          "The laws are for bubbles of these sizes that rise steadily."),
         ("Aspect ratio against Weber number", partial(plot.aspect, every, by="whose"),

@@ -80,15 +80,19 @@ def write_calibration_report(
 
 def page_of(results: CalibrationResults, outdated: Sequence[str], page_folder: Path) -> Page:
     """Return what the page says; ``page_folder`` is where it will lie."""
+    residuals = Section("residuals", "Residuals", _residuals(results))
+    next_view = Section("next", "Would another view help?", _next(results))
+    rejected = results.file.verdict.status == Status.REJECTED
+    first, later = ((residuals,), ()) if rejected else ((next_view,), (residuals,))
     return Page(
         "telerig calibration report", str(results.file.verdict.status),
         results.file.name or "calibration", _verdict(results), _look(results),
         [
             Section("key", "", [Tiles(tuple(tables.key_numbers(results)))]),
-            Section("next", "Would another view help?", _next(results)),
+            *first,
             Section("parameters", "Cameras", _cameras(results)),
             Section("trust", "How far it can be trusted", _trust(results)),
-            Section("residuals", "Residuals", _residuals(results)),
+            *later,
             Section("coverage", "Coverage and tilts", _coverage(results)),
             Section("target", "Shape of the target", _target(results)),
             Section("views", "View by view", _views(results, page_folder)),
@@ -117,7 +121,8 @@ def _verdict(results: CalibrationResults) -> Verdict:
         said = "" if asked and more else sentence(str(advice["verdict"]))
         words.append(f"{said}{more}".strip())
     headline = f"{status}{tables.precision_words(results)}"
-    return Verdict(headline, _COLOURS[status], tuple(words), tuple(file.verdict.reasons))
+    return Verdict(headline, _COLOURS[status], tuple(words),
+                   tuple(map(sentence, file.verdict.reasons)))  # fmt: skip
 
 
 def _look(results: CalibrationResults) -> list[Figure]:
@@ -179,7 +184,8 @@ _SHARES: dict[Share, tuple[str, str]] = {
         "Uncertainty: the calibration's share",
         "Standard deviation of a point's position due to the calibration alone, √(sx² + sy² + sz²),"
         " in the plane of the rig frame nearest to both optical axes. Points of a run that lie "
-        "near each other share this error: it cancels in their differences.",
+        "near each other share this error: it cancels in their differences. It holds the error "
+        "of the rig frame itself, which moves all points alike and which the verdict leaves out.",
     ),
     "measurement": (
         "Uncertainty: the pixels' share",

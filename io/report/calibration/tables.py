@@ -46,12 +46,14 @@ def key_numbers(results: CalibrationResults) -> list[Tile]:
 
 
 def precision_words(results: CalibrationResults) -> str:
-    """Return how well a point is placed, to follow the status; "" if that is not to be used.
+    """Return how well a point is placed, to follow the status; "" for a single camera.
 
     Only of a good calibration it is certain that errors are what is stated.
     """
     sd_um, status = results.statistics.get("space_sd_um"), results.file.verdict.status
-    if len(results.cameras) < 2 or sd_um is None or status == Status.REJECTED:
+    if status == Status.REJECTED:
+        return ": do not measure with this calibration"
+    if len(results.cameras) < 2 or sd_um is None:
         return ""
     words = "are good to" if status == Status.GOOD else "have a stated error of"
     return f": points in space {words} {number(sd_um)} µm (1 sd per axis)"
@@ -61,17 +63,18 @@ def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Ti
     if len(results.cameras) < 2:
         return [Tile("In space", "no depth", "one camera never sees the depth along its axis")]
     precision = f"{number(s.get('space_sd_um'))} µm"
+    rejected = results.file.verdict.status == Status.REJECTED
     remark = (
         f"1 sd per axis of a triangulated point; dots are {number(s.get('space_rms_um'))} µm RMS "
         f"from the fit, rays miss by {number(s.get('ray_miss_rms_um'))} µm"
     )
-    figures = [Tile("In space", precision, remark)]
+    figures = [] if rejected else [Tile("In space", precision, remark)]
     for name, of in s.get("from_first", {"": s}).items():
         angle = with_sd(of.get("axes_angle_deg"), of.get("axes_angle_sd_deg"))
         which = f"of {results.cameras[0].name} and {name}" if name else "between the optical axes"
-        figures.append(Tile("Angle between axes", f"{angle} °", f"1 sd; {which}"))
+        figures.append(Tile("Angle between axes", f"{angle}°", f"1 sd; {which}"))
     if "perspective_centres_distance_mm" in s:
-        distance = f"{number(s['perspective_centres_distance_mm'], 6)} mm"
+        distance = f"{number(s['perspective_centres_distance_mm'], 4)} mm"
         figures.append(Tile("Base", distance, "between the centres of perspective"))
     return figures
 

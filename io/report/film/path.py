@@ -16,7 +16,7 @@ from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.mp4 import Picture, Progress, write_film
 from telerig.io.report.plot.axes import colour_of
-from telerig.io.report.plot.tracks import thinned
+from telerig.io.report.plot.tracks import spaced, thinned
 from telerig.io.results.bodies import ellipsoids_of
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
@@ -26,7 +26,6 @@ from telerig.io.tables.table import SHAPE_COLUMNS
 STEP_DEG = 2
 MOST_POINTS = 3_000
 MOST_BODIES = 120
-_SPACING = 1.7
 _PLACE, _SD = ["x_mm", "y_mm", "z_mm"], ["sx_mm", "sy_mm", "sz_mm"]
 _VARIANCE = ["sxx_mm2", "syy_mm2", "szz_mm2"]
 
@@ -153,24 +152,13 @@ def _bodies(results: TrackResults, kept: pd.DataFrame) -> tuple[Ints, Array, str
         here, on=["frame", "particle"]
     )
     sizes = sizes[np.isfinite(sizes["d_eq_mm"].to_numpy(float))].sort_values("row")
-    sizes = sizes.iloc[_apart(kept, sizes)].reset_index(drop=True)
+    points = kept[_PLACE].to_numpy(float)[sizes["row"].to_numpy(np.int64)]
+    particle, diameter = (sizes[name].to_numpy(float) for name in ("particle", "d_eq_mm"))
+    sizes = sizes.iloc[spaced(points, particle, diameter, MOST_BODIES)].reset_index(drop=True)
     quadrics, shaped = ellipsoids_of(sizes)
     rows = sizes["row"].to_numpy(np.int64)
     kind = "ellipsoids from their outlines" if shaped.any() else "spheres of equal volume"
     return rows, quadrics, f"bubbles: {kind}"
-
-
-def _apart(kept: pd.DataFrame, sizes: pd.DataFrame) -> list[int]:
-    """Return rows of ``sizes`` so far apart along tracks that bubbles do not hide each other."""
-    points = kept[_PLACE].to_numpy(float)[sizes["row"].to_numpy(np.int64)]
-    particle, diameter = sizes["particle"].to_numpy(), sizes["d_eq_mm"].to_numpy(float)
-    chosen: list[int] = []
-    for i in range(len(sizes)):
-        last = chosen[-1] if chosen else -1
-        far = np.linalg.norm(points[i] - points[last]) > _SPACING * diameter[i]
-        if last < 0 or particle[i] != particle[last] or far:
-            chosen.append(i)
-    return chosen[:: len(chosen) // MOST_BODIES + 1]
 
 
 @dataclass(frozen=True)

@@ -88,11 +88,15 @@ Block = Tiles | Table | Text | Choice | Figure | Picture
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page, which is left out if it has no contents; ``name`` is its anchor."""
+    """A part of a page, which is left out if it has no contents; ``name`` is its anchor.
+
+    open : whether it opens with the page, as the first one always does.
+    """
 
     name: str
     title: str
     contents: Sequence[Block]
+    open: bool = False
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ from telerig.io.report.plot.axes import (
     finite,
     nothing_to_draw,
 )
-from telerig.io.report.plot.tracks import thinned
+from telerig.io.report.plot.tracks import spaced, thinned
+from telerig.io.results.bodies import ellipsoids_of
 from telerig.io.rig_file.fluid import liquid_of
 from telerig.rig.bubble_physics import (
     Liquid,
@@ -42,7 +43,7 @@ from telerig.rig.bubble_physics import (
 _SUMMARY = "what telerig.bubble_summary returns, or bubble_summary.csv"
 _WAVES_FROM_M = 1.3e-3
 _MOST_CLOUD = 4000
-_MOST_POINTS, _MOST_LINES, _WINDOW = 8_000, 12, 1_000
+_MOST_POINTS, _MOST_LINES, _WINDOW, _MOST_BODIES = 8_000, 12, 1_000, 120
 _WIDENING, _WIDEST, _FLATTEST = (1, 2, 5, 10, 20), 0.5, 0.02
 
 
@@ -54,14 +55,16 @@ def path(
     up: str = "-y",
     axes: Any = None,
 ) -> Any:
-    """Draw the paths of bubbles in space; returns 3-D axes.
+    """Draw the paths of bubbles in space, with some bubbles as ellipsoids; returns 3-D axes.
 
     trajectories : `Smoothing.trajectories`, bubbles.csv or tracks.csv; long ones are thinned.
     particles : which bubbles; None for all.
     colour_by : a column that colours the path, like "slip_mm_s"; None for a colour per bubble.
     up : the axis of the rig that points upwards, drawn as the height; "-y" for upright cameras.
 
-    Slender paths are drawn wider than true, by a factor that stands above them.
+    bubbles.csv and tracks.csv have the shapes of bubbles; of diameters alone spheres are drawn, and
+    with ``colour_by`` none. Slender paths are drawn
+    wider than true, by a factor that stands above them.
     Raises InputError for a table without positions.
     """
     axes, vertical = axes_of(axes, projection="3d"), Vertical.of(up)
@@ -77,6 +80,11 @@ def path(
         for rows in np.split(np.arange(len(chosen)), starts[1:]) if len(chosen) else ():
             line = [place[i][rows] for i in vertical.order]
             axes.plot(*line, color=colour_of(int(whose[rows[0]])), linewidth=1.0)
+        frame = np.array([vertical.sign_of(i) * np.eye(3)[i] for i in vertical.order])
+        sized = chosen[np.isfinite(chosen.get("d_eq_mm", np.full(len(chosen), np.nan)))]
+        points = sized[["x_mm", "y_mm", "z_mm"]].to_numpy(float) @ frame.T
+        radius = sized["d_eq_mm"].to_numpy(float)[:, None] / 2 if len(sized) else np.zeros((0, 1))
+        axes.auto_scale_xyz(*np.r_[points - radius, points + radius].T)
     else:
         (colours,) = columns_of(chosen, colour_by, made_by="bubbles.csv")
         known = colours[np.isfinite(colours)]
@@ -84,13 +92,45 @@ def path(
         drawn = axes.scatter(*(place[i] for i in vertical.order), c=colours, s=3, **limits)
         axes.figure.colorbar(drawn, ax=axes, label=colour_by, shrink=0.7, pad=0.12)
     wider = _widening(axes)
+    if colour_by is None and len(sized):
+        _draw_bodies(axes, sized, points, frame, wider)
     if wider > 1:
         axes.set_title(f"horizontally {wider} times as wide as true", fontsize=8, y=0.98)
     for side, i in zip("xyz", vertical.order):
         getattr(axes, f"set_{side}label")(f"{vertical.name(i)} / mm")
     for side in "xy":
-        axes.locator_params(axis=side, nbins=4)
+        axes.locator_params(axis=side, nbins=3)
+    axes.tick_params(axis="z", pad=8)
+    axes.zaxis.labelpad = 20
     return axes
+
+
+def _draw_bodies(
+    axes: Any, sized: pd.DataFrame, points_mm: Array, frame: Array, wider: int
+) -> None:
+    """Draw the outlines of some bubbles as they are seen, so few that they leave the paths free.
+
+    sized : N rows of a sorted table with ``d_eq_mm``. points_mm : (N, 3) in the figure's axes,
+    which are the rows of ``frame`` (3, 3) in rig axes. wider : how much the figure is widened.
+    """
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    particle, diameter = (sized[name].to_numpy(float) for name in ("particle", "d_eq_mm"))
+    turn, stretch = np.linspace(0, 2 * np.pi, 24, endpoint=False), np.array([wider, wider, 1.0])
+    azimuth, elevation = np.deg2rad([axes.azim, axes.elev])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    level = np.array([-np.cos(azimuth), -np.sin(azimuth), 0.0])
+    across = np.array([right, np.sin(elevation) * level + [0, 0, np.cos(elevation)]])
+    rows = spaced(stretch * points_mm, particle, wider * diameter, _MOST_BODIES)
+    quadrics = frame @ ellipsoids_of(sized.iloc[rows])[0] @ frame.T
+    seen = across @ (stretch[:, None] * quadrics * stretch) @ across.T
+    squares, directions = np.linalg.eigh(seen)
+    circle = np.stack([np.cos(turn), np.sin(turn)], -1)
+    half = np.sqrt(np.maximum(squares, 0.0))[:, None] * circle
+    ring = half @ np.swapaxes(directions, 1, 2) @ across / stretch
+    colours = [colour_of(int(k)) for k in particle[rows]]
+    style = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.5, "alpha": 0.25}
+    axes.add_collection3d(Poly3DCollection(points_mm[rows][:, None] + ring, **style))
 
 
 def _widening(axes: Any) -> int:
@@ -102,7 +142,7 @@ def _widening(axes: Any) -> int:
         low, high = getattr(axes, f"get_{side}lim")()
         middle = 0.5 * (low + high)
         getattr(axes, f"set_{side}lim")(middle - drawn / 2, middle + drawn / 2)
-    axes.set_box_aspect(sides, zoom=0.85)
+    axes.set_box_aspect(sides, zoom=0.82)
     return wider
 
 

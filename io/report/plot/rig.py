@@ -36,7 +36,13 @@ _LONGEST = 0.12
 """Longest arrow of a dot that was left out, in image widths; the others are drawn to scale."""
 
 _GRID = 6
-_MOST_LABELS = 30
+_MOST_LABELS, _LABEL_DEG = 30, 12.0
+"""Labels of views, which are left out where they would cover that of an earlier view."""
+
+_FINER, _MOST_NODES = 8, 9
+"""A map has so many steps between the points of its grid, where these are few: the variance is
+nearly a polynomial in space."""
+
 _MARGIN = 1 / 12
 """Round the dots of the plate, over its longer side: about half a spacing."""
 
@@ -57,7 +63,10 @@ def rig(
     axes is drawn, not measured. Returns axes.
     """
     outline, plane = rig_outline(cameras, poses, points_mm), common_plane(cameras).T
-    axes = axes_of(axes, xlabel="across the first axis / mm", ylabel="along the first axis / mm")
+    axes = axes_of(
+        axes, xlabel=f"across the axis of {no_formula(cameras[0].name)} / mm",
+        ylabel="along it / mm",
+    )  # fmt: skip
     for plate in outline.plates_mm @ plane:
         axes.plot(*plate[[0, 1, 2, 3, 0]].T, color=MUTED, linewidth=0.7)
     for i, camera in enumerate(outline.cameras):
@@ -218,12 +227,13 @@ def coverage(
     """Draw where in a camera's images dots or bubbles were measured; returns axes.
 
     table : residuals.csv, dots.csv or detections.csv. image_size_px : (width, height); None for
-    what the points cover. Cells of the image that hold no point are red; so are detections that
+    what the points cover. Cells of the image without a dot are red; so are detections that
     belong to no track. Raises InputError for a camera without points.
     """
     mine = _of_camera(table, camera)
     u, v = columns_of(mine, "u_px", "v_px", made_by=_RESIDUALS)
-    alone = mine["particle"].isna().to_numpy() if "particle" in mine else np.zeros(len(u), bool)
+    bubbles = "particle" in mine
+    alone = mine["particle"].isna().to_numpy() if bubbles else np.zeros(len(u), bool)
     if "weight" in mine:
         good = mine["weight"].to_numpy(float) > _LEAST_WEIGHT
         u, v, alone = u[good], v[good], alone[good]
@@ -233,7 +243,7 @@ def coverage(
         edges = [np.linspace(-0.5, n - 0.5, _GRID + 1) for n in image_size_px]
         count, _ = np.histogramdd(np.c_[u, v], bins=edges)
         axes.pcolormesh(
-            *edges, np.where(count.T > 0, np.nan, 1.0), cmap="Reds", vmin=0, vmax=5,
+            *edges, np.where((count.T > 0) | bubbles, np.nan, 1.0), cmap="Reds", vmin=0, vmax=5,
             edgecolors="#e3e5e8", linewidth=0.4,
         )  # fmt: skip
     dots = {"markersize": 4, "alpha": 0.6, "markeredgewidth": 0}
@@ -275,10 +285,10 @@ def tilts(
         x, y = np.degrees(tilt) * (np.cos(direction), np.sin(direction))
         label = no_formula(camera.name)
         axes.plot(x, y, "o^sD"[i % 4], color=camera_colour(i), markersize=5, label=label)
-        if len(views) <= _MOST_LABELS:
-            for view, a, b in zip(short_names(list(views)), x, y):
+        for k, view in enumerate(short_names(list(views)) if len(views) <= _MOST_LABELS else ()):
+            if np.hypot(x[:k] - x[k], y[:k] - y[k]).min(initial=np.inf) > _LABEL_DEG:
                 text = {"textcoords": "offset points", "fontsize": 7}
-                axes.annotate(no_formula(view), (a, b), (4, 3), **text)
+                axes.annotate(no_formula(view), (x[k], y[k]), (4, 3), **text)
     axes.set(xlim=(-95, 95), ylim=(95, -95), aspect="equal")
     axes.set_axis_off()
     return axes
@@ -305,10 +315,21 @@ def uncertainty(
         what = f"holds no {name}"
         raise InputError(what, where="telerig.plot.uncertainty", todo="give uncertainty.npz")
     side, z, sd_um = sd_in_plane(arrays, name, "xy".index(across))
+    if max(sd_um.shape) <= _MOST_NODES:
+        (side, of_side), (z, of_z) = _between(side), _between(z)
+        sd_um = np.sqrt(np.maximum(of_side @ sd_um**2 @ of_z.T, 0.0))
     axes = axes_of(axes, xlabel=f"{across} / mm", ylabel="z / mm", aspect="equal")
     drawn = axes.contourf(side, z, sd_um.T, levels=_LEVELS, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label=f"1 sd / µm, share of the {share}")
     return axes
+
+
+def _between(nodes: Array) -> tuple[Array, Array]:
+    """Return places (M,) over the nodes (N,), and the matrix (M, N) that interpolates there."""
+    fine = np.linspace(nodes[0], nodes[-1], _FINER * (len(nodes) - 1) + 1)
+    scale = max(float(np.ptp(nodes)), 1e-9)
+    powers = [np.vander((x - nodes.mean()) / scale, len(nodes)) for x in (fine, nodes)]
+    return fine, np.asarray(powers[0] @ np.linalg.inv(powers[1]))
 
 
 def sd_in_plane(arrays: Mapping[str, Array], name: str, across: int) -> tuple[Array, Array, Array]:

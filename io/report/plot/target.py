@@ -116,5 +116,5 @@ def _heights(axes: Any, shape: TargetShape) -> None:
         for place, z in zip(shape.place_mm, height):
             shade = "white" if abs(z) > 0.65 * limit else "black"
             words = {"ha": "center", "va": "center", "fontsize": 7, "color": shade}
-            axes.text(*place, f"{z:.0f}", **words)
+            axes.text(*place, f"{round(z):d}", **words)
     axes.figure.colorbar(dots, ax=axes, label="height / µm", orientation="horizontal")

@@ -5,6 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from telerig.arrays import Array
+
+_SPACING = 1.7
+"""Diameters between two bubbles of a track that are drawn."""
+
 
 def thinned(tracks: pd.DataFrame, most: int) -> pd.DataFrame:
     """Return about ``most`` rows sorted by bubble and frame, with the ends of all tracks.
@@ -31,3 +36,17 @@ def thinned(tracks: pd.DataFrame, most: int) -> pd.DataFrame:
     kept: pd.DataFrame = table.assign(run=run).loc[keep]
     new = np.append(True, np.diff(kept["run"]) != 0)[: len(kept)]
     return kept.assign(new=new)
+
+
+def spaced(points_mm: Array, particle: Array, diameter_mm: Array, most: int) -> list[int]:
+    """Return some rows of sorted tracks, so far apart that their bubbles do not hide each other.
+
+    points_mm : (N, 3). particle, diameter_mm : (N,). most : about so many rows.
+    """
+    chosen: list[int] = []
+    for i in range(len(points_mm)):
+        last = chosen[-1] if chosen else -1
+        far = np.linalg.norm(points_mm[i] - points_mm[last]) > _SPACING * diameter_mm[i]
+        if last < 0 or particle[i] != particle[last] or far:
+            chosen.append(i)
+    return chosen[:: len(chosen) // most + 1]

@@ -35,11 +35,14 @@ def bubble_figures(results: SmoothingResults) -> list[Figure]:
         " Lines: published laws for the rise velocity of single bubbles; one that zigzags moves "
         "faster along its path than it rises."
     )
+    speed = Figure(
+        "Speed against size", partial(plot.speed, summary, fluid),
+        "Mean speed along the path, relative to the liquid, against the diameter of the sphere of "
+        f"equal volume.{laws if fluid else ''}", 3.8,
+    )  # fmt: skip
     return [
         *([size] if known >= LEAST_MANY else []),
-        Figure("Speed against size", partial(plot.speed, summary, fluid),
-               "Mean speed along the path, relative to the liquid, against the diameter of the "
-               f"sphere of equal volume.{laws if fluid else ''}", 3.8),
+        *([speed] if known > 1 or fluid else []),
         Figure("Drag against Reynolds number", partial(plot.drag, summary, fluid),
                "Drag coefficient from the balance of buoyancy, added mass and acceleration; lines: "
                "published laws for bubbles of these sizes that rise steadily.", 3.8),

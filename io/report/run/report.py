@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ from telerig.io.results.folders.tracking import (
 )
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
-from telerig.io.results.verdict_words import words_of_refusals
+from telerig.io.results.verdict_words import words_of_axes, words_of_refusals
 from telerig.short_text import number, share
 
 _SHOWN = {"schema", "kind", "run", "notes", "worst_frames", "pairs", "covariance", "events",
@@ -62,6 +63,11 @@ _OF_SMOOTHING = (
     "Identifiable", "Encoder position",
 )  # fmt: skip
 TERMS = (*_OF_TRACKS, *_OF_SMOOTHING)
+_NEXT = (
+    "These paths hold the shake of the rig and are relative to it. Next: telerig smooth takes the "
+    "shake out, adds the travel of the stage, and says whether the paths can be relied on. If it "
+    "refused this run, it said why."
+)
 
 
 def write_track_report(
@@ -106,6 +112,8 @@ def page_of(
     ]
     name = results.file.run or "run"
     if smoothing is None:
+        if len(results.tracks):
+            verdict = replace(verdict, sentences=(*verdict.sentences, _NEXT))
         return Page(
             "telerig report of a tracked run", "Tracks", name, verdict, _look(results),
             [key, Section("paths", "Paths", _paths(results)), *about], _OF_TRACKS, outdated,
@@ -137,7 +145,7 @@ def up_name(up: Any) -> str:
 
 
 def _path(table: Any, up: str, words: str) -> Figure:
-    words += " A colour per bubble; telerig view shows it in 3-D, with the bubbles' bodies."
+    words += " A colour per bubble, some drawn as ellipsoids; telerig view turns it in 3-D."
     return Figure("Paths in space", partial(plot.path, table, up=up), words, 3.6, space=True)
 
 
@@ -155,7 +163,9 @@ def _look(results: TrackResults) -> list[Figure]:
 def _look_smoothed(results: SmoothingResults) -> list[Figure]:
     up = up_name(results.up)
     shaken = _by_shake(results)
-    paths = _path(results.trajectories, up, "In the laboratory: the travel of the stage is added "
+    shaped = len(results.bubble_frames) >= len(results.trajectories)
+    table = results.bubble_frames if shaped else results.trajectories
+    paths = _path(table, up, "In the laboratory: the travel of the stage is added "
                   "and the shake is removed.")  # fmt: skip
     return [
         *([paths, _height(results, "", up)] if len(results.trajectories) else []),
@@ -199,7 +209,8 @@ def _uses(results: SmoothingResults) -> list[Block]:
         "Median of the longest bubbles, in rig axes. Good: the value is at least ten times its "
         "standard deviation; limited: three times. A velocity in a frame and a path are given by "
         "their RMS, the path about a straight line and up to the frequency at which its power "
-        "falls below nine times that of its errors. Nothing in the run confirms the sign, unit and "
+        "falls below nine times that of its errors, a zigzag by its spectrum, which is as wide as "
+        "the record is short. Nothing in the run confirms the sign, unit and "
         "scale of what a value rests on."
     )
     if not rows:
@@ -226,7 +237,8 @@ def _axes(results: SmoothingResults) -> list[Block]:
             "remove, of the shake that the run shows (mean square of the estimate plus its "
             "variance); 1 is best."
         )
-    return [*table(head, rows), *texts(lead, small=True)]
+    words = words_of_axes(results.file)
+    return [*texts(*words, points=True), *table(head, rows), *texts(lead, small=True)]
 
 
 def _bubbles(results: SmoothingResults) -> list[Block]:
@@ -364,7 +376,8 @@ def _rays(results: TrackResults, *, beside: bool) -> list[Block]:
                    2.9, grid=False)  # fmt: skip
     rows = [Row(pair) for pair in tracked.pair_rows(results)]
     covariance = results.file.covariance
-    known = f"Covariances in tracks.csv: {covariance}" if covariance else ""
+    known = f"Covariances in tracks.csv are {covariance[:1].lower()}{covariance[1:]}"
+    known = known if covariance else ""
     return [
         *([_ray_miss(results)] if beside else []), *([along] if len(results.cameras) == 2 else []),
         *texts(*results.pairs.words), *([Table(rows)] if rows else []), *texts(known, small=True),

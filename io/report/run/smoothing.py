@@ -70,7 +70,9 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVe
         headline, meaning = VERDICT_WORDS[file.verdict].headline, consequence_words(file)
     of_axes = words_of_axes(file)
     sentences = [good, meaning, *map(words_of_contradiction, file.contradictions)]
-    sentences += of_axes or [file.words]
+    sentences += of_axes if not good else []
+    sentences += [file.words] if not of_axes else []
+    sentences.append(_size_words(results))
     if file.rig_change is not None and file.rig_change.words:
         sentences.append(f"Rig: {file.rig_change.words}.")
     in_words = file.words and not of_axes  # files from before hold the remedy in their words
@@ -185,6 +187,25 @@ def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
         rows.append(Row((head, *cells), strong=key == "verdict"))
     rows += [Row((name, *cells)) for name, cells in columns.items()]
     return ["", *(_axis_name(results, axis) for axis in range(3))], rows
+
+
+def _size_words(results: SmoothingResults) -> str:
+    """Return a sentence on residuals of another size than the model leaves; "" for none."""
+    known = known_parts(results, "whiteness", "expected").values()
+    ratios = [v["rms_sigmas"] / v["expected_rms_sigmas"] for v in known]
+    if max(ratios, default=1.0) > _LARGER:
+        return (
+            f"The pixels' residuals are {number(max(ratios), 2)} times what the model leaves: more "
+            "noise or faster motion than it states. Standard deviations of a frame may be too "
+            "small by as much."
+        )
+    if min(ratios, default=1.0) < _SMALLER:
+        return (
+            f"The pixels' residuals are {number(min(ratios), 2)} of what the model leaves: pixels "
+            "scatter less from frame to frame than stated. Standard deviations of a frame may be "
+            "too large."
+        )
+    return ""
 
 
 def _axis_name(results: SmoothingResults, axis: int) -> str:
@@ -366,7 +387,7 @@ def model_rows(results: SmoothingResults) -> list[tuple[str, str]]:
 def model_words(results: SmoothingResults) -> str:
     """Return a sentence on the origin of the hyper-parameters."""
     source = str(results.part("model").get("name") or ABSENT)
-    return f"{source}: {_SOURCES[source]}" if source in _SOURCES else source
+    return _SOURCES.get(source, source)
 
 
 def _owner(name: str, value: str, cameras: Sequence[str]) -> str:
@@ -408,24 +429,13 @@ def whiteness_words(results: SmoothingResults) -> str:
     known = known_parts(results, "whiteness", "expected").values()
     if not known:
         return "Not judged: too few frames for it."
-    ratios = [v["rms_sigmas"] / v["expected_rms_sigmas"] for v in known]
-    out = []
-    if max(ratios) > _LARGER:
-        out.append(
-            f"Residuals are {number(max(ratios), 2)} times what this model leaves: more noise or "
-            "faster motion than it states. The standard deviations are too small."
-        )
-    elif min(ratios) < _SMALLER:
-        out.append(
-            f"Residuals are {number(min(ratios), 2)} of what this model leaves: pixels scatter "
-            "less from frame to frame than their stated standard deviations."
-        )
+    out = [words] if (words := _size_words(results)) else []
     if any(v.get("verdict") == "correlated" for v in known):
         out.append(
             "Residuals of consecutive frames are correlated in another way than a correct model "
             "leaves them. Causes may be motion that the model does not contain, centres that "
-            "wander with the bubbles' shapes, or pixel noise that is not as stated. The standard "
-            "deviations cannot be relied on."
+            "wander with the bubbles' shapes, or pixel noise that is not as stated. The errors of "
+            "neighbouring frames are then more alike than the covariance says."
         )
     return " ".join(out) or (
         "The size of the residuals and their correlation between consecutive frames agree with "

@@ -159,9 +159,9 @@ def key_numbers(results: TrackResults) -> list[Tile]:
         Tile("Ray miss", f"{number(median(np.abs(miss)), 2)} µm",
                f"median; {of_noise}RMS {number(rms(miss), 2)} µm"),
         Tile("Diameter", f"{number(median(size), 3)} mm", "median, sphere of equal volume"),
-        Tile("Ambiguous", share(ambiguous, len(tracks)),
-               f"{number(ambiguous)} bubbles that another grouping explains almost as well"),
-        Tile("Centre", _centres(results), "of volume, or the mean of the silhouettes"),
+        *([Tile("Ambiguous", share(ambiguous, len(tracks)),
+                f"{number(ambiguous)} bubbles that another grouping explains almost as well")]
+          if ambiguous else []),
     ]  # fmt: skip
 
 
@@ -169,13 +169,6 @@ def _normal_median(sd_mm: Array) -> float | None:
     """Median of |miss| in µm that this noise gives."""
     middle = median(sd_mm)
     return None if middle is None else 1e3 * NORMAL_MEDIAN * middle
-
-
-def _centres(results: TrackResults) -> str:
-    counts = Counter(word for word in results.tracks["centre"] if word)
-    whole = sum(counts.values())
-    ordered = counts.most_common(1)
-    return f"{share(ordered[0][1], whole)} {ordered[0][0]}" if ordered else ABSENT
 
 
 def word_counts(flags: Iterable[str]) -> Counter[str]:

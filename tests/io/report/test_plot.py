@@ -51,7 +51,7 @@ def frames(count: int = 200) -> pd.DataFrame:
 
 
 def test_a_path_rises_on_the_screen() -> None:
-    axes = telerig.plot.path(frames())
+    axes = telerig.plot.path(frames().drop(columns="d_eq_mm"))
     (line,) = axes.get_lines()
     _, _, height = line.get_data_3d()
     assert height[-1] > height[0] and np.allclose(height, -frames()["y_mm"])
@@ -68,6 +68,20 @@ def test_a_path_rises_on_the_screen() -> None:
     assert coloured.figure.axes[-1].get_ylabel() == "slip_mm_s"
     with pytest.raises(InputError, match="up is 'down'"):
         telerig.plot.path(frames(), up="down")
+
+
+def test_a_path_has_bubbles_of_their_size_that_leave_it_free() -> None:
+    wide = frames().assign(x_mm=lambda t: 60 * t["x_mm"])
+    axes = telerig.plot.path(wide)
+    (bodies,) = axes.collections
+    outlines = bodies._faces
+    centres = outlines.mean(1)
+    np.testing.assert_allclose(np.linalg.norm(outlines - centres[:, None], axis=2), 1.5)
+    assert 10 < len(centres) <= 121, "apart, and not too many"
+    slender = telerig.plot.path(frames())
+    assert "5 times as wide" in slender.get_title()
+    heights = slender.collections[0]._faces.mean(1)[:, 2]
+    assert np.diff(heights).min() > 5 * 3.0, "they would hide the path"
 
 
 def test_height_and_velocity_stand_beside_what_was_measured() -> None:

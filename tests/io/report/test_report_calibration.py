@@ -22,6 +22,7 @@ from telerig.io.report.calibration.report import page_of, write_calibration_repo
 from telerig.io.report.calibration.tables import held_everywhere, parameter_rows, worst_rows
 from telerig.io.report.page.figures import Figure
 from telerig.io.report.remake import ResultsFolder, remake_report
+from telerig.io.results.calibration_words import telecentricity_words
 from telerig.io.results.folders.calibration import read_results
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
@@ -62,8 +63,8 @@ def test_page_is_whole_small_and_loads_nothing(report: Path) -> None:
 
 def test_page_says_verdict_parameters_and_everything_else(report: Path) -> None:
     text = Page(report).text
-    assert text.index("USABLE, with warnings") < text.index("only 6 views & <few> dots")
-    assert text.index("only 6 views & <few> dots") < text.index("Cameras", 500)
+    assert text.index("USABLE, with warnings") < text.index("Only 6 views & <few> dots")
+    assert text.index("Only 6 views & <few> dots") < text.index("Cameras", 500)
     for name in PARAMETERS:
         assert (name in text) != name.startswith("wall_")  # no wall, no word of it
     for words in (
@@ -90,6 +91,26 @@ def test_every_figure_is_one_of_plot_with_a_caption(report: Path) -> None:
 def test_verdict_has_its_colour(folder: Path, status: str, colour: str) -> None:
     page = write_calibration_report(_edit(folder, verdict={"status": status, "reasons": []}))
     assert f'class="verdict {colour}"' in page.read_text(encoding="utf-8")
+    ids, usable = Page(page).ids, status == "GOOD"
+    assert (ids.index("parameters") < ids.index("residuals")) == usable
+    assert ("In space" in Page(page).text) == usable, "no number of what must not be used"
+
+
+@pytest.mark.parametrize(
+    ("change_per_mm", "sd_per_mm", "said"),
+    [
+        (1e-6, 1e-6, "camera left is telecentric: "),
+        (5e-5, 6e-5, "camera left is telecentric as far as these views can show it: "),
+        (5e-5, 1e-5, "camera left is not quite telecentric: "),
+    ],
+)
+def test_a_scale_that_may_not_change_is_not_said_to(
+    change_per_mm: float, sd_per_mm: float, said: str
+) -> None:
+    lens = {"change_per_mm": change_per_mm, "sd_per_mm": sd_per_mm, "depth_mm": 40.0,
+            "perspective": 1e-3}  # fmt: skip
+    (words,) = telecentricity_words({"telecentricity": {"left": lens}})
+    assert words.startswith(said)
 
 
 def test_one_camera_and_nothing_optional(tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def test_page_says_what_the_files_say(whole: Path) -> None:
         "Camera right looks along x", "bubbles 2 400 12 0.5 % 0.933 0.908",
         "arm_left bias x, mm/s² 223.80 ± 0.60", "arm_left delay, ms 1.020 ± 0.031",
         "encoder scale 1.01010 ± 0.00010", "0.0 ± 5.7 -281.0 ± 5.4 -1.4 ± 5.7",
-        "multiplied by 0.945", "default: default frequencies", "broad bands[0]: camera left",
-        "broad bands[0]: low, Hz 22.98",
+        "multiplied by 0.945", "Hyper-parameters: default frequencies",
+        "broad bands[0]: camera left", "broad bands[0]: low, Hz 22.98",
         "The tracking beneath", "2 tracks",
     ):  # fmt: skip
         assert words in text, words
@@ -85,7 +85,8 @@ def test_without_smoothing_the_page_is_of_the_tracking_alone(folder: Path) -> No
     (folder / "trajectories.csv").write_text("rubbish")
     page = Page(write_track_report(folder))
     assert page.ids == ["verdict", "key", *LAST[1:]]
-    assert "smooth" not in page.spaced.lower() and "report of a tracked run" in page.spaced
+    assert "Smoothed" not in page.spaced and "report of a tracked run" in page.spaced
+    assert "Next: telerig smooth" in page.spaced
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,10 @@ new": log P_D / (1 - P_D) + log N(innovation) - log(density of new ones) + log r
 It is the same for points that several cameras see, for what one camera alone sees (a point whose
 depth is unknown), and for predictions from smoothed tracks.
 
+The shift of a frame, which all bubbles share, is expected to be as large as those of the last
+frames or as the settings say. If tracks are left without a measurement and the pairings are clearly
+more probable with an unusually large shift, the rig has moved so far in this frame.
+
 Confirmed tracks that compete for what several cameras see are in conflict: hypotheses say how all
 of them continue, each with its log weight relative to the best. Those with the same recent pairings
 are merged (weights added, the better past kept), improbable ones dropped. A track on which all
@@ -49,6 +53,9 @@ _SHIFT_ROUNDS = 5
 
 _JOINTLY_SCORED = 10
 """For each hypothesis that is kept, so many ways to continue are scored with the common shift."""
+
+_JUMP_SHARE = 1e-3
+"""Share of frames in which the rig moves farther than shake and stage usually do."""
 
 _CERTAIN = 1e12
 """Score of a pairing by an id that came with the data."""
@@ -112,30 +119,25 @@ def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
     return out
 
 
-def assigned_with_shift(
-    pairs: Evidence, rows: int, best_rows: Bools, common: Common
-) -> tuple[Common, Ints]:
-    """Return the common shift and the assignment (rows,), estimated in turn.
-
-    best_rows : (rows,) which tracks take part.
-    """
+def picked_with_shift(pairs: Evidence, rows: int, common: Common) -> Evidence:
+    """Return the best assignment of so many rows; the common shift is estimated with it in turn."""
     now, chosen = common, np.full(rows, -1)
-    usable = np.flatnonzero(best_rows[pairs.row])
+    picked = pairs.take(slice(0))
     for turn in range(_SHIFT_ROUNDS):
-        score = pairs.scores(now.shift_mm)[usable]
+        score = pairs.scores(now.shift_mm)
         if turn == 0:
             # before the shift is known its covariance belongs to the distance
-            left = pairs.innovation_mm[usable] - now.shift_mm
-            total = np.linalg.inv(pairs.covariance_mm2[usable] + now.covariance_mm2)
+            left = pairs.innovation_mm - now.shift_mm
+            total = np.linalg.inv(pairs.covariance_mm2 + now.covariance_mm2)
             wide = np.einsum("ei,eij,ej->e", left, total, left) / 2
-            score = score + pairs.distance2(now.shift_mm)[usable] / 2 - wide
-        found = best_assignment(rows, pairs.row[usable], pairs.column[usable], score)
+            score = score + pairs.distance2(now.shift_mm) / 2 - wide
+        found = best_assignment(rows, pairs.row, pairs.column, score)
         if turn and np.array_equal(found, chosen):
             break
         chosen = found
-        picked = usable[chosen[pairs.row[usable]] == pairs.column[usable]]
-        now = common.informed(pairs.innovation_mm[picked], pairs.covariance_mm2[picked])
-    return now, chosen
+        picked = pairs.take(chosen[pairs.row] == pairs.column)
+        now = common.informed(picked.innovation_mm, picked.covariance_mm2)
+    return picked
 
 
 def clear_assignment(
@@ -303,20 +305,55 @@ class Advanced:
 
 @dataclass(frozen=True)
 class _Pairings:
-    """Hold the possible pairings of confirmed tracks with what several cameras see in one frame.
+    """Hold the possible pairings of tracks with the measurements of one frame.
 
+    pairs : of confirmed tracks with what several cameras see. weak : all others.
     owner : (K,) for each state the conflict of its track, or a number of its own.
     picked : the best pairings, by which the common shift is known. prior : what it was before.
-    gain : (12, 3) mean Kalman gain of the bubbles that are measured.
     """
 
     states: States
     scan: Scan
     pairs: Evidence
+    weak: Evidence
     owner: Ints
     picked: Evidence
     prior: Common
-    gain: Array
+
+    @staticmethod
+    def of(states: States, scan: Scan, owner: Ints, best: Bools, common: Common) -> _Pairings:
+        """best : (K,) which states are those of the best hypotheses."""
+        measured, confirmed = scan.measured, states.track > NO_PARTICLE
+        ids = np.where(states.given, states.track, NO_PARTICLE)
+        allowed = ids[:, None] == measured.particle
+        allowed &= confirmed[:, None] | ~measured.alone
+        misses = scan.frame - states.seen_frame - 1
+        pairs = gated_pairs(expected(states), measured, allowed, common, scan.settings, misses)
+        sure = confirmed[pairs.row] & ~measured.alone[pairs.column]
+        firm, weak = pairs.take(sure), pairs.take(~sure)
+        for some in (firm, weak.take(~measured.alone[weak.column])):
+            picked = picked_with_shift(some.take(best[some.row]), len(states), common)
+            if len(picked.row):
+                break
+        return _Pairings(states, scan, firm, weak, owner, picked, common)
+
+    @property
+    def now(self) -> Common:
+        """The shift of this frame that all bubbles share."""
+        return self.outside(())
+
+    @property
+    def score(self) -> float:
+        """Log-likelihood ratio of the best pairings, over all shifts."""
+        return float(joint_scores(self.picked, [range(len(self.picked.row))], self.prior)[0])
+
+    @property
+    def gain(self) -> Array:
+        """Mean Kalman gain (12, 3) of the bubbles that are measured."""
+        if not len(self.picked.row):
+            return np.zeros((STATES, 3))
+        own = self.states.p[self.picked.row][:, :, POSITION] @ self.picked.information
+        return np.asarray(own.mean(0))
 
     def near(self) -> Evidence:
         """Return those inside the gate when the shift is estimated from other tracks alone."""
@@ -439,21 +476,12 @@ def advance(states: States, conflicts: Sequence[Conflict], scan: Scan, common: C
     for c, conflict in enumerate(conflicts):
         owner[conflict.rows], best[conflict.rows[1:]] = c, False
     confirmed, single = states.track > NO_PARTICLE, owner >= len(conflicts)
-    ids = np.where(states.given, states.track, NO_PARTICLE)
-    misses = scan.frame - states.seen_frame - 1
-    allowed = ids[:, None] == measured.particle
-    allowed &= confirmed[:, None] | ~measured.alone
-    pairs = gated_pairs(expected(states), measured, allowed, common, settings, misses)
-    sure = confirmed[pairs.row] & ~measured.alone[pairs.column]
-    firm, weak = pairs.take(sure), pairs.take(~sure)
-    gain, now = np.zeros((STATES, 3)), common
-    for some in (firm, weak.take(~measured.alone[weak.column])):
-        now, chosen = assigned_with_shift(some, many, best, common)
-        picked = some.take(best[some.row] & (chosen[some.row] == some.column))
-        if len(picked.row):
-            gain = (states.p[picked.row][:, :, POSITION] @ picked.information).mean(0)
-            break
-    found = _Pairings(states, scan, firm, owner, picked, common, gain)
+    found = _Pairings.of(states, scan, owner, best, common)
+    if len(found.picked.row) < min((best & confirmed).sum(), (~measured.alone).sum()):
+        jump = _Pairings.of(states, scan, owner, best, common.jumped(settings))
+        least = found.score + settings.margin_log_ratio - np.log(_JUMP_SHARE)
+        found = jump if jump.score > least else found
+    now, weak, gain = found.now, found.weak, found.gain
     near = found.near()
     columns = np.full(many, -1)
     rival = ~single[near.row] | (np.bincount(near.row, minlength=many)[near.row] > 1)

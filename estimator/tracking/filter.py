@@ -471,6 +471,13 @@ class States(Rows):
         )  # fmt: skip
 
 
+_JUMP = 10.0
+"""Standard deviation of an unusual movement of the rig in a frame, over that of the shake."""
+
+_SHAKE_GAIN = 0.25
+"""Weight of a new shift in the running mean of the shake's variance."""
+
+
 @dataclass(frozen=True)
 class Common:
     """Hold the error that all bubbles of a frame have in common.
@@ -478,10 +485,14 @@ class Common:
     shift : (12,) estimate of the common shift of this frame's states; it is not yet added to the
         tracks.
     covariance : (12, 12) covariance of the shift.
+    usual_mm2 : mean square that shake and stage are expected to move the bubbles in this frame.
+    excess : what it was in the last frames, over that; at least 1.
     """
 
     shift: Array = field(default_factory=lambda: np.zeros(STATES))
     covariance: Array = field(default_factory=lambda: np.zeros((STATES, STATES)))
+    usual_mm2: float = np.inf
+    excess: float = 1.0
 
     @property
     def shift_mm(self) -> Array:
@@ -495,10 +506,18 @@ class Common:
         """Return the error that all tracks share in the next frame, before its measurements.
 
         Its mean is 0, because the last estimate has been added to the tracks' states. Its
-        covariance has grown by the noise of the transition.
+        covariance has grown by the noise of the transition, which is larger in a run that shakes
+        more than the settings say.
         """
-        grown = step.matrix @ self.covariance @ step.matrix.T + step.common_noise
-        return Common(np.zeros(STATES), grown)
+        grown = step.matrix @ self.covariance @ step.matrix.T + self.excess * step.common_noise
+        usual = float(np.trace(step.common_noise[POSITION, POSITION]))
+        return Common(np.zeros(STATES), grown, usual, self.excess)
+
+    def jumped(self, settings: TrackerSettings) -> Common:
+        """Return the common error in a frame in which the rig has moved unusually far."""
+        covariance = self.covariance.copy()
+        covariance[POSITION, POSITION] += (_JUMP * settings.shake_sd_mm) ** 2 * np.eye(3)
+        return replace(self, covariance=covariance)
 
     def informed(self, innovations: Array, covariances: Array) -> Common:
         """Return the common error after it has been estimated from E bubbles.
@@ -513,7 +532,8 @@ class Common:
         total = information.sum(0)
         gain = self.covariance[:, POSITION] @ np.linalg.inv(np.eye(3) + total @ self.covariance_mm2)
         lost = gain @ total @ self.covariance[POSITION]
-        return Common(self.shift + gain @ score, self.covariance - (lost + lost.T) / 2)
+        covariance = self.covariance - (lost + lost.T) / 2
+        return replace(self, shift=self.shift + gain @ score, covariance=covariance)
 
     def applied(self, mean_gain: Array) -> Common:
         """Return the error that remains after the tracks have taken over the shift and their
@@ -523,4 +543,7 @@ class Common:
         """
         keep = np.eye(STATES)
         keep[:, POSITION] -= mean_gain
-        return Common(np.zeros(STATES), keep @ self.covariance @ keep.T)
+        # nothing moves the rig where the settings say so
+        moved = float(self.shift_mm @ self.shift_mm) / (self.usual_mm2 or np.inf)
+        excess = max(1.0, self.excess + _SHAKE_GAIN * (moved - self.excess))
+        return Common(np.zeros(STATES), keep @ self.covariance @ keep.T, excess=excess)

@@ -198,7 +198,7 @@ class Tracker:
             return expected(tracks)
         step, control, found = self._motion(replace(self.stage), t_s, position_mm)
         both = replace(tracks, p=tracks.p + self.common.covariance).predicted(step, found, control)
-        noise = step.common_noise[POSITION, POSITION]
+        noise = self.common.excess * step.common_noise[POSITION, POSITION]
         return replace(expected(both), covariance_mm2=both.p[:, POSITION, POSITION] + noise)
 
     def update(

@@ -30,6 +30,18 @@ def test_common_shake_of_a_whole_distance_does_not_swap_neighbours() -> None:
     assert set(ids[5].tolist()) == {0, 1} and "break" not in kinds(events)
 
 
+@pytest.mark.parametrize("count", [2, 5])
+def test_a_shake_far_beyond_the_settings_breaks_no_track(count: int) -> None:
+    """2 mm at 31 Hz: up to 1.2 mm from frame to frame at 333 Hz, where 0.2 mm are expected."""
+    rng = np.random.default_rng(3)
+    shake = 2.0 * np.sin(2 * np.pi * 31 * np.arange(120) / 333)
+    bubbles = rng.uniform(-15, 15, (count, 3))
+    frames = [bubbles + [s, 0.3 * s, 0.0] + rng.normal(0, 0.01, (count, 3)) for s in shake]
+    ids, events = run(Tracker(settings=STILL), frames, hz=333.0)
+    assert [i.tolist() for i in ids[5:]] == [list(range(count))] * 115
+    assert kinds(events) == ["birth"] * count
+
+
 def passing(offset_mm: float, rng: np.random.Generator) -> list[Array]:
     """Two bubbles on straight lines, 100 mm/s towards each other, ``offset_mm`` apart at best."""
     t = (np.arange(60) - 30) / 500

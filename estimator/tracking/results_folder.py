@@ -254,7 +254,7 @@ def _drawn(tables: Iterable[pd.DataFrame], frames: Sequence[int]) -> pd.DataFram
 
 
 def _draw(run: RunData, staged: Path, task: tuple[str, int, pd.DataFrame, pd.DataFrame]) -> None:
-    from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
+    from telerig.io.report.overlays import draw_bubble_overlay
 
     camera, frame, found, rejected = task
     image = run.image(camera, frame)
@@ -268,9 +268,6 @@ def _draw(run: RunData, staged: Path, task: tuple[str, int, pd.DataFrame, pd.Dat
     marks = [*rejected[[*Rejected._fields]].itertuples(index=False)]
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks)
     _write_image(staged / "overlays" / camera / f"{frame:06d}.jpg", picture[..., ::-1])
-    _write_image(
-        staged / "binary" / camera / f"{frame:06d}.png", draw_binary(image.shape, outlines)
-    )
 
 
 def _write_image(path: Path, picture: Any) -> None:

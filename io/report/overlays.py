@@ -128,22 +128,6 @@ def draw_bubble_overlay(
                     max_width_px, _LEAST_CONTRAST)  # fmt: skip
 
 
-def draw_binary(
-    shape: tuple[int, int], outlines: Sequence[Array], max_width_px: int = 900
-) -> Picture:
-    """Return (h, w), 255 where a pixel's middle is in an outline (N, 2) of an (H, W) image."""
-    from skimage.draw import polygon
-
-    factor = min(1.0, max_width_px / shape[1])
-    height, width = (max(1, round(n * factor)) for n in shape[:2])
-    picture = np.zeros((height, width), np.uint8)
-    for outline in outlines:
-        points = _scaled(outline, factor)
-        if len(points) > 2:
-            picture[polygon(points[:, 1], points[:, 0], (height, width))] = 255
-    return picture
-
-
 def _overlay(
     image: NDArray[Any],
     outlines: Sequence[Array],

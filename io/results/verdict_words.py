@@ -87,6 +87,10 @@ FLAG_WORDS: dict[str, str] = {
         "one or two bubbles alone show that. What is taken for this motion may be the bubble's."
     ),
 }
+UNKNOWN_FLAG = (
+    "A condition that this version does not know: another version of telerig wrote it. Smooth the "
+    "run again for today's verdict."
+)
 
 REMEDY_WORDS = {
     Remedy.STRIP: "fix a strip of dots to the tank inside both views",

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
+from telerig.io.report.overlays import draw_bubble_overlay
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.triangulation import triangulate
@@ -147,19 +147,17 @@ def _pictures(folder: Path, rng: np.random.Generator, detections: pd.DataFrame) 
             here = detections[(detections["frame"] == frame) & (detections["camera"] == camera)]
             here = here[here["u_px"].notna()]
             rings = [outline(u, v, 24, 0.04) for u, v in here[["u_px", "v_px"]].to_numpy()]
-            inside = draw_binary((SIZE_PX[1], SIZE_PX[0]), rings) > 0
-            image = np.where(inside, 60.0, 200.0) + 3 * rng.standard_normal(inside.shape)
+            inside = np.zeros((SIZE_PX[1], SIZE_PX[0]), np.uint8)
+            cv2.fillPoly(inside, [np.rint(ring).astype(np.int32) for ring in rings], 1)
+            image = np.where(inside > 0, 60.0, 200.0) + 3 * rng.standard_normal(inside.shape)
             image = cv2.GaussianBlur(image, (0, 0), 1.2).clip(0, 255).astype(np.uint8)
             labels = ["" if pd.isna(p) else str(p) for p in here["particle"]]
             colours = [(40, 200, 70) if label else (240, 160, 30) for label in labels]
             dust = [(60.0, 90.0, 5.0, "smaller than 8 px"), (300.0, 700.0, 6.0, "no contrast")]
             picture = draw_bubble_overlay(image, rings, labels, colours, rejected=dust)
-            for kind, suffix, pixels in (
-                ("overlays", "jpg", picture[..., ::-1]),
-                ("binary", "png", draw_binary(image.shape, rings)),
-            ):
-                (folder / kind / camera).mkdir(parents=True, exist_ok=True)
-                assert cv2.imwrite(str(folder / kind / camera / f"{frame:06d}.{suffix}"), pixels)
+            file = folder / "overlays" / camera / f"{frame:06d}.jpg"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(file), picture[..., ::-1])
 
 
 def write_folder(

@@ -23,6 +23,7 @@ from telerig.io.results.smoothing import Flag, Grade, Mode, Verdict
 from telerig.io.results.verdict_words import (
     FLAG_WORDS,
     NOT_JUDGED,
+    UNKNOWN_FLAG,
     VERDICT_WORDS,
     consequence_words,
     mode_remedy,
@@ -78,10 +79,7 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVe
     in_words = file.words and not of_axes  # files from before hold the remedy in their words
     if file.verdict in (Verdict.PARTIAL, Verdict.UNRESOLVED) and not in_words:
         sentences.append(to_resolve(remedy_words(file.remedies) or file.remedy))
-    flags = {
-        flag: f"{flag}: {FLAG_WORDS.get(flag, flag.replace('_', ' ').lower())}"
-        for flag in file.flags
-    }
+    flags = {flag: f"{flag}: {FLAG_WORDS.get(flag, UNKNOWN_FLAG)}" for flag in file.flags}
     sentences += [text for flag, text in flags.items() if flag in _HARMLESS]
     warnings = [text for flag, text in flags.items() if flag not in _HARMLESS]
     warnings += [sentence(w) for w in file.warnings]

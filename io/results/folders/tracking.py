@@ -43,7 +43,7 @@ class TrackResults:
     tracks, detections, events, references : the tables; rows of detections.csv that only say why a
         frame has no bubble are left out (tracking.json counts them).
     up : (3,) unit vector in the rig frame.
-    pictures : (camera or "camera, binary", frame as six digits) -> file.
+    pictures : (camera, frame as six digits) -> file.
     absent : what optional files are missing, in words.
     """
 
@@ -96,7 +96,7 @@ def read_track_results(folder: Path) -> TrackResults:
     """Read a tracked run's results folder.
 
     tracking.json and tracks.csv are needed; detections.csv, events.csv, references.csv, run.json,
-    overlays/<camera>/<frame>.jpg and binary/<camera>/<frame>.png are used when they are there.
+    overlays/<camera>/<frame>.jpg are used when they are there.
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
     with reading(folder, _FILES):
@@ -126,17 +126,15 @@ def _read_track_results(folder: Path) -> TrackResults:
     )
     run = RunFile.read_if_there(folder / "run.json").content()
     pictures = {
-        (column, picture.stem): picture
+        (camera, picture.stem): picture
         for camera in cameras
-        for column, kind in ((camera, "overlays"), (binary_column(camera), "binary"))
-        for picture in sorted((folder / kind / camera).glob("*.*"))
-        if picture.suffix in (".jpg", ".png")
+        for picture in sorted((folder / "overlays" / camera).glob("*.jpg"))
     }
     absent = {
         "detections.csv (no numbers on single images)": (folder / "detections.csv").is_file(),
         "events.csv (no history of births, gaps and ends)": (folder / "events.csv").is_file(),
         "run.json (no versions, no hashes of what went in)": bool(run),
-        "overlays/ and binary/ (no pictures of the bubbles that were found)": bool(pictures),
+        "overlays/ (no pictures of the bubbles that were found)": bool(pictures),
     }
     return TrackResults(
         file=stated,
@@ -155,11 +153,6 @@ def _read_track_results(folder: Path) -> TrackResults:
 def unit_vector(vector: ArrayLike) -> Array:
     found = np.asarray(vector, float)
     return np.asarray(found / np.linalg.norm(found))
-
-
-def binary_column(camera: str) -> str:
-    """Return the name of the contact sheet's column with a camera's binary pictures."""
-    return f"{camera}, binary"
 
 
 _MOST_ROWS = 20_000

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.bubbles.outline.ellipse_geometry import outline_points
 from telerig.estimator.calibration.result.calibration import (
     Calibration,
     calibration_from_cameras,
@@ -214,15 +215,15 @@ def test_pictures_show_what_the_tables_say(
     monkeypatch.setattr(detect_run, "_detect", elsewhere)
     tracked(rise, tmp_path / "out")
     table = pd.read_csv(tmp_path / "out" / "detections.csv", dtype={"camera": str})
-    pictures = sorted((tmp_path / "out" / "binary").glob("*/*.png"))
+    pictures = sorted((tmp_path / "out" / "overlays").glob("*/*.jpg"))
     assert len(pictures) == 2 * 3  # of the first, a middle and the last frame
     for path in pictures:
         camera = path.parent.name
         row = table[(table["camera"] == camera) & (table["frame"] == int(path.stem))].iloc[0]
-        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        v, u = np.argwhere(picture).mean(0)
-        assert (u, v) == pytest.approx((row["u_px"], row["v_px"]), abs=0.3)
-        overlay = cv2.imread(str(tmp_path / "out" / "overlays" / camera / f"{path.stem}.jpg"))
+        overlay = cv2.imread(str(path))
+        u, v = np.rint(outline_points(row, 40)).astype(int).T
+        line, beside = (np.ptp(overlay[w, u].astype(int), axis=1) > 30 for w in (v, v - 25))
+        assert line.mean() > 0.9 and beside.mean() < 0.4
         colour = np.ptp(overlay[36:45, 20:81].astype(int), axis=2)
         assert colour[:, :21].max() > 60 and colour[:, 40:].max() < 30
 

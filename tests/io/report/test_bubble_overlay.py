@@ -1,4 +1,4 @@
-"""Outlines drawn over images, and as binary pictures."""
+"""Outlines drawn over images."""
 
 from __future__ import annotations
 
@@ -7,20 +7,7 @@ import pytest
 from tracked_folder import outline
 
 from telerig.errors import InputError
-from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
-
-
-def test_binary_picture_has_the_outlines_area_and_place() -> None:
-    ring = outline(33.3, 20.8, 12.0)
-    picture = draw_binary((60, 80), [ring, np.full((5, 2), np.nan)])
-    assert picture.shape == (60, 80) and set(np.unique(picture)) == {0, 255}
-    v, u = np.nonzero(picture)
-    assert len(u) == pytest.approx(np.pi * 12**2, rel=0.01)
-    assert (u.mean(), v.mean()) == (pytest.approx(33.3, abs=0.05), pytest.approx(20.8, abs=0.05))
-    cut = draw_binary((60, 80), [outline(0, 0, 12.0)], max_width_px=40)
-    assert cut.shape == (30, 40) and np.count_nonzero(cut) == pytest.approx(
-        np.pi * 6**2 / 4 + 6, rel=0.15
-    )
+from telerig.io.report.overlays import draw_bubble_overlay
 
 
 def test_overlay_draws_each_outline_where_it_is() -> None:

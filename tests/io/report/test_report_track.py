@@ -40,7 +40,7 @@ SECTIONS = [
     "more",
     "origin",
 ]
-OPTIONAL = ("detections.csv", "events.csv", "run.json", "overlays", "binary")
+OPTIONAL = ("detections.csv", "events.csv", "run.json", "overlays")
 _edit = partial(edit, "tracking.json")
 
 
@@ -158,7 +158,7 @@ def test_nothing_optional(folder: Path) -> None:
     text = Page(write_track_report(folder)).text
     for words in (
         "events.csv (no history", "detections.csv (no numbers", "run.json (no versions",
-        "overlays/ and binary/ (no pictures",
+        "overlays/ (no pictures",
         "How many bubbles the single images held is not known",
     ):  # fmt: skip
         assert words in text, words

@@ -52,6 +52,7 @@ from telerig.io.files.atomic import plain
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.results.calibration_words import NO_COVARIANCE
+from telerig.io.results.cameras import CameraRecord, wall_records
 from telerig.io.tables.table import CALIBRATION_SHARE, EXTRAPOLATED, POINT
 from telerig.live import publish
 from telerig.progress import Progress as Steps
@@ -174,6 +175,7 @@ class TrackingStream:
                 todo="look at the images; bubbles must be darker than the screen, and wider than "
                 "--min-diameter",
             )
+        used = [c for c in self.calibration.cameras if c.name in run.cameras]
         change, known = self._pairs.found(), self.calibration.covariance_known
         # in a shorter time slow shake is no different from it
         misplaced = self.linking.misplaced if np.ptp(run.t_s) >= LEAST_SEEN_S else None
@@ -184,6 +186,8 @@ class TrackingStream:
             "pixel_origin": "centre",
             "frame_of_reference": "rig frame (the first camera's), mm",
             "image_size_px": dict(run.image_sizes_px),
+            "cameras": {c.name: CameraRecord.of_camera(c).content() for c in used},
+            "walls": wall_records(used),
             "frames": run.frame_count,
             "detections": self.detections,
             "points": self.points,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from telerig.arrays import Array
+from telerig.io.results.cameras import CameraRecord, rig_cameras
 from telerig.io.results.record import Name, Part, Record, Vector3
+from telerig.rig.camera import Camera
 
 
 class WorstFrame(Part):
@@ -70,6 +72,8 @@ class TrackingFile(Record):
     """Hold the content of tracking.json, the result of tracking a run.
 
     frames, detections, points, tracks : their numbers; None where they were not counted.
+    cameras, walls : the calibrated cameras and refractive windows that the run was tracked with, by
+        name; empty in older files.
     events : number of events of each kind.
     pairs : statistics of the ray miss, or None.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
@@ -89,6 +93,8 @@ class TrackingFile(Record):
     pixel_origin: str = "centre"
     frame_of_reference: str = ""
     image_size_px: dict[Name, tuple[int, int] | None] = Field(default_factory=dict)
+    cameras: dict[Name, CameraRecord] = Field(default_factory=dict)
+    walls: dict[str, dict[str, Any]] = Field(default_factory=dict)
     frames: int | None = None
     detections: int | None = None
     points: int | None = None
@@ -107,6 +113,15 @@ class TrackingFile(Record):
     up: Vector3 | None = None
     extrapolated: float | None = None
     calibration_sd_mm: Vector3 | None = None
+
+    @model_validator(mode="after")
+    def _parameters_are_known(self) -> Self:
+        self.rig_cameras()
+        return self
+
+    def rig_cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras that the run was tracked with; none for an older file."""
+        return rig_cameras(self.cameras, self.walls)
 
 
 def share_words(sd_mm: Sequence[float] | Array | None, extrapolated: float | None) -> list[str]:

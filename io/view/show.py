@@ -18,7 +18,7 @@ from telerig.io.files.atomic import atomic_path
 from telerig.io.report.film.views import read_outlines
 from telerig.io.results.folders.calibration import read_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
-from telerig.io.results.folders.tracking import TrackResults, read_track_results, run_cameras
+from telerig.io.results.folders.tracking import TrackResults, read_track_results
 from telerig.io.tables.calibration import REJECTED
 from telerig.io.view.calibration import log_calibration
 from telerig.io.view.names import calibration_layout, need_rerun, run_layout
@@ -112,7 +112,6 @@ def log_results(
         )  # fmt: skip
     tracks = read_track_results(place)
     smoothing = read_smoothing_results(place, tracks.up)
-    cameras, _ = run_cameras(place, tracks)
     data = _recording_of(place, recording, tracks)
     image, count = _frames_of(data, tracks)
     every = range(count)[slice(*frames)] if frames else range(count)
@@ -125,7 +124,7 @@ def log_results(
     if data is not None and data.accelerometers is not None:
         plots.append("accelerometers_m_s2")
     stream.send_blueprint(run_layout(tracks.cameras, plots, spectra=smoothing is not None))
-    log_run(stream, tracks, smoothing, cameras or (), found, image, list(shown))
+    log_run(stream, tracks, smoothing, tracks.rig, found, image, list(shown))
     if data is not None:
         log_sensors(stream, data, smoothing)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.io.report.overlays import draw_bubble_overlay
+from telerig.io.results.cameras import CameraRecord
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.triangulation import triangulate
@@ -128,6 +129,7 @@ def _content(tracks: pd.DataFrame, detections: pd.DataFrame, bias_px: float) -> 
                   "rms_px": [abs(bias_px) + 0.07, 0.07, 0.07, 0.072],
                   "calibration_problem": bool(bias_px), "words": words},
         "image_size_px": {"left": list(SIZE_PX), "right": list(SIZE_PX)},
+        "cameras": {c.name: CameraRecord.of_camera(c).content() for c in two_cameras()},
         "shapes": {"third": 0.011, "fourth": 0.004}, "covariance": "of the measurement alone",
         "notes": ["frames.csv has <no> times"],
         "worst_frames": [{"frame": WORST[0], "score": 4.0, "why": "3 bubbles without a partner"},

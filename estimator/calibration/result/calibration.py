@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray
 
-    from telerig.io.results.calibration import CalibrationFile, CameraRecord
+    from telerig.io.results.calibration import CalibrationFile
     from telerig.io.results.findings import Finding
 
 _AT_ONCE = 8192
@@ -545,7 +545,8 @@ class Calibration(ShortText):
 
     def record(self) -> CalibrationFile:
         """Return the content of `calibration.json`; no file is written."""
-        from telerig.io.results.calibration import CalibrationFile, PoseRecord
+        from telerig.io.results.calibration import CalibrationFile
+        from telerig.io.results.cameras import CameraRecord, PoseRecord, wall_records
 
         content = {
             "schema": CalibrationFile.SCHEMA,
@@ -557,8 +558,11 @@ class Calibration(ShortText):
             "medium": self.medium,
             "verdict": self.verdict,
             "findings": self.findings,
-            "cameras": {c.name: self._camera_record(c, f) for c, f in zip(self.cameras, self.free)},
-            "walls": {c.name: c.wall.as_dict() for c in self.cameras if c.wall is not None},
+            "cameras": {
+                c.name: CameraRecord.of_camera(c, {n: self.sd(f"{c.name}.{n}") for n in free})
+                for c, free in zip(self.cameras, self.free)
+            },
+            "walls": wall_records(self.cameras),
             "target": {"dots": self.dot_ids, "points_mm": self.target_points_mm},
             "views": {view: PoseRecord.of_pose(pose) for view, pose in self.target_poses.items()},
             "covariance": {"names": self.covariance_names, "matrix": self.covariance},
@@ -569,19 +573,6 @@ class Calibration(ShortText):
             "diagnostics": plain(dict(self.diagnostics)),
         }
         return CalibrationFile.model_validate(content)
-
-    def _camera_record(self, camera: Camera, free: tuple[str, ...]) -> CameraRecord:
-        from telerig.io.results.calibration import CameraRecord, PoseRecord
-
-        deviations = {n: self.sd(f"{camera.name}.{n}") for n in free}
-        return CameraRecord(
-            image_size_px=camera.image_size_px,
-            rho_mm=camera.rho_mm,
-            parameters={p: camera[p] for p in PARAMETERS},
-            free=free,
-            standard_deviations={n: s if np.isfinite(s) else None for n, s in deviations.items()},
-            camera_from_rig=PoseRecord.of_pose(camera.camera_from_rig),
-        )
 
     def save(self, path: str | Path) -> None:
         """Write `calibration.json`, `covariance.npz`, `dots.csv` and `residuals.csv` into a folder.

@@ -11,7 +11,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.io.report.page.page import Row, Tile, link_to
-from telerig.io.results.calibration import CameraRecord
+from telerig.io.results.cameras import CameraRecord
 from telerig.io.results.findings import Status
 from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.rig import projection

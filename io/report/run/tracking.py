@@ -87,7 +87,7 @@ def _miss_words(results: TrackResults) -> str:
             f"The rays of a bubble miss its point by {number(typical, 2)} µm (median of the RMS), "
         )
     if ratio is None:
-        return text + "there are too few points to say what that should be."
+        return text + "what that should be is not known."
     text += f"{number(ratio, 2)} times what the outlines' noise predicts."
     whole = ray_miss_ratio(results, _with_learnt(results), centred=True)
     if ratio > _MISS_TOO_LARGE and whole is not None and whole < _MISS_TOO_LARGE:

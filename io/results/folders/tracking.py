@@ -1,7 +1,4 @@
-"""What a tracked run's results folder holds, read and checked, and what its tables add up to.
-
-The cameras that the run was tracked with come from the calibration beside it.
-"""
+"""What a tracked run's results folder holds, read and checked, and what its tables add up to."""
 
 from __future__ import annotations
 
@@ -17,14 +14,13 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Rows, header_of
-from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
 from telerig.io.results.tracking import Pairs, TrackingFile
 from telerig.io.tables.run import DETECTIONS, EVENTS, REFERENCES, TRACKS
-from telerig.io.tables.table import POINT, SILHOUETTES
+from telerig.io.tables.table import POINT
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import triangulate_views
+from telerig.rig.triangulation import stacked_jacobian
 from telerig.statistics import median
 
 _FILES = (
@@ -40,6 +36,7 @@ class TrackResults:
 
     file : tracking.json.
     cameras : names, in the rig's order.
+    rig : these cameras; empty for a folder of an older version, whose tracking.json has none.
     tracks, detections, events, references : the tables; rows of detections.csv that only say why a
         frame has no bubble are left out (tracking.json counts them).
     up : (3,) unit vector in the rig frame.
@@ -49,6 +46,7 @@ class TrackResults:
 
     file: TrackingFile
     cameras: tuple[str, ...]
+    rig: tuple[Camera, ...]
     tracks: pd.DataFrame
     detections: pd.DataFrame
     events: pd.DataFrame
@@ -139,6 +137,7 @@ def _read_track_results(folder: Path) -> TrackResults:
     return TrackResults(
         file=stated,
         cameras=cameras,
+        rig=_rig(stated, cameras, folder),
         tracks=TRACKS.read_known(file, cameras),
         detections=found[np.isfinite(found["u_px"])].reset_index(drop=True),
         events=tables[EVENTS.file],
@@ -150,14 +149,20 @@ def _read_track_results(folder: Path) -> TrackResults:
     )
 
 
+def _rig(stated: TrackingFile, names: tuple[str, ...], folder: Path) -> tuple[Camera, ...]:
+    """Return the cameras of tracks.csv."""
+    known = {camera.name: camera for camera in stated.rig_cameras()}
+    if known and not set(names) <= set(known):
+        what = f"its cameras are {list(known)}, those of tracks.csv {list(names)}"
+        raise InputError(what, where=str(folder / "tracking.json"), todo=TrackingFile.AGAIN)
+    return tuple(known[name] for name in names if known)
+
+
 def unit_vector(vector: ArrayLike) -> Array:
     found = np.asarray(vector, float)
     return np.asarray(found / np.linalg.norm(found))
 
 
-_MOST_ROWS = 20_000
-_LEAST_SPREAD_MM = 0.1
-_LEAST_ROWS = 12
 NORMAL_MEDIAN = 0.6745
 """Of the absolute value, in standard deviations."""
 
@@ -165,9 +170,7 @@ NORMAL_MEDIAN = 0.6745
 def ray_miss_sd_mm(results: TrackResults) -> Array | None:
     """(N,) sd of ``ray_miss_mm`` that the outlines' covariances predict; None if it is not known.
 
-    The cameras are not in the folder, but the points and their pixels are: an affine camera
-    fitted to them gives the rays' directions and what a pixel is worth along the common
-    perpendicular, to the lens's residual perspective. It takes points that fill some space.
+    The cameras' magnification and directions are those in the middle of the points.
     """
     worth = _mm_per_px(results)
     if worth is None:
@@ -204,10 +207,10 @@ def learnt_sd_mm(results: TrackResults) -> float | None:
 def _mm_per_px(results: TrackResults) -> Array | None:
     """Return by camera what one px of u and v moves a ray along the common perpendicular; of more
     than two cameras in any direction across the ray."""
-    maps = [_affine(results, camera) for camera in results.cameras]
-    known = [m for m in maps if m is not None]
-    if len(known) != len(maps) or len(known) < 2:
+    if len(results.rig) < 2 or not len(results.tracks):
         return None
+    middle = np.nanmedian(results.points_mm, axis=0)
+    known = stacked_jacobian(results.rig, middle[None])[1].reshape(-1, 2, 3)
     if len(known) > 2:
         scale = [float(np.linalg.det(m @ m.T)) ** 0.25 for m in known]
         return np.repeat(np.sqrt(0.5) / np.array(scale)[:, None], 2, axis=1)
@@ -217,20 +220,6 @@ def _mm_per_px(results: TrackResults) -> Array | None:
     if length < 1e-9:
         return None
     return np.array([np.linalg.lstsq(m.T, across / length, rcond=None)[0] for m in known])
-
-
-def _affine(results: TrackResults, camera: str) -> Array | None:
-    """Return an affine camera (2, 3) px per mm; None if the points do not determine it."""
-    uv = results.tracks[[f"{camera}_u_px", f"{camera}_v_px"]].to_numpy(float)
-    both = np.c_[results.points_mm, uv]
-    both = both[np.isfinite(both).all(axis=1)]
-    both = both[:: len(both) // _MOST_ROWS + 1]
-    if len(both) < _LEAST_ROWS:
-        return None
-    points, pixels = both[:, :3] - both[:, :3].mean(axis=0), both[:, 3:] - both[:, 3:].mean(axis=0)
-    if np.linalg.svd(points, compute_uv=False)[2] < _LEAST_SPREAD_MM * np.sqrt(len(both)):
-        return None
-    return np.asarray(np.linalg.lstsq(points, pixels, rcond=None)[0].T)
 
 
 def ray_miss_ratio(
@@ -275,63 +264,3 @@ def per_frame(results: TrackResults) -> dict[str, Ints]:
 def track_lengths(results: TrackResults) -> Ints:
     """Return the number of points (K,) of each track."""
     return np.asarray(results.tracks["particle"].value_counts().to_numpy(np.int64))
-
-
-_AGREE_MM, _NEAR_MM = 1e-4, 0.02
-
-
-def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, ...] | None, str]:
-    """Return the cameras, or None and the reason in words.
-
-    calibration.json is looked for in the run's results folder and in `calibration/` beside it.
-    It counts only if the rays of the pixels in tracks.csv meet where that table says, so another
-    calibration is not taken for the run's.
-    Raises InputError for a calibration.json that cannot be read.
-    """
-    places = (folder, folder.resolve().parent / "calibration")
-    file = next(
-        (p / "calibration.json" for p in places if (p / "calibration.json").is_file()), None
-    )
-    if file is None:
-        return None, "calibration.json is neither in this folder nor in calibration/ beside it"
-    with reading(file.parent, [file.name]):
-        stated = CalibrationFile.read(file)
-    known = {camera.name: camera for camera in stated.rig_cameras(windows=True)}
-    if len(results.cameras) < 2 or not set(results.cameras) <= set(known):
-        return None, f"calibration.json beside it has cameras {', '.join(known)}, not the run's"
-    cameras = tuple(known[name] for name in results.cameras)
-    return (cameras, "") if _agree(results, cameras) else (
-        None, "calibration.json beside it is not the one that the run was tracked with"
-    )  # fmt: skip
-
-
-def outline_pixels(results: TrackResults, rows: Ints) -> Array:
-    """Return the outlines' centres (N, C, 2) of rows, NaN where a camera does not see it."""
-    columns = [f"{c}_{x}_px" for c in results.cameras for x in "uv"]
-    pixels = results.tracks[columns].to_numpy(float)[rows]
-    return pixels.reshape(len(rows), len(results.cameras), 2)
-
-
-def paired_rows(results: TrackResults) -> Ints:
-    """Return the rows of tracks.csv that two cameras or more measured."""
-    good = np.isfinite(results.tracks["ray_miss_mm"].to_numpy(float))
-    seen = np.isfinite(outline_pixels(results, np.arange(len(good)))).all(-1).sum(1)
-    return np.flatnonzero(good & (seen >= 2))
-
-
-def _agree(results: TrackResults, cameras: tuple[Camera, ...]) -> bool:
-    """Return whether the rays' points, and of two cameras their distances, are in tracks.csv."""
-    rows = paired_rows(results)
-    if not len(rows):
-        return True
-    pixels = outline_pixels(results, rows)
-    found = triangulate_views(cameras, list(np.moveaxis(pixels, 1, 0)), 1.0, "midpoint")
-    stated = np.abs(results.tracks["ray_miss_mm"].to_numpy(float)[rows])
-    two = np.isfinite(pixels).all(-1).sum(1) == 2
-    miss = np.nansum(found.ray_miss_mm, axis=-1)
-    names = SILHOUETTES if set(SILHOUETTES) <= set(results.tracks) else POINT
-    place = results.tracks[list(names)].to_numpy(float)[rows]
-    away = np.linalg.norm(found.points_mm - place, axis=1)
-    if two.any() and np.median(np.abs(miss - stated)[two]) > _AGREE_MM:
-        return False
-    return bool(np.nanmedian(away) < _NEAR_MM + np.median(stated))

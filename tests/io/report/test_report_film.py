@@ -17,7 +17,6 @@ from filmed_run import (
 )
 
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.report.film import path as film_path
 from telerig.io.report.film.path import (
     FilmPath,
@@ -30,7 +29,7 @@ from telerig.io.report.film.path import (
     view_matrix,
     write_path_film,
 )
-from telerig.io.results.folders.tracking import read_track_results, run_cameras
+from telerig.io.results.folders.tracking import read_track_results
 
 BLUE = (31, 95, 168)
 
@@ -183,16 +182,3 @@ def test_no_track_no_film(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no bubble was followed"):
         write_path_film(folder, tmp_path / "a.mp4")
     assert not (tmp_path / "a.mp4").exists()
-
-
-def test_only_the_runs_own_calibration_counts(run: Path, tmp_path: Path) -> None:
-    cameras, why = run_cameras(run, read_track_results(run))
-    assert why == "" and cameras is not None and cameras[1].name == "right"
-    alone = write_run(tmp_path / "a" / "rise", calibration=False)
-    assert "neither in this folder" in run_cameras(alone, read_track_results(alone))[1]
-    calibration_from_cameras(list(two_cameras(1.4))).save(tmp_path / "a" / "calibration")
-    none, why = run_cameras(alone, read_track_results(alone))
-    assert none is None and "not the one that the run was tracked with" in why
-    (tmp_path / "a" / "calibration" / "calibration.json").write_text("{")
-    with pytest.raises(InputError, match="JSON"):
-        run_cameras(alone, read_track_results(alone))

@@ -104,6 +104,19 @@ def test_ray_miss_prediction_is_the_propagated_pixel_noise(results: TrackResults
     assert verdict(results).colour == "good" and not verdict(results).warnings
 
 
+def test_the_cameras_of_a_run_stand_in_its_folder(tmp_path: Path) -> None:
+    """A folder of an older version has none; those of another run are refused."""
+    folder = write_folder(tmp_path / "r", bubbles=3, frames=59, drawn=False)
+    cameras = json.loads((folder / "tracking.json").read_text())["cameras"]
+    old = read_track_results(_edit(folder, cameras={}))
+    assert old.rig == () and ray_miss_sd_mm(old) is None and verdict(old).colour == "good"
+    with pytest.raises(InputError, match=r"tracking\.json: its cameras are \['left'\]"):
+        read_track_results(_edit(folder, cameras={"left": cameras["left"]}))
+    turned = cameras["left"] | {"parameters": {"scale_px_per_mm": -1.0}}
+    with pytest.raises(InputError, match="must be positive"):
+        read_track_results(_edit(folder, cameras=cameras | {"left": turned}))
+
+
 def test_a_biased_calibration_is_named_first_and_seen_in_the_rays(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "r", bubbles=3, frames=59, bias_px=1.8, drawn=False)
     results = read_track_results(folder)

@@ -2,10 +2,10 @@
 
 Usage: python benchmarks/many_cameras.py [--only NAME ...] [--out FILE.md]
 
-Simulated swarms with rendered images (presets `three` and `four`, exact calibrations): bubbles are
-detected once, and the same detections are tracked by all cameras and by the pair whose lines of
-sight are nearest to a right angle. Both are scored by the bubbles that two cameras or more see
-whole.
+Simulated swarms with rendered images (presets `swarm_three` and `swarm_four`, exact calibrations):
+bubbles are detected once, and the same detections are tracked by all cameras and by the pair whose
+lines of sight are nearest to a right angle. Both are scored by the bubbles that two cameras or more
+see whole.
 """
 
 from __future__ import annotations
@@ -37,16 +37,20 @@ NEAR_PX, NEAR_SIGMAS = 3.0, 3.0
 """A row is that of a bubble if every pixel is nearer than this, or than so many of its standard
 deviations: of four outlines one may be hidden, and say so."""
 SCENES: dict[str, dict[str, Any]] = {
-    "three, 20 bubbles": {"preset": "three", "bubbles": 20, "frames": 12},
-    "three, 20 bubbles, no shake": {"preset": "three", "bubbles": 20, "frames": 12, "shake": 0.0},
-    "three, 60 bubbles": {"preset": "three", "bubbles": 60, "frames": 8},
-    "four, 20 bubbles": {"preset": "four", "bubbles": 20, "frames": 12},
-    "four, 20 bubbles, no shake": {"preset": "four", "bubbles": 20, "frames": 12, "shake": 0.0},
-    "four, 60 bubbles": {"preset": "four", "bubbles": 60, "frames": 8},
+    "three, 20 bubbles": {"preset": "swarm_three", "bubbles": 20, "frames": 12},
+    "three, 20 bubbles, no shake": {
+        "preset": "swarm_three", "bubbles": 20, "frames": 12, "shake": 0.0
+    },
+    "three, 60 bubbles": {"preset": "swarm_three", "bubbles": 60, "frames": 8},
+    "four, 20 bubbles": {"preset": "swarm_four", "bubbles": 20, "frames": 12},
+    "four, 20 bubbles, no shake": {
+        "preset": "swarm_four", "bubbles": 20, "frames": 12, "shake": 0.0
+    },
+    "four, 60 bubbles": {"preset": "swarm_four", "bubbles": 60, "frames": 8},
     "crossings: three, 60 bubbles, 4 % covered":
-        {"preset": "three", "bubbles": 60, "frames": 16, "d_eq_mm": (0.8, 2.0)},
+        {"preset": "swarm_three", "bubbles": 60, "frames": 16, "d_eq_mm": (0.8, 2.0)},
     "three, one gone for 50 of 100 frames (table)":
-        {"preset": "three", "bubbles": 20, "frames": 100, "gone": (25, 75)},
+        {"preset": "swarm_three", "bubbles": 20, "frames": 100, "gone": (25, 75)},
 }  # fmt: skip
 
 

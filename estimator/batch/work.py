@@ -146,5 +146,6 @@ def smooth_run(
         data, calibrated, tracks, folder, **options.keywords, inputs=files, report=report,
         stage=stage, again=again,
     )  # fmt: skip
-    publish("results", folder=folder.resolve())
+    own = tracks if tracks.is_dir() else tracks.parent
+    publish("results", folder=folder.resolve(), tracked=own.resolve(), recording=data.path)
     return found

@@ -7,6 +7,6 @@ CALIBRATIONS = (
     "three",
 )  # fmt: skip
 RUNS = (
-    "rise", "swarm", "three", "four", "crossing", "forces", "S0", "S1", "S2", "S3", "S4", "S5",
-    "S6",
+    "rise", "swarm", "swarm_three", "swarm_four", "crossing", "forces", "S0", "S1", "S2", "S3",
+    "S4", "S5", "S6",
 )  # fmt: skip

@@ -264,8 +264,8 @@ _RUNS = (
         ),
     ),
     _SWARM,
-    replace(_SWARM, name="three", calibration=_around(3, "three")),
-    replace(_SWARM, name="four", calibration=_around(4, "four")),
+    replace(_SWARM, name="swarm_three", calibration=_around(3, "swarm_three")),
+    replace(_SWARM, name="swarm_four", calibration=_around(4, "swarm_four")),
     RunConfig(
         "crossing",
         _like_paper("crossing", (1280, 800), 40.0, 0.45),

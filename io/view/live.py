@@ -165,9 +165,15 @@ class LiveView:
             dots = rr.Points2D(points, colors=rgb(colour), radii=rr.Radius.ui_points(2.5))
             self.stream.log(of_image(camera, name), dots)
 
-    def results(self, folder: Path, dataset: Path | None = None) -> None:
-        """Show a folder of results as `telerig view` does."""
-        log_results(self.stream, folder, dataset=dataset)
+    def results(
+        self,
+        folder: Path,
+        dataset: Path | None = None,
+        tracked: Path | None = None,
+        recording: Path | None = None,
+    ) -> None:
+        """Show a folder of results as `telerig view` does; arguments are those of `log_results`."""
+        log_results(self.stream, folder, None, recording, dataset, tracked)
 
     def recorder(
         self, devices: Sequence[DeviceDescription], cameras: Sequence[str], folder: Path

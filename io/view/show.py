@@ -91,10 +91,12 @@ def log_results(
     frames: tuple[int, int] | None = None,
     recording: Path | None = None,
     dataset: Path | None = None,
+    tracked: Path | None = None,
 ) -> None:
     """Log a folder of results and the layout of the window.
 
     frames, recording : as for `view`. dataset : of a calibration; None for the one it lies in.
+    tracked : the results folder of a smoothed run's tracks; None for the same.
     """
     if (place / "calibration.json").is_file():
         results = read_results(place)
@@ -105,12 +107,13 @@ def log_results(
         images = _views_of(dataset or place.resolve().parent.parent)
         log_calibration(stream, results, rejected, images)
         return
-    if not (place / "tracking.json").is_file():
+    found_in = tracked or place
+    if not (found_in / "tracking.json").is_file():
         raise InputError(
             "holds neither a calibration nor a tracked run", where=str(place),
             todo="give a folder like DATASET/results/calibration or DATASET/results/NAME",
         )  # fmt: skip
-    tracks = read_track_results(place)
+    tracks = read_track_results(found_in)
     smoothing = read_smoothing_results(place, tracks.up)
     data = _recording_of(place, recording, tracks)
     image, count = _frames_of(data, tracks)
@@ -118,7 +121,7 @@ def log_results(
     shown = every[:: -(-len(every) * len(tracks.cameras) // MOST_IMAGES) or 1]
     smoothed = ("height_less_line_mm", "shake_um", "speed_mm_s", "encoder_residual_um")
     plots = ["ray_miss_um", "step_mm", *(() if smoothing is None else smoothed)]
-    found = read_outlines(place / "detections.csv", tracks.cameras)
+    found = read_outlines(found_in / "detections.csv", tracks.cameras)
     if "chi2_dof" in found and found["chi2_dof"].notna().any():
         plots.insert(2, "outline_chi2")
     if data is not None and data.accelerometers is not None:

@@ -335,7 +335,7 @@ def test_words_say_it_once() -> None:
 def run_of_three(which: int, frames: int) -> tuple[Calibration, Array, pd.DataFrame]:
     """Return a calibration, the true points and the tracks of a run in which one camera is 0.08 mm
     higher along y than calibrated."""
-    cameras = tuple(true_cameras(run_preset("three").calibration).values())
+    cameras = tuple(true_cameras(run_preset("swarm_three").calibration).values())
     names = tuple(f"{c.name}.{n.split('.')[1]}" for c in cameras[1:] for n in NAMES)
     covariance = np.diag(np.tile(np.repeat(np.square((2e-5, 5e-4)), 3), 2))
     known = Calibration(

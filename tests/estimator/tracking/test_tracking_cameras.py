@@ -125,7 +125,7 @@ def test_a_pair_without_the_first_camera(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def swarm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]:
     folder = tmp_path_factory.mktemp("swarm") / "three"
-    config = run_preset("three", frames=24, bubbles=10)
+    config = run_preset("swarm_three", frames=24, bubbles=10)
     data = simulate(config, rng=np.random.default_rng(5), out=folder, images=False)
     known = calibration_from_cameras(list(true_cameras(config.calibration).values()))
     return next((data.path / "runs").iterdir()), replace(known, findings=())

@@ -249,3 +249,4 @@ def test_senseless_settings_are_refused_by_name(fault):
 
 def test_the_help_names_all_presets() -> None:
     assert (tuple(PRESETS), tuple(RUN_PRESETS)) == (preset_names.CALIBRATIONS, preset_names.RUNS)
+    assert not set(PRESETS) & set(RUN_PRESETS), "the command could not reach one of them"

@@ -15,7 +15,9 @@ from fault_recordings import ARM, ENCODER, Account, recorded_with_faults
 from viewed import entities, needs_rerun
 
 from telerig import live
+from telerig.command_options import SmoothingOptions
 from telerig.errors import TelerigWarning
+from telerig.estimator.batch.work import smooth_run
 from telerig.io.recording.simulated.devices import Faults, SimulatedDevice
 from telerig.live import MOST_WAITING, Feed, publish, viewed
 
@@ -136,3 +138,18 @@ def test_a_recording_has_curves_clocks_and_spectra_while_it_is_made(
         len([name for name in found if name.startswith("/plots/accelerometers_m_s2/arm_left_")])
         == 3
     )
+
+
+@needs_rerun
+@pytest.mark.slow
+def test_results_beside_other_tracks_are_shown_with_them(
+    tank: Path, tmp_path: Path, kept: Kept
+) -> None:
+    run, out = tank / "runs/rise", tmp_path / "elsewhere"
+    smooth_run(
+        run, out, SmoothingOptions(model="default"), tracks=tank / "results/rise", again="",
+        report=False,
+    )  # fmt: skip
+    assert not (out / "tracking.json").exists()
+    found = shown(kept, tmp_path / "live.rrd")
+    assert {"/space/paths/smoothed", "/space/paths/triangulated"} <= set(found)

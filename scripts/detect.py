@@ -17,18 +17,20 @@ def detect(
 
     Exit code 0: done. 2: the input cannot be used. 130: interrupted.
     """
-    from telerig.estimator.calibration.results_folder import write_detections
+    from telerig.estimator.calibration.results_folder import sources, write_detections
     from telerig.estimator.dots.dataset_dots import detect_dataset
     from telerig.io.dataset.dataset import load_dataset
     from telerig.io.files.csv_table import write_table
+    from telerig.io.results.inputs import fingerprints
     from telerig.io.results.manifest import replaced_results
 
     data = load_dataset(dataset, source="images")
+    folder = out or data.results / "calibration"
+    inputs = fingerprints(folder, sources(data))
     with progress(quiet) as stage:
         found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
-    folder = out or data.results / "calibration"
     again = typed_command() or f"telerig detect {data.path}"
-    with replaced_results(folder, "detect", again=again, inputs={}) as staged:
+    with replaced_results(folder, "detect", again=again, inputs=inputs) as staged:
         write_table(found.dots, staged / "dots.csv")
         write_detections(found, staged)
     for image in found.images:

@@ -26,15 +26,6 @@ if TYPE_CHECKING:
     from telerig.io.dataset.dataset import Dataset
 
 
-def input_files(dataset: Dataset) -> list[Path]:
-    """Return the paths of the files that a calibration of this dataset reads."""
-    beside = dataset.path / "stage_axis"
-    files = [dataset.path / "rig.toml", *sorted(p for p in beside.rglob("*") if p.is_file())]
-    if dataset.source == "dots":
-        return [*files, dataset.path / "calibration" / "dots.csv"]
-    return files + [path for view in dataset.views for path in view.image_paths.values()]
-
-
 _RIG_TABLES = ("cameras", "stereo", "target", "stage", "walls")
 """The tables of rig.toml on which a calibration depends."""
 
@@ -106,7 +97,7 @@ def write_results(
     used : fingerprints of `sources` from before the dataset was read.
     again : the command line that makes the folder again; "" for `telerig calibrate` of the dataset.
     """
-    record = run_record(command, dataset.path, input_files(dataset), options, seconds)
+    record = run_record(command, options, seconds)
     again = again or f"telerig calibrate {shlex.quote(str(dataset.path))}"
     inputs = fingerprints(folder, sources(dataset)) if used is None else used
     with replaced_results(folder, "calibrate", again=again, inputs=inputs) as staged:

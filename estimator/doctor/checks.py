@@ -20,6 +20,7 @@ from telerig.estimator.batch.jobs import check_run_name
 from telerig.estimator.doctor.cost import cost_words
 from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.recording.ports import NO_PERMISSION, found_ports
+from telerig.io.results.stale import stale
 from telerig.short_text import counted
 
 if TYPE_CHECKING:
@@ -183,8 +184,21 @@ def check_dataset(place: Path) -> Iterator[Check]:
             yield from _run(data, name)
     if not data.runs:
         yield Check("runs", "note", "none", "put recordings into runs/<name>/<camera>/")
+    yield from _results(data)
     yield from _left_over(data)
     yield _disk(data)
+
+
+def _results(data: Dataset) -> Iterator[Check]:
+    """Check whether the results were made from the inputs that are there now."""
+    folders = sorted(p.parent for p in data.results.glob("*/manifest.json"))
+    for folder in folders:
+        found = stale(folder)
+        what = f"results {folder.name}"
+        for words in found:
+            yield Check(what, "warning", words)
+        if not found:
+            yield Check(what, "ok", "made from the inputs that are there now")
 
 
 def _left_over(data: Dataset) -> Iterator[Check]:

@@ -75,7 +75,6 @@ def smooth_run(
         *window_warnings(run.rig, calibration),
         *([] if refine_rig else _moved(followed)),
     ]
-    tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
     again = again or f"telerig smooth {shlex.quote(str(run.path))}"
     with replaced_results(folder, "smooth", again=again, inputs=fingerprint) as staged:
         found = smooth(
@@ -87,7 +86,7 @@ def smooth_run(
         )
         found.write_files(staged)
         record = run_record(
-            "smooth", run.path, [*tables, source, *marks, *inputs],
+            "smooth",
             {"model": model, "refine_rig": refine_rig, "accept": list(accept)},
             {"smooth": time.perf_counter() - begun},
         )  # fmt: skip

@@ -151,7 +151,13 @@ def write_tracking(
         table = stream.marks.table if stream.marks is not None else None
         if table is not None:
             write_table(table, staged / "references.csv")
-        write_json_atomic(staged / "run.json", _record(run, folder, options, record))
+        stated = {
+            **record.get("options", {}),
+            "track": repr(options),
+            "calibration": [relative(file, folder) for file in record.get("inputs", [])],
+        }
+        command, seconds = str(record.get("command", "track")), record.get("seconds", {})
+        write_json_atomic(staged / "run.json", run_record(command, stated, seconds))
         if run.detections is None:
             _write_pictures(run, stream.store, summary, staged)
         if report:
@@ -203,34 +209,10 @@ def _write_rows(stream: TrackingStream, staged: Path) -> _Worst:
     return worst
 
 
-def _record(
-    run: RunData, folder: Path, options: TrackOptions, record: Mapping[str, Any]
-) -> dict[str, Any]:
-    inputs = [*record.get("inputs", [])]
-    tables = list(run.path.glob("*.csv")) + list(run.path.glob("*.toml"))
-    content = run_record(
-        str(record.get("command", "track")),
-        run.path,
-        [*tables, *inputs],
-        {
-            **record.get("options", {}),
-            "track": repr(options),
-            "calibration": [relative(file, folder) for file in inputs],
-        },
-        record.get("seconds", {}),
-    )
-    known, files, size = set(tables), 0, 0
-    for path in run.path.rglob("*"):
-        if path.is_file() and path not in known:
-            files, size = files + 1, size + path.stat().st_size
-    content["images"] = {"files": files, "bytes": size}
-    return content
-
-
 def _write_pictures(
     run: RunData, store: DetectionStore, summary: Mapping[str, Any], staged: Path
 ) -> None:
-    """Write overlays and binary pictures of the worst frames, from the tables."""
+    """Write overlays of the worst frames, from the tables."""
     frames = [int(w["frame"]) for w in summary["worst_frames"]]
     written = pd.read_csv(
         staged / "detections.csv", dtype={"camera": str, "flags": str},

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -30,7 +30,6 @@ from pydantic import (
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import plain, write_json_atomic
-from telerig.io.files.hashing import hashed
 from telerig.io.files.names import fault_of_name
 from telerig.io.files.text import read_bytes
 from telerig.short_text import counted_list
@@ -219,13 +218,14 @@ PACKAGES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "scikit-image",
 
 
 class RunFile(Record):
-    """Hold the content of run.json: which command made a results folder, and from what.
+    """Hold the content of run.json: which command made a results folder, with which versions.
+
+    The manifest says from which inputs.
 
     command : the command's name.
     telerig : the version of telerig; None where it is not known.
     seconds : duration in s of each step by name.
     options : the values of the command's options.
-    inputs_sha256 : the SHA-256 hash of each input file by its path relative to the dataset.
     tracks : the run.json of the tracking on which a smoothing is based; otherwise empty.
     """
 
@@ -235,21 +235,16 @@ class RunFile(Record):
     telerig: str | None = None
     seconds: dict[str, float] = Field(default_factory=dict)
     options: dict[str, Any] = Field(default_factory=dict)
-    inputs_sha256: dict[str, str] = Field(default_factory=dict)
     tracks: dict[str, Any] = Field(default_factory=dict)
 
 
 def run_record(
     command: str,
-    dataset: Path,
-    inputs: Iterable[Path],
     options: Mapping[str, Any],
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """Return the content of run.json for a command that has just finished; nothing is written.
 
-    dataset : the dataset folder.
-    inputs : the files that the command read; they are hashed and named relative to the dataset.
     options : the values of the command's options.
     seconds : duration in s of each step by name.
     """
@@ -262,7 +257,6 @@ def run_record(
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": {name: round(float(s), 3) for name, s in seconds.items()},
         "options": dict(options),
-        "inputs_sha256": {_relative(p, dataset): hashed(p).sha256 for p in inputs},
     }
 
 
@@ -272,7 +266,3 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
-
-
-def _relative(path: Path, dataset: Path) -> str:
-    return path.relative_to(dataset).as_posix() if path.is_relative_to(dataset) else path.name

@@ -9,6 +9,7 @@ import h5py
 import pytest
 from typer.testing import CliRunner
 
+from telerig.estimator.doctor.checks import check_dataset
 from telerig.scripts.main import app
 
 pytestmark = pytest.mark.usefixtures("without_advice", "known_low_passes", "undrawn")
@@ -50,6 +51,17 @@ def test_export_refuses_stale_trajectories(data: Path) -> None:
     with h5py.File(data / "results" / "export" / "rise.h5") as file:
         assert "calibration.json has changed" in file.attrs["accepted"]
     assert telerig("export", data, "--to", "opencv")[0] == 0, "the calibration itself is fresh"
+
+
+def test_doctor_names_stale_results(data: Path) -> None:
+    """A comment in rig.toml makes nothing stale."""
+    found = {c.what: c for c in check_dataset(data) if c.what.startswith("results ")}
+    assert found["results calibration"].status == "ok"
+    assert found["results rise"].status == "warning"
+    assert "calibration/calibration.json has changed" in found["results rise"].words
+    rig = data / "rig.toml"
+    rig.write_text(rig.read_text() + "\n# a remark\n")
+    assert "results calibration" in {c.what for c in check_dataset(data) if c.status == "ok"}
 
 
 def test_cameras_of_a_stale_calibration_say_so(data: Path) -> None:

@@ -120,7 +120,7 @@ def _read_results(folder: Path) -> CalibrationResults:
     words = {
         "dots.csv with covariances (residuals are shown in px only)": "whitened_u" in residuals,
         "covariance.npz (no standard deviations of the target's shape)": bool(joint.size),
-        "run.json (no versions, no hashes of what went in)": bool(run.content()),
+        "run.json (no versions, no options)": bool(run.content()),
         "overlays/ (no pictures of the dots that were found)": bool(overlays),
     }
     absent = tuple(text for text, present in words.items() if not present)

@@ -131,7 +131,7 @@ def _read_track_results(folder: Path) -> TrackResults:
     absent = {
         "detections.csv (no numbers on single images)": (folder / "detections.csv").is_file(),
         "events.csv (no history of births, gaps and ends)": (folder / "events.csv").is_file(),
-        "run.json (no versions, no hashes of what went in)": bool(run),
+        "run.json (no versions, no options)": bool(run),
         "overlays/ (no pictures of the bubbles that were found)": bool(pictures),
     }
     return TrackResults(

@@ -149,8 +149,9 @@ def test_smoothing_uses_the_marks_that_were_followed(data: Path, tmp_path: Path)
     assert errors["marks"] < 0.5 * errors["none"]
     page = (tmp_path / "marks" / "report.html").read_text(encoding="utf-8")
     assert "Marks fixed to the tank, left" in page
-    record = json.loads((tmp_path / "marks" / "run.json").read_text(encoding="utf-8"))
-    assert any(name.endswith("references.csv") for name in record["inputs_sha256"])
+    manifest = json.loads((tmp_path / "marks" / "manifest.json").read_text(encoding="utf-8"))
+    inputs = manifest["sections"]["smooth"]["inputs"]
+    assert any(name.endswith("rise/references.csv") for name in inputs)
 
 
 def short(data: Path, target: Path, frames: int = 5) -> Path:

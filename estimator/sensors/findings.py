@@ -30,6 +30,8 @@ class Code(StrEnum):
     ENCODER_SCALE = "ENCODER_SCALE"
     ENCODER_JUMP = "ENCODER_JUMP"
     ENCODER_CLOCK = "ENCODER_CLOCK"
+    STAGE_AXIS = "STAGE_AXIS"
+    CAMERA_SCALE = "CAMERA_SCALE"
     FRAME_TIMES = "FRAME_TIMES"
     RISE_SPEED = "RISE_SPEED"
 
@@ -46,8 +48,8 @@ class Finding:
         "unit": "g"; "axes": rows; "factor": number by which readings are multiplied; "add_m_s2":
         [x, y, z]; "offset_s": s, which is added to its times. {"exchange": [name, name]} exchanges
         two records. For the encoder it is {"encoder_factor": -1.0}, {"encoder_offset_s": s}, or
-        {"encoder_jumps": [[t_s, mm], ...]}, lengths that are subtracted from t_s on. For the frames
-        it is {"frame_time_factor": 0.001}.
+        {"encoder_jumps": [[t_s, mm], ...]}, lengths that are subtracted from t_s on. For the stage
+        it is {"stage_axis": [x, y, z]}, for the frames {"frame_time_factor": 0.001}.
     is_fault : False for what was assumed because it is not stated.
     """
 

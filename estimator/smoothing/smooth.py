@@ -17,7 +17,7 @@ from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, r
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
 from telerig.estimator.sensors.given import AccelerometerRecord, times
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, drawn, solve
-from telerig.estimator.smoothing.graph.stage_travel import carriage, travel_of
+from telerig.estimator.smoothing.graph.stage_travel import carriage, scale_warnings, travel_of
 from telerig.estimator.smoothing.learning.cross_validation import learning_record
 from telerig.estimator.smoothing.learning.default_priors import (
     adapted,
@@ -164,7 +164,7 @@ def smooth(
     accept : codes of faults, like ["SENSOR_AXES"], that are used as they are, where they would be
         refused (the error names its code): SENSOR_UNIT, SENSOR_GRAVITY, SENSOR_AXES, SENSOR_MOUNT,
         SENSOR_SCALE, SENSOR_CLOCK, ENCODER_SIGN, ENCODER_UNIT, ENCODER_STUCK, ENCODER_SCALE,
-        ENCODER_JUMP, ENCODER_CLOCK, FRAME_TIMES, RISE_SPEED.
+        ENCODER_JUMP, ENCODER_CLOCK, STAGE_AXIS, CAMERA_SCALE, FRAME_TIMES, RISE_SPEED.
     folder : an existing folder for results.h5 of a run that is too long for memory; None for a
         temporary one, which lasts as long as what is returned.
 
@@ -220,6 +220,7 @@ def smooth(
     summary["accepted"] = sorted(accepted)
     summary["warnings"] = [
         *warnings, *sample_warnings(evidence), *speed_warnings(problem, evidence.mean_velocities),
+        *scale_warnings(solution),
         *([] if calibration.covariance_known else [NO_COVARIANCE]),
     ]  # fmt: skip
     change = refined_change(solution, calibration)
@@ -420,7 +421,11 @@ def with_sensors_aligned(
         return aligned(problem, findings, _log_evidence)
     first = (count - _MOST_ALIGNED) // 2
     part = all_of(problem, first, first + _MOST_ALIGNED).problem
-    return problem, aligned(part, findings, _log_evidence)[1]
+    placed, findings = aligned(part, findings, _log_evidence)
+    if placed.stage is None or problem.stage is None:
+        return problem, findings
+    late = placed.stage.delay_sigma_s
+    return replace(problem, stage=replace(problem.stage, delay_sigma_s=late)), findings
 
 
 def _log_evidence(problem: SmoothingProblem) -> float:
@@ -544,7 +549,7 @@ def problem_of(
     findings = list(sensors.findings)
     if tracked is not None:
         findings += check_tracks(tracked.sample, calibration)
-    record = stage_of(sensors.encoder, at_frames)
+    record = stage_of(sensors.encoder, at_frames, described)
     if record is not None and travel.scale:
         record = replace(record, position_mm=record.position_mm / (1 + travel.scale))
     positions = np.zeros(len(at_frames))

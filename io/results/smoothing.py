@@ -77,6 +77,7 @@ class Quantity(StrEnum):
 
     MEAN_VELOCITY = "mean velocity"
     PATH = "path"
+    PLACE = "place"
     ZIGZAG_AMPLITUDE = "zigzag amplitude"
     ZIGZAG_FREQUENCY = "zigzag frequency"
     VELOCITY = "velocity"
@@ -114,6 +115,8 @@ class AxisVerdict(Part):
     sigma_mm, sigma_shake_known_mm : these two standard deviations of a position in mm.
     sigma_encoder_mm : standard deviation that the encoder's scale and the travel axis add to all
         positions alike, in mm. `sigma_mm` is without it.
+    sigma_offset_mm : standard deviation in mm of an offset that all positions share, as the
+        encoder's delay is not known; no other standard deviation contains it.
     shake_rms_mm : RMS of the shake in mm of the camera that shakes most.
     """
 
@@ -124,6 +127,7 @@ class AxisVerdict(Part):
     sigma_mm: float | None = None
     sigma_shake_known_mm: float | None = None
     sigma_encoder_mm: float | None = None
+    sigma_offset_mm: float | None = None
     shake_rms_mm: float | None = None
     words: str = ""
 
@@ -164,6 +168,9 @@ class Contradiction(Part):
 
 class Use(Part):
     """Hold how well a run determines one quantity of the bubbles.
+
+    A place is compared with the path about a line: its standard deviation contains what all places
+    share, which that of the path does not.
 
     axis : axis of the rig.
     value : the median over the bubbles; None if there is none.

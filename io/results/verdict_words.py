@@ -138,6 +138,12 @@ def number_words(axes: Mapping[str, AxisVerdict], vertical: str) -> str:
             f". The encoder's scale and the travel axis add {number(1e3 * more[0], 2)} µm along "
             f"{more[1]}, which are the same for all bubbles and grow with the travel"
         )
+    offset = max(((axis.sigma_offset_mm or 0.0, name) for name, axis in axes.items()), default=None)
+    if offset is not None and offset[0] > _MUCH * sds.get(offset[1], 0.0):
+        text += (
+            f". Places of all bubbles share an unknown offset of {number(1e3 * offset[0], 2)} µm "
+            f"along {offset[1]}, from the encoder's delay; motion is free of it"
+        )
     return f"{text}."
 
 
@@ -264,6 +270,7 @@ QUANTITY_WORDS = {
     Quantity.VELOCITY: "velocity in a frame",
     Quantity.ACCELERATION: "acceleration in a frame",
     Quantity.PATH: "path about a line",
+    Quantity.PLACE: "place in the laboratory",
     Quantity.ZIGZAG_AMPLITUDE: "zigzag amplitude",
     Quantity.ZIGZAG_FREQUENCY: "zigzag frequency",
 }

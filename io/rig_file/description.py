@@ -75,6 +75,8 @@ class StageDescription(Table):
     position_sigma_mm : standard deviation of an encoder reading.
     scale_sigma : standard deviation of the encoder's relative scale error; None if the file does
         not state it.
+    delay_sigma_s : standard deviation of how much later than the images the encoder is read; None
+        if the file does not state it.
     """
 
     axis: Direction
@@ -92,6 +94,10 @@ class StageDescription(Table):
             description="the laboratory's gravity in m/s^2, from 9.7 to 9.9, like 9.80665",
         ),
     ] = STANDARD_GRAVITY_M_S2
+    delay_sigma_s: Annotated[
+        float | None,
+        Field(ge=0, lt=1, description="seconds like 0.0001: how late the encoder may be read"),
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ _COMMENTS = {
     "up": "away from gravity",
     "scale_sigma": "of the encoder, relative",
     "gravity_m_s2": "of the laboratory",
+    "delay_sigma_s": "of the encoder against the images",
     "mounted_on": 'a camera or "carriage"',
     "axes": "rows: the sensor's x, y, z axes in rig coordinates",
     "range_m_s2": "beyond it readings are clipped",

@@ -15,7 +15,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.problem.problem import ShakeModel, Travel
+from telerig.estimator.smoothing.problem.problem import Travel
 from telerig.rig.pose import across
 
 SCALE_SIGMA = 1e-3
@@ -72,6 +72,45 @@ def wider_scale_sigma(solution: Solution) -> float | None:
     return 2 * off if off > _FAR * prior else None
 
 
+def disputed_scale(solution: Solution) -> float:
+    """Return the scale error that marks show and that is far outside what is assumed; else 0.
+
+    The encoder may be off so much, or the magnifications: nothing tells which, so that the
+    error is as uncertain as it is large.
+    """
+    travel = solution.graph.problem.travel
+    off = abs(solution.state.encoder_scale(solution.graph))
+    assumed = travel is not None and travel.source == "assumed"
+    return off if assumed and off > _FAR * default_scale_sigma(travel) else 0.0
+
+
+def scale_warnings(solution: Solution) -> list[str]:
+    """Return a warning if marks and encoder disagree on how far the stage moves."""
+    off = disputed_scale(solution)
+    if not off:
+        return []
+    return [
+        f"the marks move {100 * off:.2g} % {'less' if total_scale(solution) > 0 else 'more'} than "
+        "the encoder reads: its scale or the magnifications are wrong, and all heights and mean "
+        "velocities are as uncertain. State scale_sigma in rig.toml [stage] if the encoder may be "
+        "off so much, or calibrate again"
+    ]
+
+
+def offset_sigma(solution: Solution) -> Array:
+    """Return the standard deviation (3,) in mm of an offset that all places of a run share.
+
+    It is the way that the stage moves in the uncertain delay of its encoder. The motion of the
+    bubbles about their means is free of it.
+    """
+    problem = solution.graph.problem
+    if problem.stage is None:
+        return np.zeros(3)
+    _, speed = carriage(solution)
+    way = problem.stage.delay_sigma_s * float(np.sqrt(np.mean(speed**2)))
+    return np.asarray(np.abs(problem.axis) * way)
+
+
 def considered_variance(solution: Solution) -> tuple[Array, Array]:
     """Return variances of the bubbles that the uncertain encoder scale and travel axis cause.
 
@@ -110,7 +149,8 @@ def scale_sigma(solution: Solution) -> float:
     """
     graph, found = solution.graph, solution.covariances
     if graph.encoder_flags[0]:
-        return 0.0 if found is None else float(np.sqrt(found.encoder[0, 0]))
+        own = 0.0 if found is None else float(np.sqrt(found.encoder[0, 0]))
+        return float(np.hypot(own, disputed_scale(solution)))
     travel = graph.problem.travel
     return 0.0 if travel is None else float(np.sqrt(travel.covariance[2, 2]))
 
@@ -125,13 +165,15 @@ def total_scale(solution: Solution) -> float:
     return float((1 + before) * (1 + solution.state.encoder_scale(solution.graph)) - 1)
 
 
-def considered(travel: Travel, model: ShakeModel) -> Array:
+def considered(solution: Solution, travel: Travel) -> Array:
     """Return the covariance (3, 3) of the travel axis' two tilts and of the encoder's scale.
 
-    The part of the scale is 0 if the scale is a variable of the graph.
+    If the scale is a variable of the graph, its part is what `disputed_scale` adds.
     """
-    keep = np.array([1.0, 1.0, float(model.encoder_scale_sigma == 0)])
-    return np.asarray(travel.covariance * np.outer(keep, keep))
+    keep = np.array([1.0, 1.0, float(solution.graph.model.encoder_scale_sigma == 0)])
+    out = travel.covariance * np.outer(keep, keep)
+    out[2, 2] += disputed_scale(solution) ** 2
+    return np.asarray(out)
 
 
 def _variance(solution: Solution, along: Array) -> Array:
@@ -140,5 +182,5 @@ def _variance(solution: Solution, along: Array) -> Array:
     if travel is None or stage is None:
         return np.zeros((len(along), 3))
     turn = np.column_stack([travel.basis, -travel.axis])
-    each = np.diagonal(turn @ considered(travel, solution.graph.model) @ turn.T)
+    each = np.diagonal(turn @ considered(solution, travel) @ turn.T)
     return np.asarray(along[:, None] ** 2 * each)

@@ -13,6 +13,7 @@ from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
+    DELAY_SIGMA_S,
     FEWEST_BUBBLES,
     BroadBand,
     CarriageModel,
@@ -25,7 +26,6 @@ from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.factors.state_space import broad_band_density
 
 SHAKE_RMS_MM = 0.2
-DELAY_SIGMA_S = 0.002
 _ZIGZAG_HZ = (3.0, 12.0)
 _ZIGZAG_GUESS_HZ = 6.5
 _ZIGZAG_RMS_MM = 0.5

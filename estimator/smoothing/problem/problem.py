@@ -24,6 +24,9 @@ CARRIAGE = -1
 a vibration that is common to all cameras.
 """
 
+DELAY_SIGMA_S = 0.002
+"""Prior standard deviation of the delay of a record that is on the frames' clock."""
+
 FEWEST_BUBBLES = 3
 """So many bubbles tell their own motion from that of the rig: with fewer, a line of one and of the
 other fit nearly alike."""
@@ -214,10 +217,12 @@ class Stage:
 
     t_s : (E,) times.
     position_mm : (E,) positions, corrected for a calibrated scale error.
+    delay_sigma_s : standard deviation of how much later than the frames' clock the times are.
     """
 
     t_s: Array
     position_mm: Array
+    delay_sigma_s: float = DELAY_SIGMA_S
 
 
 @dataclass(frozen=True)

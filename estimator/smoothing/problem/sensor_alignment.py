@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
@@ -33,15 +33,18 @@ from telerig.estimator.sensors.mounting import (
     mounting,
 )
 from telerig.estimator.sensors.response import CommonGain, Response
+from telerig.estimator.smoothing.problem.mark_motion import LENS_SIGMA, MarkMotion
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
+    DELAY_SIGMA_S,
     Accelerometer,
     SmoothingProblem,
 )
 from telerig.estimator.smoothing.problem.tables import near_frames
+from telerig.rig.pose import across
 
-SAME_CLOCK_S = 0.006
-"""Largest offset of a clock that counts as that of the frames: three sd of the delay's prior."""
+SAME_CLOCK_S = 3 * DELAY_SIGMA_S
+"""Largest offset of a clock that counts as that of the frames."""
 
 _MOST_REFINEMENTS = 6
 _SHARED_S = 2.0
@@ -63,12 +66,13 @@ _FRAME_FACTORS = {
     0.5: "the stated frame rate is half the true one",
     2.0: "the stated frame rate is twice the true one",
 }
-_CLEAR_GAIN = 5.0
-_CORRELATED = 10.0
-"""So many neighbouring pixels of a mark count as one, because the shake moves them alike."""
-
 _USUAL_GAIN, _KNOWN_GAIN = (0.75, 1.35), 0.01
-_LEAST_TRAVEL_MM = 0.3
+_FAR = 3.0
+"""Prior standard deviations beyond which a lens or an axis is wrong rather than a little off."""
+
+_AXIS_SIGMA = 3e-3
+"""Standard deviation (rad) of a travel axis that is stated and not measured."""
+
 _FASTEST_MM_S = 3000.0
 _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
@@ -132,10 +136,13 @@ def _aligned(
         return _with(problem, [s for s, _ in sensors if s is not None]), findings
     findings = []
     placed: dict[int, Accelerometer] = {}
+    late = [] if encoder is None else [encoder]
     for group, clock in _clocks(problem, images):
         if not _sure(clock):
             beside = [s for s in placed.values() if s.confirmed]
             clock = _clock(problem, images, group, beside=beside) or clock
+        if clock is not None and all(problem.accelerometers[i].clock == "frames" for i in group):
+            late.append(clock)
         for index in group:
             sensor, found = _placed(problem.accelerometers[index], clock, problem)
             findings += found
@@ -147,11 +154,25 @@ def _aligned(
             placed.update(zip(free, corrected))
             findings += found
     problem = _with(problem, [placed[i] for i in sorted(placed)])
+    problem = _with_late_images(problem, late)
     findings += _mountings(problem, images, refused, log_evidence)
     findings += _encoder(problem, images, encoder, [*refused, *findings])
     findings += _rise(problem)
     near = [near_frames(s, problem.t_s) for s in problem.accelerometers]
     return _with(problem, near), findings
+
+
+def _with_late_images(problem: SmoothingProblem, clocks: Sequence[Alignment]) -> SmoothingProblem:
+    """Return the problem with an encoder that may be as late as records on the frames' clock are.
+
+    A delay of the images is one of all these records. The arms answer the stage with a delay of
+    their own, so that what the images show of the encoder's is no correction of it.
+    """
+    if problem.stage is None:
+        return problem
+    shown = [c.offset_s for c in clocks if c.unique and abs(c.offset_s) > _FAR * c.sd_s]
+    sigma = np.hypot(problem.stage.delay_sigma_s, max(map(abs, shown), default=0.0))
+    return replace(problem, stage=replace(problem.stage, delay_sigma_s=float(sigma)))
 
 
 def _in_place(clock: Alignment, encoder: Alignment | None, problem: SmoothingProblem) -> bool:
@@ -781,7 +802,8 @@ def _encoder(
     clock: Alignment | None,
     refused: Sequence[Finding],
 ) -> list[Finding]:
-    """Return findings about the encoder: stuck, or a wrong sign, unit or clock.
+    """Return findings about the encoder (stuck, or a wrong sign, unit or clock), the travel axis
+    and the cameras' magnifications.
 
     clock : its alignment with the images.
     refused : earlier findings; the sensors that they concern are not compared with.
@@ -794,12 +816,16 @@ def _encoder(
         return stuck
     doubtful = {f.fix.get("sensor") for f in refused}
     sensors = [s for s in problem.accelerometers if s.confirmed and s.name not in doubtful]
-    marked, common = _gain_of_marks(problem), None
-    if marked is not None:
-        gain, sd = marked
+    marks, common = MarkMotion.of(problem), None
+    if marks is not None:
+        found = marks.gain()
+        gain, sd = float(found.value[0]), float(found.sd[0])
         usual = _USUAL_GAIN[0] < gain < _USUAL_GAIN[1]
-        if not usual and min(abs(gain), abs(gain - 1)) > _CLEAR_GAIN * sd:
+        if not usual and found.excludes(0.0) and found.excludes(1.0):
             return [_gain_finding(gain, max(3 * sd / abs(gain), 0.02), sd, where)]
+        wrong = list(_cameras(problem, marks))
+        if wrong:
+            return wrong
     elif images.encoder is not None:
         common = CommonGain.of(_responses(problem, images, images.encoder, sensors))
     if common is not None and (common.excludes(1.0) or common.opposed):
@@ -840,31 +866,39 @@ def _responses(
     return [Response.of(y, x, known & encoder.known) for y, known in shown]
 
 
-def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Return the ratio of the marks' displacement to the encoder's, with its sd; None without."""
-    seen = problem.references
-    if not len(seen) or problem.stage is None or not np.ptp(problem.encoder_mm) > 0:
-        return None
-    square = product = rest = 0.0
-    count = 0
-    for c, camera in enumerate(problem.cameras):
-        mine = seen.camera == c
-        axis = directions(camera) @ problem.axis
-        if not mine.any() or axis @ axis < 0.1:
+def _cameras(problem: SmoothingProblem, marks: MarkMotion) -> Iterator[Finding]:
+    """Yield what marks show of a magnification that has changed, and of a wrong travel axis."""
+    for first, second in combinations(range(len(problem.cameras)), 2):
+        found = marks.ratio(first, second)
+        two = [problem.cameras[c] for c in (first, second)]
+        depth = max(abs(c["kappa_per_mm"]) for c in two) * _depth_sigma_mm(problem)
+        if found is None or not found.excludes(1.0):
             continue
-        place = camera.unproject(seen.uv_px[mine])[0] @ directions(camera).T @ axis / (axis @ axis)
-        moved = problem.encoder_mm[seen.frame[mine]]
-        item = np.unique(seen.item[mine], return_inverse=True)[1]
-        size = np.bincount(item)
-        y = place - (np.bincount(item, place) / size)[item]
-        x = moved - (np.bincount(item, moved) / size)[item]
-        square, product = square + float(x @ x), product - float(x @ y)
-        rest, count = rest + float(y @ y), count + len(y)
-    if square <= 0 or max(square, rest) < _LEAST_TRAVEL_MM**2 * count:
-        return None
-    gain = product / square
-    spread = max(rest - gain**2 * square, 0.0) / max(count, 1)
-    return gain, max(float(np.sqrt(_CORRELATED * spread / square)), 1e-4)
+        ratio, sd = float(found.value[0]), float(found.sd[0])
+        if abs(ratio - 1) > _FAR * np.hypot(LENS_SIGMA, depth):
+            yield Finding(
+                f"marks move {ratio:.4f} ± {sd:.2g} times as far in it as in {two[0].name}, by the "
+                "calibration: a magnification has changed",
+                f"camera {two[1].name}", "check both lenses, and calibrate again",
+                Code.CAMERA_SCALE,
+            )  # fmt: skip
+    basis = across(problem.axis)
+    tilt = marks.tilt(basis)
+    stated = 0.0 if problem.travel is None else float(np.sqrt(problem.travel.covariance[0, 0]))
+    if tilt is not None and tilt.beyond(_FAR * max(stated, _AXIS_SIGMA)):
+        axis = problem.axis + basis @ tilt.value
+        axis /= np.linalg.norm(axis)
+        angle = np.rad2deg(np.linalg.norm(tilt.value))
+        line = ", ".join(f"{v:.5g}" for v in axis)
+        yield Finding(
+            f"the marks show that the stage moves {angle:.2g} degrees from the stated axis",
+            "stage", f"[stage] axis = [{line}] would fit; or measure it (stage_axis/)",
+            Code.STAGE_AXIS, {"stage_axis": axis.tolist()},
+        )  # fmt: skip
+
+
+def _depth_sigma_mm(problem: SmoothingProblem) -> float:
+    return max((mark.sigma_mm for mark in problem.marks), default=0.0)
 
 
 def _gain_finding(gain: float, reach: float, sd: float, where: str) -> Finding:

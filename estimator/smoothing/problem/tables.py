@@ -18,6 +18,7 @@ from telerig.estimator.sensors.given import Sensor, numbers, times
 from telerig.estimator.sensors.samples import sampling_rate
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
+    DELAY_SIGMA_S,
     Accelerometer,
     Bubble,
     CalibrationShare,
@@ -42,15 +43,18 @@ _MARK_SIGMA_MM = 100.0
 _VISIBLE_PX = 2e-3
 
 
-def stage_of(encoder: Encoder | None, t_s: Array) -> Stage | None:
+def stage_of(encoder: Encoder | None, t_s: Array, described: Any = None) -> Stage | None:
     """Return the encoder's readings during the frames, with a margin; None without an encoder.
 
     t_s : (F,) times of the frames.
+    described : what rig.toml states of the stage; None for nothing.
     """
     if encoder is None:
         return None
     near = _near(encoder.t_s, t_s)
-    return Stage(encoder.t_s[near], encoder.position_mm[near])
+    stated = getattr(described, "delay_sigma_s", None)
+    sigma = DELAY_SIGMA_S if stated is None else float(stated)
+    return Stage(encoder.t_s[near], encoder.position_mm[near], sigma)
 
 
 def accelerometers_of(

@@ -98,7 +98,7 @@ def _stage_near(stage: Stage, t_s: Array) -> Stage:
     low = int(np.searchsorted(stage.t_s, t_s[0] - MARGIN_S)) - 1
     high = int(np.searchsorted(stage.t_s, t_s[-1] + MARGIN_S)) + 1
     near = slice(max(low, 0), high)
-    return Stage(stage.t_s[near], stage.position_mm[near])
+    return replace(stage, t_s=stage.t_s[near], position_mm=stage.position_mm[near])
 
 
 def _renumbered(obs: Observations, chosen: Ints) -> Observations:

@@ -20,7 +20,7 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.known_rig import shake_known_variances
 from telerig.estimator.smoothing.graph.layout import GraphLayout
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.stage_travel import considered_variance
+from telerig.estimator.smoothing.graph.stage_travel import considered_variance, offset_sigma
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, FEWEST_BUBBLES
 from telerig.estimator.smoothing.verdict.evidence import Shake, shake_of
 from telerig.factors.motion import start
@@ -64,13 +64,14 @@ def verdicts(
     if solution.covariances is None or not solution.graph.rows:
         return {}
     sigma, known, encoder = _sigmas(solution)
+    offset = offset_sigma(solution)
     eta, rms = shake_share(solution, shake), shake_rms(solution, shake)
     measured, given = measured_shake(solution), solution.graph.model.name == "given"
     return {
         name: axis_verdict(
             sigma[:, axis], known[:, axis], encoder[:, axis], eta[axis], rms[axis],
             inflation[axis], measured=measured[axis], given=given,
-        )
+        ).model_copy(update={"sigma_offset_mm": float(offset[axis])})
         for axis, name in enumerate(AXES)
     }  # fmt: skip
 

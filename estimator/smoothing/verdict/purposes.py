@@ -14,7 +14,7 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.draws import DRAWS, Draws
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.stage_travel import considered_variance
+from telerig.estimator.smoothing.graph.stage_travel import considered_variance, offset_sigma
 from telerig.io.results.smoothing import Grade, Quantity, Use
 from telerig.io.tables.smoothing import AXES
 
@@ -30,7 +30,7 @@ _LEAST_SHARE = 0.3
 def uses(
     solution: Solution, draws: Draws, inflation: Sequence[float] = (1.0, 1.0, 1.0)
 ) -> list[Use]:
-    """Return velocity, path, acceleration and zigzag with sd and grade, by axis.
+    """Return velocity, path, place, acceleration and zigzag with sd and grade, by axis.
 
     The list is empty without bubbles or covariances.
 
@@ -77,13 +77,14 @@ class _Path:
         states = solution.state.bubbles[rows]
         self.rows, self.widen = rows, widen
         self.t_s = graph.problem.t_s[graph.frame_of_row[rows]]
-        speed = considered_variance(solution)[1][rows]
+        place, speed = (v[rows] for v in considered_variance(solution))
         row = graph.bubble.position
         error = np.einsum("id,ndk->nik", row, graph.bubble_basis(rows) @ errors[rows])
         variance = np.einsum("id,nde,ie->ni", row, found.bubbles[rows], row, optimize=True)
         scale = np.sqrt(variance.mean(0) / (error**2).mean((0, 2)).clip(1e-300))
         self.errors = error * (scale * widen)[None, :, None]
         self.place = states @ row.T
+        self.place_sd = np.hypot(np.sqrt(variance + place) * widen, offset_sigma(solution))
         self.speed = solution.velocities_mm_s[rows]
         self.speed_sd = np.sqrt(solution.velocity_variances()[rows] + speed) * widen
         self.mean_speed_variance = speed.mean(0) * widen**2
@@ -134,6 +135,8 @@ def _of_axis(solution: Solution, paths: Sequence[_Path], axis: int) -> Iterator[
     if not below:
         path = path.model_copy(update={"grade": Grade.NO})
     yield path.model_copy(update={"below_hz": below or None})
+    each = [(_band_rms(p, axis, 0.0)[0], _rms(p.place_sd[:, axis])) for p in paths]
+    yield use(Quantity.PLACE, each, "mm")
     if abs(float(problem.up[axis])) > 0.5:
         return
     for quantity, unit, of in (

@@ -55,6 +55,7 @@ _HARMLESS = {Flag.SHAKE_BELOW_NOISE}
 _HEADS = {
     "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
     "sigma_encoder_mm": "sd that the encoder's scale and the travel axis add, µm",
+    "sigma_offset_mm": "sd of the offset of all places, µm",
 }  # fmt: skip
 _IN_UM = {"mm": ("µm", 1e3)}
 

@@ -230,13 +230,14 @@ def test_outliers_cost_little(marked: Smoothing) -> None:
 
 
 def test_encoder_scale_far_from_what_is_assumed_is_found_by_default() -> None:
-    """The assumed 0.1 % is no obstacle to marks that show 1 %."""
+    """The assumed 0.1 % is no obstacle to marks that show 1 %, which the lenses may be off, too."""
     run = run_of("S2", 1, 300, around_s=AROUND_S, encoder_scale=0.01, scale_sigma=None)
     found = smoothed(run, "references")
     scale = found.summary["encoder"]
     assert scale["scale_from"] == "run"
-    assert scale["scale"] == pytest.approx(0.01, abs=4 * scale["sscale"])
-    assert scale["sscale"] < 3e-4
+    assert scale["scale"] == pytest.approx(0.01, abs=1e-3)
+    assert scale["sscale"] == pytest.approx(scale["scale"], rel=0.01)
+    assert any("magnifications" in words for words in found.summary["warnings"])
     assert found.model.encoder_scale_sigma > 0.01
 
 

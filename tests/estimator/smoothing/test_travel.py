@@ -15,6 +15,9 @@ from shake_learning_data import ARM_HZ, CAMERAS, COMMON_HZ, UP, run
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import (
     considered_variance,
+    offset_sigma,
+    scale_sigma,
+    scale_warnings,
     total_scale,
     travel_of,
 )
@@ -182,3 +185,28 @@ def test_arms_that_shake_alone_and_together() -> None:
             lines = {"common": COMMON_HZ, "arm left": ARM_HZ, "arm right": ARM_HZ}
             assert row.frequency_hz == pytest.approx(lines[row.where], abs=1.5)
         assert sorted(r.where for r in rows) == ["arm left", "arm right", "common"]
+
+
+def test_an_encoder_that_marks_contradict_may_be_right() -> None:
+    """1 % is ten times what is assumed: either the encoder is off, or the magnifications."""
+    off = problem(0.01, marks=True)
+    model = replace(STILL, encoder_scale_sigma=0.02)
+    solution = solve(replace(off, travel=replace(travel(1e-3), source="assumed")), model)
+    variance, _ = considered_variance(solution)
+    assert np.sqrt(variance[-1, 1]) == pytest.approx(0.01 * SPEED * off.t_s[-1], rel=0.05)
+    assert scale_sigma(solution) == pytest.approx(0.01, rel=0.05)
+    assert len(scale_warnings(solution)) == 1
+    stated = solve(replace(off, travel=travel(1e-3)), model)
+    assert not considered_variance(stated)[0].any() and not scale_warnings(stated)
+
+
+def test_an_unknown_delay_of_the_encoder_is_an_offset_of_all_places_and_of_no_motion() -> None:
+    known = problem()
+    assert known.stage is not None
+    exact, late = (
+        solve(replace(known, stage=replace(known.stage, delay_sigma_s=s)), STILL) for s in (0, 5e-3)
+    )
+    assert not offset_sigma(exact).any()
+    np.testing.assert_allclose(offset_sigma(late), [0, 5e-3 * SPEED, 0], rtol=0.02)
+    a, b = trajectories(exact, None), trajectories(late, None)
+    np.testing.assert_array_equal(a["sy_mm"], b["sy_mm"])

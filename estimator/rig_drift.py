@@ -93,6 +93,7 @@ class Series:
         return len(self.miss_mm)
 
     def of(self, keep: Bools) -> Series:
+        """Return the rows that are kept; keep : (N,)."""
         return Series(*(getattr(self, column.name)[keep] for column in fields(self)))
 
     def residuals(self) -> Array:

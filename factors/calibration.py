@@ -66,6 +66,7 @@ class Observations:
         return replace(self, **parts)
 
     def wall(self, camera: int) -> Wall | None:
+        """Return the window before a camera, by the camera's index; None for none."""
         return self.walls[camera] if self.walls else None
 
     def __len__(self) -> int:

@@ -59,6 +59,7 @@ class Component:
 
     @property
     def size(self) -> int:
+        """Return the number of states of the component."""
         return len(self.drift)
 
     @property

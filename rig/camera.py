@@ -102,10 +102,12 @@ class Camera:
 
     @property
     def scales(self) -> Scales:
+        """Return the camera's scale (px/mm), half diagonal (mm) and image width (px)."""
         return Scales(self["scale_px_per_mm"], self.rho_mm, self.image_size_px[0])
 
     @property
     def rig_from_camera(self) -> Pose:
+        """Return the pose of the camera in the rig frame."""
         return self.camera_from_rig.inverse()
 
     def project(self, points_rig_mm: ArrayLike) -> Array:

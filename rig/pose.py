@@ -74,14 +74,17 @@ class Pose:
 
     @staticmethod
     def identity() -> Pose:
+        """Return the pose that changes nothing."""
         return Pose(np.eye(3), np.zeros(3))
 
     @staticmethod
     def from_rotvec(rotvec_rad: ArrayLike, translation_mm: ArrayLike = (0.0, 0.0, 0.0)) -> Pose:
+        """Return the pose of a rotation vector (3,) in rad and a translation (3,) in mm."""
         return Pose(rotation_from_rotvec(rotvec_rad), np.asarray(translation_mm, float))
 
     @property
     def rotvec_rad(self) -> Array:
+        """Return the rotation vector (3,) in rad."""
         return rotvec_from_rotation(self.rotation)
 
     def apply(self, points_mm: ArrayLike) -> Array:

@@ -116,7 +116,10 @@ def largest(moments: Array, direction: Array) -> Array:
 
 
 def proper(moments: Array) -> Array:
-    """Return moments (..., 3, 3) with the thinnest axis limited: outlines may not fit together."""
+    """Return second moments (..., 3, 3) of a body that exists: no principal axis is too thin.
+
+    Moments that were fitted to outlines which do not fit together can have negative eigenvalues.
+    """
     squares, axes = np.linalg.eigh(moments)
     squares = np.maximum(squares, _THINNEST**2 * np.abs(squares).max(-1, keepdims=True))
     return np.asarray((axes * squares[..., None, :]) @ axes.mT)

@@ -155,10 +155,16 @@ def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
     for text in ports:
         name, equals, port = text.partition("=")
         if not equals or not port:
-            raise InputError(f"--port {text}", todo="write --port NAME=PORT")
+            raise InputError(
+                f"--port {text!r} does not say which device is at which port",
+                todo="write --port NAME=PORT with the name of a [devices] table of rig.toml, like "
+                "--port encoder=/dev/ttyUSB0",
+            )
         if name not in rig.devices:
             known = list(rig.devices)
-            raise InputError(f"--port: no device {name!r}", todo=suggestion(name, known))
+            raise InputError(
+                f"--port {text}: rig.toml has no [devices.{name}]", todo=suggestion(name, known)
+            )
         if name in given:
             raise InputError(f"--port names {name} twice", todo="give each device one port")
         given[name] = port

@@ -23,6 +23,10 @@ LEAST_BRIGHTNESS = 0.25
 
 
 def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: float) -> NDArray[Any]:
+    """Return an image (H, W) as an array.
+
+    Raises InputError for one that is not grey or is too small, and for senseless settings.
+    """
     image = np.asarray(image)
     check_grey_image(image, 16, "bubbles")
     if not min_diameter_px >= 4.0:
@@ -55,6 +59,7 @@ def checked_background(background: NDArray[Any], shape: tuple[int, ...]) -> NDAr
 
 
 def nothing_to_see(image: NDArray[Any]) -> str:
+    """Return why an image (H, W) can show no bubble, in words; "" if it can."""
     low, high = float(image.min()), float(image.max())
     if high <= 0.0:
         return "the image is black"

@@ -55,6 +55,7 @@ class NextView:
 
     @property
     def after_um(self) -> float:
+        """Return what ``before_um`` becomes with the best pose."""
         return self.poses[0].after_um if self.poses else self.before_um
 
     @property
@@ -441,6 +442,10 @@ class ViewGain:
 
     @staticmethod
     def of(problem: Problem, state: State, joint: JointCovariance, dots: Ints) -> ViewGain:
+        """Return the gain of views from the covariance of a calibration.
+
+        dots : indices of the dots of the target that the views may show.
+        """
         cameras = cameras_from_state(problem, state)
         points = working_volume(cameras)
         shift = aligned_shift(cameras, problem.free, points)
@@ -452,6 +457,7 @@ class ViewGain:
 
     @property
     def before_um(self) -> float:
+        """Return the standard deviation per axis of points, in µm, with the views so far."""
         return float(self._um(np.zeros(1))[0])
 
     @property

@@ -44,8 +44,11 @@ _NAMED = 5
 class Stop(Protocol):
     """A flag that says when to stop, such as a `threading.Event`."""
 
-    def wait(self, timeout: float) -> bool: ...
-    def is_set(self) -> bool: ...
+    def wait(self, timeout: float) -> bool:
+        """Wait at most ``timeout`` seconds; return whether the end was asked for."""
+
+    def is_set(self) -> bool:
+        """Return whether the end was asked for."""
 
 
 @dataclass

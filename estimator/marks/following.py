@@ -149,6 +149,7 @@ class Mark:
 
     @property
     def travelled_px(self) -> float:
+        """Return the length of the way that the mark has moved in the image, in px."""
         return float(np.linalg.norm(self.high_px - self.low_px))
 
     @property

@@ -197,12 +197,15 @@ class DetectionStore:
             write_json_atomic(mark, state)
 
     def path(self, batch: Batch, kind: str = "detections") -> Path:
+        """Return the file of a batch of frames."""
         return self.folder / f"{kind}-{batch[0]:07d}.csv"
 
     def missing(self, kind: str = "detections") -> list[Batch]:
+        """Return the batches of frames that are not detected yet."""
         return [b for b in self.batches if not self.path(b, kind).is_file()]
 
     def tables(self, kind: str = "detections") -> Iterator[pd.DataFrame]:
+        """Yield the table of each batch of frames, in their order."""
         return (read_batch(self.path(batch, kind)) for batch in self.batches)
 
     def fill(

@@ -496,10 +496,12 @@ class Common:
 
     @property
     def shift_mm(self) -> Array:
+        """Return the shift (3,) that all bubbles have in common."""
         return self.shift[POSITION]
 
     @property
     def covariance_mm2(self) -> Array:
+        """Return the covariance (3, 3) of `shift_mm`."""
         return self.covariance[POSITION, POSITION]
 
     def predicted(self, step: Transition) -> Common:

@@ -86,6 +86,7 @@ class RowMaker:
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
+        """Return the run's cameras."""
         return self.model.cameras
 
     def sights(self, frames: Sequence[Tables]) -> list[Sight]:

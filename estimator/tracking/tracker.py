@@ -47,7 +47,7 @@ class OpenFrames:
         self._seen: dict[int, int] = {}
 
     def begin(self, frame: int, t_s: float, count: int) -> None:
-        """Add a frame with so many measurements, without ids."""
+        """Add a frame; count : number of its measurements, which have no track yet."""
         self._frames[frame] = (t_s, np.full(count, NO_PARTICLE))
 
     def write(self, track: int, frames: Ints, columns: Ints) -> None:

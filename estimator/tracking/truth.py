@@ -121,4 +121,5 @@ def pixels(table: pd.DataFrame, cameras: Sequence[str], name: str) -> Array:
 
 
 def rms(error: Array) -> float:
+    """Return the root mean square of errors; NaN of none."""
     return float(np.sqrt(np.mean(error**2))) if error.size else float("nan")

@@ -40,10 +40,12 @@ class FrameSource(Protocol):
     """
 
     @property
-    def path(self) -> Path: ...
+    def path(self) -> Path:
+        """Return the file or folder that holds the frames."""
 
     @property
-    def cut_short(self) -> bool: ...
+    def cut_short(self) -> bool:
+        """Return whether the file ends before the frames that its header states."""
 
     def __len__(self) -> int: ...
 

@@ -100,6 +100,7 @@ class RawLog:
             raise log_error(path, error, recorded=False) from error
 
     def append(self, entry: Entry) -> None:
+        """Add an entry, which `flush` writes to the disk."""
         self._waiting.append(packed(entry))
 
     def flush(self) -> None:
@@ -146,6 +147,7 @@ class RawLog:
             raise log_error(self.path, error) from error
 
     def close(self) -> None:
+        """Close the file; what was appended since the last `flush` is lost."""
         self._file.close()
 
     def __enter__(self) -> RawLog:

@@ -122,9 +122,11 @@ class Reader(threading.Thread):
         self._stop_asked = threading.Event()
 
     def stop(self) -> None:
+        """Ask the thread to end after what it is reading."""
         self._stop_asked.set()
 
     def run(self) -> None:
+        """Read the port until `stop`; one that is lost is opened again when it comes back."""
         try:
             while not self._stop_asked.is_set():
                 try:

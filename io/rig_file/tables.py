@@ -34,6 +34,7 @@ class Problem:
 
     @property
     def place(self) -> str:
+        """Return where in rig.toml the problem is, like "[cameras.left] image_size_px"."""
         return " ".join(p for p in (f"[{self.table}]" if self.table else "", self.key) if p)
 
 

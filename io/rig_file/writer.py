@@ -134,6 +134,7 @@ def _lines(lines: list[Line]) -> str:
 
 
 def toml_key(key: str) -> str:
+    """Return a key as TOML has it: quoted unless it is of letters, digits, - and _."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
 
 

@@ -75,7 +75,10 @@ class Table:
         return read_table(file, columns, extra=True, empty=True).reset_index(drop=True)
 
     def reader_of_parts(self, file: Path, *, need: Collection[str] | None = None) -> Read:
-        """Return the function that reads some rows as `read` does, for a `FrameTable`."""
+        """Return the function that reads some of a file's rows, for a `FrameTable`.
+
+        Columns are checked and converted as by `read`. need : as for `read`.
+        """
 
         def read(content: bytes, row: int) -> pd.DataFrame | None:
             table = read_part(file, content, row, self.of(need=need))

@@ -208,7 +208,7 @@ def _log_travel(stream: Any, rows: pd.DataFrame, smoothed: pd.DataFrame) -> None
 
 
 def log_bodies(stream: Any, rows: pd.DataFrame) -> None:
-    """Log the bodies of a frame's bubbles in space."""
+    """Log the bodies of a frame's bubbles in space; rows : of tracks.csv, one per bubble."""
     rr = need_rerun()
     points = rows[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     quadrics, _ = ellipsoids_of(rows)

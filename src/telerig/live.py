@@ -111,6 +111,7 @@ class Feed:
         self._last_s: dict[str, float] = {}
 
     def due(self, kind: str) -> bool:
+        """Return whether nothing of this kind was told for half a second."""
         last_s = self._last_s.get(kind, float("-inf"))
         return self._mine() and time.monotonic() - last_s >= _EVERY_S
 

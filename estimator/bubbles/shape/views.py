@@ -74,6 +74,7 @@ class Views:
 
     @staticmethod
     def of(sightings: Sightings, cameras: Sequence[Camera]) -> Views:
+        """Triangulate the centres of outlines; sightings : (B, n) of n cameras."""
         count = len(cameras)
         found = triangulate_views(
             cameras,

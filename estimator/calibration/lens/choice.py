@@ -97,6 +97,7 @@ class Choice:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Return the name of the lens model of each camera."""
         return tuple(name_of(lens) for lens in self.lenses)
 
 

@@ -234,9 +234,12 @@ class Named(Protocol):
     """A camera with a name and an image size, whether calibrated or only described in rig.toml."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Return the camera's name."""
+
     @property
-    def image_size_px(self) -> tuple[int, int]: ...
+    def image_size_px(self) -> tuple[int, int]:
+        """Return (width, height) of its images."""
 
 
 def check_same_rig(first: Sequence[Named], second: Sequence[Named]) -> None:
@@ -308,6 +311,7 @@ def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
 
 
 def chance_words(p_value: float) -> str:
+    """Return a p-value in words, down to 1e-12."""
     return f"chance {p_value:.0e}" if p_value >= _LEAST_CHANCE else "chance below 1e-12"
 
 

@@ -130,6 +130,7 @@ class Problem:
 
     @property
     def rho_mm(self) -> tuple[float, ...]:
+        """Return half the image's diagonal of each camera in mm, the unit of its distortion."""
         return tuple(c.rho_mm for c in self.cameras)
 
     @property

@@ -73,6 +73,7 @@ class Candidates:
 
     @property
     def promising(self) -> tuple[Candidate, ...]:
+        """Return the blobs that may be dots: those without a reason against them."""
         return tuple(blob for blob in self.blobs if not blob.reason)
 
     def up_to(self, diameter_px: float) -> Candidates:

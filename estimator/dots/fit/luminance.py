@@ -137,6 +137,7 @@ class DotFit:
 
     @property
     def dof(self) -> int:
+        """Return the degrees of freedom of the fit: pixels used less parameters, at least 1."""
         return max(self.pixels - self.dropped - PARAMETERS, 1)
 
     @property

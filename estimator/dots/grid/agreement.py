@@ -40,6 +40,7 @@ class PossibleNumbers:
 
     @property
     def is_decided(self) -> bool:
+        """Return whether a single way of numbering the dots is likely."""
         return bool(is_likely(self.score).sum() == 1)
 
     @property

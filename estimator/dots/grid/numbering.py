@@ -271,6 +271,7 @@ class Placements:
         return self.take(np.flatnonzero(is_likely(self.score)))
 
     def take(self, which: Ints) -> Placements:
+        """Return some of the placements; which : their indices (K,)."""
         return Placements(self.turn[which], self.shift[which], self.score[which])
 
 

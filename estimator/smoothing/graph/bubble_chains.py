@@ -39,6 +39,7 @@ class Places:
 
     @staticmethod
     def of(graph: GraphLayout) -> Places:
+        """Return the places of the states of all bubbles in a graph."""
         lengths = np.diff(graph.first_row)
         order = np.argsort(-lengths, kind="stable").astype(np.int64)
         ages = np.arange(int(lengths.max(initial=0)))

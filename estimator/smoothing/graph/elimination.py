@@ -263,6 +263,7 @@ class Clique:
 
     @property
     def keys(self) -> list[int]:
+        """Return the keys of its variables: those that it eliminates, then the separator."""
         return self.fronts + self.separator
 
 

@@ -77,6 +77,7 @@ class ShakeLayout:
 
     @property
     def size(self) -> int:
+        """Return the number of states of the shake at one time."""
         return len(self.position)
 
 
@@ -101,6 +102,7 @@ class BubbleLayout:
 
     @property
     def size(self) -> int:
+        """Return the number of states of a bubble at one time."""
         return int(self.position.shape[1])
 
 
@@ -502,14 +504,17 @@ class GraphLayout:
 
     @property
     def rows(self) -> int:
+        """Return the number of (bubble, time) pairs."""
         return int(self.first_row[-1])
 
     def row(self, bubble: Ints, graph: Ints) -> Ints:
+        """Return the rows of bubbles (N,) at times of the graph (N,)."""
         first = np.array([b.first for b in self.problem.bubbles], np.int64)
         return np.asarray(self.first_row[bubble] + graph - first[bubble])
 
     @property
     def sensor_flags(self) -> tuple[bool, bool]:
+        """Return whether scale and delay of the accelerometers are estimated."""
         model = self.model
         return model.accelerometer_scale_sigma > 0, model.accelerometer_delay_sigma_s > 0
 
@@ -526,6 +531,7 @@ class GraphLayout:
 
     @property
     def encoder_size(self) -> int:
+        """Return how many constants of the encoder are estimated."""
         return sum(self.encoder_flags)
 
     @property
@@ -535,6 +541,7 @@ class GraphLayout:
         return 0 if share is None else int(share.root.shape[1])
 
     def counts(self) -> Families[Family]:
+        """Return number and size of the variables of each family."""
         problem = self.problem
         return Families(
             Family(len(self.nodes.t_s), self.shake.size),
@@ -655,6 +662,7 @@ def points_in_rig(graph: GraphLayout, state: State) -> Array:
 
 
 def times(matrices: Array, vectors: Array) -> Array:
+    """Return the products (..., n) of matrices (..., n, m) and vectors (..., m)."""
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 

@@ -360,6 +360,7 @@ class Factor:
         self.square -= float((linear * self.constants).sum())
 
     def log_evidence(self) -> float:
+        """Return the logarithm of the marginal likelihood of the signal."""
         used = self.weight[self.weight > 0]
         log_noise = 0.5 * float(np.log(used / (2 * np.pi)).sum())
         log_inner = float(np.log(np.diag(self.inner[0])).sum())
@@ -385,6 +386,7 @@ class Factor:
         return sides, constants
 
     def posterior(self) -> SignalPosterior:
+        """Return the states and constants that the signal gives, with their covariances."""
         system, signal, count = self.system, self.signal, self.count
         states = self.chain.means(self.spread()[0][:, :count])
         states = states @ np.swapaxes(self.bases, -1, -2)[self.which]

@@ -240,6 +240,7 @@ class Group:
 
     @cached_property
     def fast(self) -> tuple[Signal, ...]:
+        """Return the signals as means and differences of their bubbles, which are quicker."""
         return tuple(part for signal in self.signals for part in pooled(signal))
 
 

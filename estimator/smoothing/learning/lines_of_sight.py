@@ -66,6 +66,7 @@ class Signal:
 
     @property
     def samples(self) -> int:
+        """Return the number of samples that count."""
         return int((self.weight > 0).sum())
 
     @property

@@ -407,7 +407,10 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
             todo="give the tracks.csv that `telerig track` wrote with this calibration",
         )
     if not len(table):
-        raise InputError("the tracks have no rows", where="tracks", todo="track the run first")
+        raise InputError(
+            "the tracks have no rows: no bubble was followed", where="tracks",
+            todo="look at the report of `telerig track` for the reasons, and track again",
+        )  # fmt: skip
     names = [p for p in table["particle"].unique() if isinstance(p, str)]
     if names:
         raise InputError(

@@ -129,6 +129,6 @@ def seen_points(cameras: Sequence[Camera], volume: Volume, per_edge: int) -> Arr
         raise InputError(
             f"only {len(points)} of {per_edge**3} points of the volume ({volume.words()}) are in "
             "every camera's image",
-            todo="give a volume inside the images",
+            todo="give a smaller volume, or one about the middle of the fields of view (--volume)",
         )
     return points

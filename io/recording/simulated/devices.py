@@ -207,6 +207,7 @@ class PseudoTerminal:
         self.master = self._slave = -1
 
     def plug(self) -> None:
+        """Open the pseudo-terminal and link ``name`` to it."""
         import tty
 
         self.master, self._slave = os.openpty()
@@ -217,6 +218,7 @@ class PseudoTerminal:
         beside.replace(self.name)
 
     def unplug(self) -> None:
+        """Close it and remove the link, as when a cable is pulled."""
         if self.master >= 0:
             self.name.unlink(missing_ok=True)
             os.close(self._slave)
@@ -311,10 +313,12 @@ class SimulatedPorts:
 
     @property
     def devices(self) -> list[DeviceDescription]:
+        """Return the descriptions of the simulated devices, with the ports to open."""
         return [sim.device for sim in self.sims]
 
     @property
     def truths(self) -> list[Truth]:
+        """Return what each device has sent, in the order of `devices`."""
         return [runner.truth for runner in self._runners]
 
     def __enter__(self) -> SimulatedPorts:

@@ -297,6 +297,7 @@ def view_rows(results: CalibrationResults, page_folder: Path) -> list[Row]:
 
 
 def share_of(part: int, whole: int) -> str:
+    """Return "PART of WHOLE", or "-" of nothing."""
     return f"{part} of {whole}" if whole else "-"
 
 

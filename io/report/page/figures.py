@@ -159,6 +159,7 @@ def png(figure: Any, dpi: int = 130, colours: int | None = None) -> str:
 
 
 def data_uri(kind: str, content: bytes) -> str:
+    """Return bytes as a data URI; kind : their MIME type, like "image/png"."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 

@@ -35,6 +35,8 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
+    """Key numbers side by side."""
+
     kind: ClassVar[str] = "tiles"
     tiles: tuple[Tile, ...]
 

@@ -28,6 +28,7 @@ def colour_of(k: int) -> str:
 
 
 def camera_colour(index: int) -> str:
+    """Return the colour of a camera, by its number from 0."""
     return COLOURS[index % len(COLOURS)]
 
 
@@ -125,9 +126,11 @@ class Vertical:
         return (one, other, self.axis) if self.sign > 0 else (other, one, self.axis)
 
     def name(self, axis: int) -> str:
+        """Return the label of a rig axis (0, 1, 2): "height", or its letter."""
         return "height" if axis == self.axis else "xyz"[axis]
 
     def sign_of(self, axis: int) -> float:
+        """Return the factor of a rig axis (0, 1, 2) that makes the height increase upwards."""
         return self.sign if axis == self.axis else 1.0
 
 

@@ -80,6 +80,7 @@ class CalibrationResults:
 
     @property
     def statistics(self) -> Mapping[str, Any]:
+        """Return ``statistics`` of calibration.json."""
         return self.file.statistics
 
     @property
@@ -95,6 +96,7 @@ class CalibrationResults:
 
     @property
     def camera_names(self) -> list[str]:
+        """Return the names of the cameras, in the rig's order."""
         return [camera.name for camera in self.cameras]
 
 

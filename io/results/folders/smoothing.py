@@ -89,6 +89,7 @@ class SmoothingResults:
         return tuple(axis for axis, none in zip(AXES, still) if none and len(self.shake))
 
     def seen(self, camera: str) -> tuple[str, ...]:
+        """Return the rig axes ("x", "y", "z") along which the shake of a camera can be seen."""
         return tuple(axis for axis in AXES if axis not in self.unseen(camera))
 
 

@@ -83,6 +83,7 @@ class TrackResults:
 
     @property
     def pairs(self) -> Pairs:
+        """Return what the run says of its pairs of cameras; an empty one where it says nothing."""
         return self.file.pairs or Pairs()
 
     def image_size_px(self, camera: str) -> tuple[int, int] | None:
@@ -159,6 +160,7 @@ def _rig(stated: TrackingFile, names: tuple[str, ...], folder: Path) -> tuple[Ca
 
 
 def unit_vector(vector: ArrayLike) -> Array:
+    """Return a vector divided by its length."""
     found = np.asarray(vector, float)
     return np.asarray(found / np.linalg.norm(found))
 

@@ -64,6 +64,7 @@ class Carriage:
 
     @property
     def frames(self) -> slice:
+        """Return the samples at which the cameras expose."""
         return slice(0, len(self.t_s) - 1, self.stride)
 
 
@@ -90,22 +91,27 @@ class RunScene:
 
     @property
     def t_s(self) -> Array:
+        """Return the times (F,) of the frames in s."""
         return self.carriage.t_s[self.carriage.frames]
 
     @property
     def position_mm(self) -> Array:
+        """Return the carriage's travel (F,) in the frames, without the shake."""
         return self.carriage.position_mm[self.carriage.frames]
 
     @property
     def velocity_mm_s(self) -> Array:
+        """Return the carriage's velocity (F,) in the frames."""
         return self.carriage.velocity_mm_s[self.carriage.frames]
 
     @property
     def shake_mm(self) -> Array:
+        """Return the shake (C, F, 3) of each camera in the frames, in rig axes."""
         return self.carriage.shake.offset_mm[:, self.carriage.frames]
 
     @property
     def shake_mm_s(self) -> Array:
+        """Return the velocity (C, F, 3) of the shake in the frames."""
         return self.carriage.shake.velocity_mm_s[:, self.carriage.frames]
 
     def rig_from_lab_mm(self, camera: int, frame: int) -> Array:

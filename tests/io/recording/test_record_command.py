@@ -116,7 +116,7 @@ def test_simulated_devices_print_their_ports_and_end(tmp_path: Path) -> None:
 
 def test_what_record_refuses(dataset: Path, tmp_path: Path) -> None:
     folder = dataset / "runs" / "one"
-    assert "no device 'encodr'" in run("record", folder, "--port", "encodr=/dev/x", code=2)
+    assert "no [devices.encodr]" in run("record", folder, "--port", "encodr=/dev/x", code=2)
     assert "did you mean encoder?" in run("record", folder, "--port", "encodr=/dev/x", code=2)
     twice = ("--port", "encoder=a", "--port", "encoder=b")
     assert "names encoder twice" in run("record", folder, *twice, code=2)

@@ -30,7 +30,7 @@ from telerig.estimator.smoothing.truth import motion_error
 from telerig.estimator.tracking.truth import score_tracks
 from telerig.io.simulation.presets import preset, run_preset
 from telerig.rig.camera import Camera
-from telerig.rig.pose import nearest_rotation
+from telerig.rig.pose import Pose
 from telerig.rig.triangulation import working_volume
 
 Array = NDArray[np.float64]
@@ -85,18 +85,13 @@ def space_um(sigma_px: float, seed: int) -> tuple[float, float]:
         noisy[0], noisy[1], sigma_px=sigma_px, include_calibration=False
     )
     return (
-        1e3 * rms(np.linalg.norm(_aligned(placed, points) - points, axis=1)),
+        1e3 * rms(np.linalg.norm(Pose.aligning(placed, points).apply(placed) - points, axis=1)),
         1e3 * rms(np.linalg.norm(known.points_mm - points, axis=1)),
     )
 
 
 def _with(calibration: Calibration, cameras: tuple[Camera, ...]) -> Calibration:
     return replace(calibration, cameras=cameras)
-
-
-def _aligned(points: Array, onto: Array) -> Array:
-    a, b = points - points.mean(0), onto - onto.mean(0)
-    return a @ nearest_rotation(b.T @ a).T + onto.mean(0)
 
 
 def one(seed: int, folder: Path) -> Figures:

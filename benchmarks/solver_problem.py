@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.solver.problem import Problem, matrix_from_camera
+from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.start import known_target
 from telerig.factors.calibration import Observations, State, pixels
 from telerig.rig.camera import Camera
@@ -65,7 +65,7 @@ def _truth(cameras: list[Camera], dots: Array, views: int, rng: np.random.Genera
     middle = dots.mean(0)
     poses[:, :3, 3] = rng.uniform(-1, 1, (views, 3)) - poses[:, :3, :3] @ middle
     intrinsics = np.array([c.intrinsics for c in cameras])
-    return State(intrinsics, np.array([matrix_from_camera(c) for c in cameras]), poses, dots)
+    return State(intrinsics, np.array([c.rig_from_camera.matrix for c in cameras]), poses, dots)
 
 
 def with_solver(problem: Problem, solver: str) -> Problem:

@@ -82,10 +82,22 @@ class Pose:
         """Return the pose of a rotation vector (3,) in rad and a translation (3,) in mm."""
         return Pose(rotation_from_rotvec(rotvec_rad), np.asarray(translation_mm, float))
 
+    @staticmethod
+    def aligning(source_mm: Array, target_mm: Array) -> Pose:
+        """Return the pose that moves points (N, 3) to others with the least squared distances."""
+        a, b = source_mm.mean(0), target_mm.mean(0)
+        rotation = nearest_rotation((target_mm - b).T @ (source_mm - a))
+        return Pose(rotation, b - rotation @ a)
+
     @property
     def rotvec_rad(self) -> Array:
         """Return the rotation vector (3,) in rad."""
         return rotvec_from_rotation(self.rotation)
+
+    @property
+    def matrix(self) -> Array:
+        """The transformation of homogeneous coordinates (4, 4)."""
+        return np.block([[self.rotation, self.translation_mm[:, None]], [0.0, 0.0, 0.0, 1.0]])
 
     def apply(self, points_mm: ArrayLike) -> Array:
         """Return points (..., N, 3) in target coordinates, from those in source coordinates."""

@@ -34,7 +34,7 @@ from telerig.io.files.csv_table import read_table
 from telerig.io.images.read import natural
 from telerig.io.results.findings import Code, Finding
 from telerig.io.tables.calibration import POSITIONS
-from telerig.rig.pose import Pose, across, nearest_rotation
+from telerig.rig.pose import Pose, across
 from telerig.rig.target import Target
 from telerig.rig.triangulation import triangulate_any
 from telerig.statistics import robust_sd
@@ -585,7 +585,7 @@ def start(stops: Stops) -> Travel:
     at_zero = points + slope * reading[:, None]
     seen = np.unique(dot)
     middle = np.array([np.median(at_zero[dot == one], axis=0) for one in seen])
-    return Travel(_fitted_pose(stops.known.dots_mm[seen], middle), slope)
+    return Travel(Pose.aligning(stops.known.dots_mm[seen], middle).matrix, slope)
 
 
 def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
@@ -605,11 +605,3 @@ def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
             todo="keep the target in the images of two cameras while the stage travels",
         )
     return np.asarray(np.median(every, axis=0))
-
-
-def _fitted_pose(place: Array, points: Array) -> Array:
-    """Return rig_from_target (4, 4) by a least-squares fit of places to points (N, 3) (Kabsch)."""
-    pose, a, b = np.eye(4), place.mean(0), points.mean(0)
-    pose[:3, :3] = nearest_rotation((points - b).T @ (place - a))
-    pose[:3, 3] = b - pose[:3, :3] @ a
-    return pose

@@ -33,9 +33,8 @@ from telerig.estimator.dots.fit.candidates import (
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dot
 from telerig.estimator.dots.fit.surroundings import (
     close_neighbours,
-    contrast_gradients,
     dot_window,
-    with_common_blur,
+    priors_from,
     without_neighbours,
 )
 from telerig.estimator.images.noise import (
@@ -57,7 +56,6 @@ COLUMNS = [
 REJECTED = ["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"]
 
 _FIRST_SIGMA_PX = 1.0
-_PILOTS = 5
 _FEWEST_PIXELS = 25
 """Least number of pixels for a second fit; a dot whose first fit left the image has fewer."""
 _ROUNDS = 10
@@ -215,19 +213,10 @@ class _Scene:
     blobs: list[Candidate]
 
     def first_fits(self, noise: NoiseModel) -> list[DotFit]:
-        """Fit each dot independently; the first five give the start value of the blur."""
-        pilots = self._coarse_fits(self.blobs[:_PILOTS], noise, _FIRST_SIGMA_PX)
-        if len(self.blobs) <= _PILOTS:
-            return pilots
-        sigma = float(np.median([fit.sigma_px for fit in pilots]))
-        return pilots + self._coarse_fits(self.blobs[_PILOTS:], noise, sigma)
-
-    def _coarse_fits(
-        self, blobs: Sequence[Candidate], noise: NoiseModel, sigma_px: float
-    ) -> list[DotFit]:
+        """Fit each dot independently, to a part of its pixels."""
         fits = []
-        for blob in blobs:
-            start = Start(blob.centre_px, blob.shape_px, sigma_px)
+        for blob in self.blobs:
+            start = Start(blob.centre_px, blob.shape_px, _FIRST_SIGMA_PX)
             window = dot_window(self.grey, self.labels, blob, start, coarse=True)
             fits.append(fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1))
         return fits
@@ -238,7 +227,7 @@ class _Scene:
         Of dots that share pixels, each is fitted after the light of the others was subtracted,
         until none moves (Gauss-Seidel iteration; its limit is the fit of all dots together).
         """
-        priors = with_common_blur(contrast_gradients(fits, self.grey.shape), fits)
+        priors = priors_from(fits, self.grey.shape)
         neighbours = close_neighbours(fits)
         fits = list(fits)
         again: Sequence[int] = range(len(fits))

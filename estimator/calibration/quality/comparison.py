@@ -21,7 +21,7 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.thresholds import SURE_SD, UNLIKELY
 from telerig.rig.camera import Camera
-from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
+from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_covariance, triangulate_any, working_volume
 from telerig.short_text import number, with_sd
 
@@ -353,16 +353,6 @@ def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
     return Change(label, "ppm", float(change), float(1e6 * np.sqrt(variance)))
 
 
-def after_rigid_motion(found_mm: Array, points_mm: Array) -> Array:
-    """Return the differences (N, 3) of two sets of N points after their best rigid alignment.
-
-    They are found_mm, moved rigidly such that it fits points_mm best, minus points_mm; both are
-    (N, 3).
-    """
-    a, b = found_mm - found_mm.mean(0), points_mm - points_mm.mean(0)
-    return np.asarray(a @ nearest_rotation(b.T @ a).T - b)
-
-
 def difference_from_truth(
     calibration: Calibration, cameras: Sequence[Camera], points_mm: Array | None = None
 ) -> FieldDifference:
@@ -385,7 +375,7 @@ def field_difference(first: Rig, second: Rig, points_mm: Array | None = None) ->
     points = working_volume(first.cameras, 5) if points_mm is None else points_mm
     pixels = [camera.project(points) for camera in first.cameras]
     found = triangulate_any(second.cameras, pixels, 1.0).points_mm
-    shift = after_rigid_motion(found, points)
+    shift = Pose.aligning(found, points).apply(found) - points
     one, other = (
         aligned_covariance(rig.cameras, rig.free, rig.covariance, points) for rig in (first, second)
     )

@@ -236,17 +236,10 @@ def prior_sigma(camera: Camera) -> Array:
 
 def nominal_state(problem: Problem) -> State:
     """Return the state of nominal cameras and dots, with the target at the origin in every view."""
-    poses = np.array([matrix_from_camera(c) for c in problem.cameras])
+    poses = np.array([c.rig_from_camera.matrix for c in problem.cameras])
     intrinsics = np.array([c.intrinsics for c in problem.cameras])
     views = np.tile(np.eye(4), (len(problem.views), 1, 1))
     return State(intrinsics, poses, views, problem.nominal_mm.copy())
-
-
-def matrix_from_camera(camera: Camera) -> Array:
-    """Return rig_from_camera as a matrix (4, 4)."""
-    pose, out = camera.rig_from_camera, np.eye(4)
-    out[:3, :3], out[:3, 3] = pose.rotation, pose.translation_mm
-    return out
 
 
 def held_at_nominal(problem: Problem, state: State) -> State:

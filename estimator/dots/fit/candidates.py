@@ -7,7 +7,7 @@ size nor even light. Blobs are rejected by their outlines before the fit, dots b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, sqrt
 from typing import Literal
@@ -32,13 +32,10 @@ _BLOCK = 4
 _COARSE_WINDOW = 5
 _STRONG_SHARE = 0.15
 _STRONG_SIGMA = 7.0
-_FLAT_DISTANCES_PX = (6, 5, 4, 3, 2)
-_FLAT_SHARE = 0.1
+_FLAT_DISTANCE_PX = 3
 _PIECE_LEVELS = (0.15, 0.3, 0.45, 0.6, 0.75)
-_PIECE_SHARE = 0.6
 _PIECE_SEMI_AXIS_PX = 4.0
 _PIECE_GROWTH_PX = 0.5
-_LARGE_PIECE = 1.5
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,8 @@ class Candidate:
     centre_px, shape_px : (2,), (3,) of the ellipse with the same second moments, see
         ``blurred_ellipse``.
     holes : outlines (N, 2) of the holes in the region, in px.
-    reason : why the region cannot be a dot; None if it may be one.
+    unevenness : how far the outline is from an ellipse, in standard deviations of a dot's.
+    reason : why the region is left out whatever its outline; None if it may be a dot.
     """
 
     label: int
@@ -57,7 +55,13 @@ class Candidate:
     shape_px: Array
     area_px2: float
     holes: tuple[NDArray[np.int32], ...]
+    unevenness: float
     reason: Reason | None
+
+    @property
+    def promising(self) -> bool:
+        """Whether the outline alone may be that of a dot."""
+        return not self.reason and not is_unlike([self.unevenness])
 
 
 @dataclass(frozen=True)
@@ -73,8 +77,8 @@ class Candidates:
 
     @property
     def promising(self) -> tuple[Candidate, ...]:
-        """Return the blobs that may be dots: those without a reason against them."""
-        return tuple(blob for blob in self.blobs if not blob.reason)
+        """Return the blobs whose outline may be that of a dot."""
+        return tuple(blob for blob in self.blobs if blob.promising)
 
     def up_to(self, diameter_px: float) -> Candidates:
         """Return the candidates; those larger than this diameter are marked as too large."""
@@ -134,13 +138,10 @@ def _away_from(bright: Bools) -> Bools:
     grey = bright.astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
-    flat: Bools = crossing == 0
-    for distance in _FLAT_DISTANCES_PX:
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * distance + 1, 2 * distance + 1))
-        flat = np.asarray(cv2.dilate(crossing, disc) == 0)
-        flat[[0, -1]] = flat[:, [0, -1]] = False
-        if np.count_nonzero(flat) > _FLAT_SHARE * flat.size:
-            break
+    size = 2 * _FLAT_DISTANCE_PX + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    flat: Bools = np.asarray(cv2.dilate(crossing, disc) == 0)
+    flat[[0, -1]] = flat[:, [0, -1]] = False
     return flat
 
 
@@ -180,8 +181,11 @@ def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) 
         (outline, _first_look(outline, holes, labels.shape, min_diameter_px))
         for outline, holes in _outlines(above > 0)
     ]
-    for _ in range(2):
-        shown = _with_pieces(shown, above, min_diameter_px)
+    shown = [
+        one
+        for outline, look in shown
+        for one in _pieces(above, outline, look, min_diameter_px) or [(outline, look)]
+    ]
     blobs: list[Candidate] = []
     for outline, look in shown:
         if look is not None:
@@ -191,23 +195,6 @@ def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) 
 
 
 _Look = tuple[NDArray[np.int32], Candidate | None]
-
-
-def _with_pieces(shown: list[_Look], above: Float32, min_diameter_px: float) -> list[_Look]:
-    """Return the outlines, those of merged small dots replaced by their pieces (`_pieces`)."""
-    good = [look.area_px2 for _, look in shown if look is not None and not look.reason]
-    large = _LARGE_PIECE * float(np.median(good)) if good else 0.0
-    result: list[_Look] = []
-    for outline, look in shown:
-        pieces: list[_Look] = []
-        if (
-            look is not None
-            and look.reason != Reason.TOO_SMALL
-            and (look.reason or look.area_px2 > large)
-        ):
-            pieces = _pieces(above, outline, min_diameter_px - 2.0 * _PIECE_GROWTH_PX)
-        result += pieces or [(outline, look)]
-    return result
 
 
 def fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) -> None:
@@ -234,11 +221,16 @@ def _outlines(
     return [(outlines[k], tuple(holes.get(int(k), ()))) for k in np.flatnonzero(parents < 0)]
 
 
-def _pieces(above: Float32, outline: NDArray[np.int32], min_diameter_px: float) -> list[_Look]:
+def _pieces(
+    above: Float32, outline: NDArray[np.int32], whole: Candidate | None, min_diameter_px: float
+) -> list[_Look]:
     """Return the small dots whose blurs overlap, separated by a higher threshold.
 
-    Only blobs nowhere thicker than the blur are separated: larger dots touch in the world.
+    Only blobs that are no dot and nowhere thicker than the blur are separated: larger dots touch in
+    the world.
     """
+    if whole is None or whole.promising or whole.reason == Reason.TOO_SMALL:
+        return []
     low, high = outline.min(axis=0), outline.max(axis=0) + 1
     filled = np.zeros((high - low)[::-1] + 2, np.uint8)
     fill(filled, 1, outline - low + 1)
@@ -253,11 +245,11 @@ def _pieces(above: Float32, outline: NDArray[np.int32], min_diameter_px: float) 
         inside = crop > level * peak
         small: list[_Look] = []
         for piece, _ in _outlines(inside):
-            look = _first_look(piece + low, (), above.shape, min_diameter_px)
+            least = min_diameter_px - 2.0 * _PIECE_GROWTH_PX
+            look = _first_look(piece + low, (), above.shape, least)
             if look is not None and _is_small_dot(look):
                 small.append((piece + low, look))
-        covered = sum(look.area_px2 for _, look in small if look is not None)
-        if len(small) > max(1, len(best)) and covered > _PIECE_SHARE * np.count_nonzero(inside):
+        if len(small) > max(1, len(best)):
             best = small
     grown = _PIECE_GROWTH_PX * np.array([1.0, 0.0, 1.0])
     return [(o, replace(look, shape_px=look.shape_px + grown)) for o, look in best if look]
@@ -266,7 +258,7 @@ def _pieces(above: Float32, outline: NDArray[np.int32], min_diameter_px: float) 
 def _is_small_dot(piece: Candidate) -> bool:
     if piece.reason == Reason.TOUCHES_BORDER:
         return True
-    sound = piece.reason in (None, Reason.TOO_SMALL)
+    sound = piece.promising or piece.reason == Reason.TOO_SMALL
     return sound and bool(semi_axes(piece.shape_px)[1] <= _PIECE_SEMI_AXIS_PX)
 
 
@@ -281,14 +273,12 @@ def _first_look(
     if size.max() < 0.5 * min_diameter_px:
         return None
     area, centre, shape = _filled_moments(outline)
-    reason: Reason | None
+    reason: Reason | None = None
     if low.min() <= 0 or np.any(low + size >= image_shape[::-1]):
         reason = Reason.TOUCHES_BORDER
     elif 2.0 * semi_axes(shape)[0] < min_diameter_px:
         reason = Reason.TOO_SMALL
-    else:
-        reason = _reason_against_outline(outline, centre, shape)
-    return Candidate(0, centre, shape, area, holes, reason)
+    return Candidate(0, centre, shape, area, holes, _unevenness(outline, centre, shape), reason)
 
 
 def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
@@ -316,37 +306,32 @@ def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
     return np.array([round_part + across, turned * uv, round_part - across])
 
 
-def _reason_against_outline(
-    outline: NDArray[np.int32], centre: Array, shape: Array
-) -> Reason | None:
+def _unevenness(outline: NDArray[np.int32], centre: Array, shape: Array) -> float:
+    """Return how far an outline (N, 2) is from the ellipse of its blob, in standard deviations."""
     offset = outline - centre
     distance = approximate_distance_px(shape, offset[:, 0], offset[:, 1]) + 0.5
-    b = semi_axes(shape)[1]
-    roughness = float(np.sqrt(np.mean(distance**2)))
-    if roughness <= 0.5 + 0.04 * b:
-        return None
-    hull = cv2.contourArea(cv2.convexHull(outline.reshape(-1, 1, 2)))
-    solidity = cv2.contourArea(outline.reshape(-1, 1, 2)) / max(hull, 1.0)
-    return Reason.MERGED if 0.6 < solidity < 0.95 else Reason.NOT_ELLIPSE
+    excess = float(np.sqrt(np.mean(distance**2))) - OUTLINE_PX
+    return max(excess, 0.0) / float(OUTLINE_SD[0] + OUTLINE_SD[1] * semi_axes(shape)[1])
 
 
 REFUSED = 1e-4
-"""Share of true dots whose size, contrast and residuals may be refused as unlike the others."""
-LOG_SPREAD = 0.35
+"""Share of true dots that may be refused as unlike the others."""
+OUTLINE_PX, OUTLINE_SD = 0.3, (0.02, 0.004)
+"""RMS distance of a dot's outline from the ellipse of its blob, as pixels are drawn; and standard
+deviation of its excess, in px and per semi-minor axis."""
+LOG_SPREAD = 0.25
 """Least standard deviation of log radius and log contrast of the dots of one image: marks are up to
 twice as large as dots, and light falls off towards the corners."""
-LOG_FITTED = 0.2
-"""Standard deviation of the log of a dot's fitted size divided by that of its blob."""
-MODEL_RESIDUAL = 0.03
+LOG_FITTED = 0.15
+"""Standard deviation of the log of a dot's fitted size divided by that of its blob, and of the way
+between both centres divided by the radius."""
+MODEL_RESIDUAL, MODEL_RESIDUAL_DOTS = 0.03, 5
 """What the luminance model leaves of true dots (`DotFit.misfit`) where few dots show it; medians of
-seven images of real plates are 0.026 to 0.058."""
-MODEL_RESIDUAL_DOTS = 5
-"""It counts as so many dots of the image."""
-LOG_MISFIT = 0.2
-"""Standard deviation of the log of a true dot's misfit about the median of its image, both
-increased by `LEAST_MISFIT`: 0.1 to 0.2 on real plates."""
-LEAST_MISFIT = 0.02
-"""A misfit that any dot may have: rounding, specks of dust, an edge without blur."""
+seven images of real plates are 0.026 to 0.058. It counts as so many dots of the image."""
+LOG_MISFIT, LEAST_MISFIT = 0.15, 0.02
+"""Standard deviation of the log of a true dot's misfit about the median of its image, 0.1 to 0.2 on
+real plates; both are increased by a misfit that any dot may have: rounding, specks of dust, an edge
+without blur."""
 _HOLE_SHARE = 0.02
 """Least share of a ring's area that is hole; specks of dust are smaller."""
 
@@ -384,9 +369,17 @@ class Look:
 
 def is_unlike(deviations: ArrayLike) -> Bools:
     """Return whether deviations (..., k), in standard deviations, are together rarer than `REFUSED`
-    among true dots, as booleans (...)."""
+    among true dots, or not finite, as booleans (...)."""
     square = np.square(np.asarray(deviations, np.float64))
-    return np.asarray(chdtrc(square.shape[-1], square.sum(-1)) < REFUSED)
+    return ~np.asarray(chdtrc(square.shape[-1], square.sum(-1)) >= REFUSED)
+
+
+def _objection(deviations: Mapping[Reason, float]) -> Reason | None:
+    """Return the reason of the largest deviation, in standard deviations, if all together are
+    unlike a dot's."""
+    if not is_unlike([*deviations.values()]):
+        return None
+    return max(deviations, key=lambda reason: np.nan_to_num(deviations[reason], nan=np.inf))
 
 
 def is_ring(blob: Candidate) -> bool:
@@ -417,12 +410,7 @@ def clipping_levels(grey: Float32) -> tuple[float, float]:
 
 def reason_against_blob(blob: Candidate, look: Look) -> Reason | None:
     """Return why a blob is left out before any fit; None for a blob that may be a dot."""
-    if blob.reason == Reason.TOUCHES_BORDER:
-        return blob.reason
-    size = 0.5 * np.log(blob.area_px2 / np.pi) - look.log_radius
-    if size < 0 and is_unlike([size / LOG_SPREAD]):
-        return Reason.MUCH_SMALLER
-    return blob.reason
+    return blob.reason or _objection(_of_blob(blob, look))
 
 
 def reason_against_fit(
@@ -434,22 +422,26 @@ def reason_against_fit(
     """
     if fit.pixels <= PARAMETERS:
         return Reason.HIDDEN
-    if not np.all(np.isfinite(fit.covariance_px2)) or semi_axes(fit.shape_px)[1] <= 0.0:
-        return Reason.FIT_FAILED
-    step = fit.centre_px - blob.centre_px
-    sizes = [np.log(np.add(semi_axes(shape), 1.0)) for shape in (fit.shape_px, blob.shape_px)]
-    if approximate_distance_px(blob.shape_px, step[:1], step[1:])[0] > 0.0 or is_unlike(
-        [np.abs(sizes[0] - sizes[1]).max() / LOG_FITTED]
-    ):
-        return Reason.MISPLACED
     half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(size_px[::-1])
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
         return Reason.TOUCHES_BORDER
-    if (fit.contrast > 0.0) != (polarity == "white_on_black"):
-        return Reason.WRONG_SIGN
-    ratio = (fit.misfit + LEAST_MISFIT) / (look.misfit + LEAST_MISFIT)
-    misfit = max(float(np.log(ratio)), 0.0) / LOG_MISFIT
-    faint = (np.log(max(abs(fit.contrast), 1e-12)) - look.log_contrast) / look.contrast_spread
-    if not is_unlike([misfit, min(faint, 0.0)]):
-        return None
-    return Reason.MISFIT if misfit > -faint else Reason.FAINT
+    axes, own = (np.add(semi_axes(shape), 1.0) for shape in (fit.shape_px, blob.shape_px))
+    way = float(np.linalg.norm(fit.centre_px - blob.centre_px) / np.mean(own))
+    sign = 1.0 if polarity == "white_on_black" else -1.0
+    faint = np.log(max(sign * fit.contrast, 1e-12)) - look.log_contrast
+    misfit = np.log((fit.misfit + LEAST_MISFIT) / (look.misfit + LEAST_MISFIT))
+    return _objection({
+        **_of_blob(blob, look),
+        Reason.MISPLACED: max(way, float(np.abs(np.log(axes / own)).max())) / LOG_FITTED,
+        Reason.FAINT: max(float(-faint), 0.0) / look.contrast_spread,
+        Reason.MISFIT: max(float(misfit), 0.0) / LOG_MISFIT,
+    })  # fmt: skip
+
+
+def _of_blob(blob: Candidate, look: Look) -> dict[Reason, float]:
+    """Return how many standard deviations a blob's outline and size are from those of a dot."""
+    smaller = look.log_radius - 0.5 * np.log(blob.area_px2 / np.pi)
+    return {
+        Reason.NOT_ELLIPSE: blob.unevenness,
+        Reason.MUCH_SMALLER: max(float(smaller), 0.0) / LOG_SPREAD,
+    }

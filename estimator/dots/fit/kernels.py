@@ -127,21 +127,17 @@ def predict(
 def prior_rows(prior: Array, radius: float, parameters: Array, rows: Array, gap: Array) -> float:
     """Fill in the whitened equations of the priors on two contrast gradients and the edge's blur.
 
-    prior : (6,) the fields of `luminance.Prior`. rows : (3, 12), which must be 0. gap : (3,) prior
+    prior : (5,) the fields of `luminance.Prior`. rows : (3, 12), which must be 0. gap : (3,) prior
     minus present value. Returns the sum of its squares.
     """
-    tied, background, contrast = prior[3] > 0.0, parameters[6], parameters[9]
-    weight = 1.0 / (prior[2] * radius * max(abs(contrast), 1e-12))
+    weight = 1.0 / (prior[2] * radius * max(abs(parameters[9]), 1e-12))
     for k in range(2):
         rows[k, 10 + k] = weight
-        if tied:
-            rows[k, 7 + k] = -contrast / background * weight
-        else:
-            rows[k, 9] = -prior[k] * radius * weight
-    rows[2, 5] = 1.0 / prior[5]
+        rows[k, 9] = -prior[k] * radius * weight
+    rows[2, 5] = 1.0 / prior[4]
     total = 0.0
     for k in range(3):
-        gap[k] = prior[4] / prior[5] if k == 2 else 0.0
+        gap[k] = prior[3] / prior[4] if k == 2 else 0.0
         for i in range(12):
             gap[k] -= rows[k, i] * parameters[i]
         total += gap[k] ** 2

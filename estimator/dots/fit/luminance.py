@@ -40,12 +40,9 @@ class Reason(StrEnum):
     TOO_LARGE = "larger than the dots"
     TOO_SMALL = "smaller than the smallest dot asked for"
     MUCH_SMALLER = "much smaller than the other dots"
-    MERGED = "merged with its neighbour"
-    NOT_ELLIPSE = "outline is not an ellipse"
+    NOT_ELLIPSE = "outline is not an ellipse: no dot, or merged with its neighbour"
     HIDDEN = "shows too few pixels of its own"
     FAINT = "much fainter than the other dots"
-    WRONG_SIGN = "does not look like a dot (contrast has the wrong sign)"
-    FIT_FAILED = "does not look like a dot (fit failed)"
     MISPLACED = "does not look like a dot (the fit left its blob)"
     MISFIT = "does not look like a dot (residuals far above the noise)"
 
@@ -56,8 +53,6 @@ class Prior:
 
     u_per_px, v_per_px : relative gradient of the contrast, (dC/du)/C and (dC/dv)/C.
     sigma_per_px : standard deviation of both.
-    tie_to_background : whether the background's relative gradient is taken instead, because the
-        same light falls on both.
     edge_px : standard deviation of the edge's Gaussian blur.
     edge_spread_px : standard deviation of this number; infinite if it is unknown.
     """
@@ -65,7 +60,6 @@ class Prior:
     u_per_px: float = 0.0
     v_per_px: float = 0.0
     sigma_per_px: float = 3e-4
-    tie_to_background: bool = False
     edge_px: float = 1.0
     edge_spread_px: float = np.inf
 

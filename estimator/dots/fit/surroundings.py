@@ -7,7 +7,6 @@ dots: the illumination, and the blur that all dots have in common.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -160,21 +159,20 @@ PRIOR_GRADIENT_PER_PX = 4e-4
 _PRIOR_SCATTER, _PRIOR_SCATTER_DOTS = 0.01, 4.0
 _FAR_SDS = 2.0
 _FLOOR_PER_PX = 5e-6
-_ENOUGH_DOTS = 6
 _BLUR_SPREAD = 0.1
 
 
-def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
-    """Return a prior for each fitted dot: the contrast gradient that the other dots show.
+def priors_from(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
+    """Return a prior for each fitted dot: the contrast gradient and the blur of all dots.
 
     A cubic surface is fitted robustly to log |contrast| over the image, with a prior (the light
-    changes by about a factor exp(0.4) over 1000 px). With fewer than 6 dots, `background_tie` gives
-    the priors.
+    changes by about a factor exp(0.4) over 1000 px). The dots' median edge blur is a prior of each
+    dot's, for dots that are no larger than the blur.
 
     image_shape : (rows, columns).
     """
-    if len(fits) < _ENOUGH_DOTS:
-        return [background_tie(fit) for fit in fits]
+    if not fits:
+        return []
     centres = np.array([fit.centre_px for fit in fits])
     contrast = np.array([abs(fit.contrast) for fit in fits])
     value = np.log(np.maximum(contrast, 1e-12))
@@ -182,32 +180,11 @@ def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list
     reach = 0.5 * max(image_shape)
     position = (centres - np.mean(centres, axis=0)) / reach
     coefficients, covariance = _cubic(position, value, own, PRIOR_GRADIENT_PER_PX * reach)
-    return [_prior_at(p, coefficients, covariance, reach) for p in position]
-
-
-def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
-    """Return the priors with the dots' median edge blur as prior of each dot's edge blur.
-
-    It is used for dots that are no larger than the blur. With fewer than 6 dots the priors stay as
-    they are.
-    """
-    if len(fits) < _ENOUGH_DOTS:
-        return priors
     sigmas = np.array([fit.sigma_px for fit in fits])
     usual = float(np.median(sigmas))
     spread = max(_BLUR_SPREAD * usual, float(robust_sd(sigmas - usual)))
-    return [replace(prior, edge_px=usual, edge_spread_px=spread) for prior in priors]
-
-
-def background_tie(fit: DotFit) -> Prior:
-    """Return the prior of a dot's contrast gradient from its own background.
-
-    It is the relative gradient of the background if the background is bright, otherwise 0 with a
-    large standard deviation.
-    """
-    if fit.levels[0] > 0.5 * abs(fit.levels[3]):
-        return Prior(sigma_per_px=1e-4, tie_to_background=True)
-    return Prior(sigma_per_px=PRIOR_GRADIENT_PER_PX)
+    gradients = (_gradient_at(p, coefficients, covariance, reach) for p in position)
+    return [Prior(*gradient, edge_px=usual, edge_spread_px=spread) for gradient in gradients]
 
 
 _POWERS = np.array([(i, j) for i in range(4) for j in range(4 - i)])
@@ -234,11 +211,13 @@ def _cubic(position: Array, value: Array, own: Array, slope: float) -> tuple[Arr
     return coefficients, covariance
 
 
-def _prior_at(position: Array, coefficients: Array, covariance: Array, reach: float) -> Prior:
+def _gradient_at(
+    position: Array, coefficients: Array, covariance: Array, reach: float
+) -> tuple[float, float, float]:
+    """Return the surface's gradient along u and v, per px, and the standard deviation of both."""
     lower = np.maximum(_POWERS - np.eye(2, dtype=int)[:, None], 0)  # (2, 10, 2)
     rows = _POWERS.T * np.prod(position**lower, axis=-1) / reach
     gradient = rows @ coefficients
     variance = 0.5 * float(np.trace(rows @ covariance @ rows.T))
-    return Prior(
-        float(gradient[0]), float(gradient[1]), float(np.hypot(np.sqrt(variance), _FLOOR_PER_PX))
-    )
+    sigma = float(np.hypot(np.sqrt(variance), _FLOOR_PER_PX))
+    return float(gradient[0]), float(gradient[1]), sigma

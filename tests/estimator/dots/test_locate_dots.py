@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from places import REAL, ROOT
 
 from telerig.errors import InputError
+from telerig.estimator.dots.fit.luminance import Reason
 from telerig.estimator.dots.locate import DotMeasurement, locate_dots, measure_dots
 from telerig.io.simulation.images.plates import Light, Plate, image_centres, render
 from telerig.io.simulation.images.sensor import digitise
@@ -206,9 +207,9 @@ def test_partial_merged_tiny_and_glared_dots_are_named() -> None:
     image = cv2.GaussianBlur(image, (0, 0), 0.9) + rng.standard_normal(image.shape)
     measured = measure_dots(np.clip(np.rint(image), 0, 255).astype(np.uint8))
     assert reasons(measured, 6, 120) == ["touches the image border"]
-    assert reasons(measured, 92, 60) == ["merged with its neighbour"]
+    assert reasons(measured, 92, 60) == [Reason.NOT_ELLIPSE]
     assert reasons(measured, 260, 120) == ["much smaller than the other dots"]
-    assert reasons(measured, 205, 177, 12.0) == ["merged with its neighbour"]
+    assert reasons(measured, 205, 177, 12.0) == [Reason.NOT_ELLIPSE]
     places = measured.dots[["u_px", "v_px"]].to_numpy()
     expected = np.array([[200, 60], [60, 180], [130, 180]])
     assert len(places) == 3

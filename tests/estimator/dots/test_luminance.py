@@ -134,7 +134,7 @@ def test_a_dot_that_shows_hardly_a_pixel_does_not_disturb_the_others(pixels: int
     assert one.converged and np.linalg.norm(one.centre_px - CENTRE) < 1e-3
 
 
-@pytest.mark.parametrize("change", [{"centre_px": CENTRE + (7.0, 0.0)}, {"shape_px": 3.0}])
+@pytest.mark.parametrize("change", [{"centre_px": CENTRE + (7.0, 0.0)}, {"shape_px": 2.4}])
 def test_a_fit_that_left_its_blob_is_no_dot(change: dict[str, Any]) -> None:
     shape = shape_from_axes(6, 5, 0.3)
     grey = picture(shape)

@@ -28,7 +28,6 @@ from telerig.estimator.bubbles.outline.blobs import (
     Part,
     Rejected,
     find_blobs,
-    implausible_outlines,
     noise_shares,
     split_blobs,
 )
@@ -45,6 +44,7 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     Outlines,
     blur_px,
     fit_outlines,
+    implausible_outlines,
     radius_px,
     start_outlines,
 )
@@ -244,7 +244,9 @@ def _found(
         fit = fit_outlines(ratio, own_start, noise, beside=outlines.take(known), shadows=True)
         start = Outlines.concat([start.take(kept), own_start])
         outlines = Outlines.concat([outlines.take(kept), settled(fit, every)])
-        merged = np.concatenate([merged[kept], np.zeros(len(fit), np.bool_)])
+        # In a crowd it is rather a neighbour in front that bends an outline than a second bubble.
+        new = implausible_outlines(outlines)[0][-len(fit) :] & (not whole)
+        merged = np.concatenate([merged[kept], new])
     elif whole:
         start, outlines = start.take(kept), outlines.take(kept)
         merged = merged[kept]
@@ -252,7 +254,8 @@ def _found(
         nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
         return replace(nothing, clusters=clusters)
     # All that is known of a bubble of a merged outline is that it is somewhere in it.
-    within = np.where(merged, radius_px(outlines) ** 2 / 4.0, 0.0)[:, None, None] * np.eye(2)
+    bent = implausible_outlines(outlines)[1]
+    within = np.where(merged, radius_px(outlines) ** 2 / 4.0, bent)[:, None, None] * np.eye(2)
     outlines = outlines.changed(covariance_px2=outlines.covariance_px2 + within)
     defocused = _defocused(outlines)
     judged = {"defocus": defocused, "merged": merged}
@@ -420,7 +423,7 @@ def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
     is implausible, then so are all parts of it of which less than 60 % of the outline is visible.
     """
     merged: Bools = np.array([part.merged for part in parts], np.bool_)
-    merged = merged | implausible_outlines(outlines)
+    merged = merged | implausible_outlines(outlines)[0]
     own = np.array([part.blob for part in parts], np.intp)
     return np.asarray(merged | (np.isin(own, own[merged]) & (outlines.coverage < _MOSTLY_SEEN)))
 

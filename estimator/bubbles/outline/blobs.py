@@ -22,12 +22,7 @@ from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     rough_distance,
 )
-from telerig.estimator.bubbles.outline.outline_fit import (
-    Outlines,
-    ellipses_along,
-    radius_px,
-    shape_oddity,
-)
+from telerig.estimator.bubbles.outline.outline_fit import ellipses_along
 from telerig.estimator.images.noise import clipped_sigma, high_pass
 
 _NOISE_SAMPLES = 40_000
@@ -384,10 +379,6 @@ _CANVAS_MARGIN_PX = 2
 """Outline points on the image's edge are left out, which narrows the blob by this much: its rows
 and columns are continued so far beyond its bounding box."""
 
-_MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
-_ODD, _BAD_FIT = 4.0, 2.0
-"""Standard deviations of the shapes of an image, and chi2_dof, beyond which it is no bubble."""
-
 
 @dataclass(frozen=True)
 class Part:
@@ -570,13 +561,3 @@ def _covered(ellipses: Array, contour: Array) -> float:
     v, u = np.nonzero(_filled(contour, low, high))
     gap = rough_distance(ellipses[:, None, :], (u + low[0])[None, :], (v + low[1])[None, :])
     return float(np.mean(np.any(gap < 0.7, axis=0)))
-
-
-def implausible_outlines(outlines: Outlines) -> Bools:
-    """Return which outlines (B,) cannot belong to a single bubble.
-
-    They miss the rim, or they fit badly and have a shape that is unlike the others of the image.
-    """
-    radius = radius_px(outlines)
-    odd = (shape_oddity(outlines) > _ODD) & (outlines.chi2_dof > _BAD_FIT)
-    return np.asarray(odd | (outlines.misfit_px > _MISFIT_PX + _MISFIT_SHARE * radius))

@@ -17,10 +17,14 @@ from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
     Rejected,
-    implausible_outlines,
 )
 from telerig.estimator.bubbles.outline.ellipse_geometry import rough_distance
-from telerig.estimator.bubbles.outline.outline_fit import Outlines, radius_px, start_outlines
+from telerig.estimator.bubbles.outline.outline_fit import (
+    Outlines,
+    missed_rims,
+    radius_px,
+    start_outlines,
+)
 from telerig.estimator.bubbles.outline.rims import (
     Rims,
     are_bubbles,
@@ -197,7 +201,7 @@ def settled(fitted: Outlines, rims: Rims) -> Outlines:
         near = np.hypot(away[:, 0], away[:, 1]) < _NEAR_SHARE * radius + _NEAR_PX
         near &= np.abs(np.log(radius_px(fitted) / radius)) < _GROWTH
     covariance = rim_covariance(rims)
-    sound = near & (fitted.coverage > _LEAST_COVERAGE) & ~implausible_outlines(fitted)
+    sound = near & (fitted.coverage > _LEAST_COVERAGE) & ~missed_rims(fitted)
     distance = np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away)
     apart = np.where((distance > _DISAGREE)[:, None, None], away[:, :, None] * away[:, None], 0.0)
     along = start_outlines(rims.ellipse, rims.blur_px, rims.inner).changed(

@@ -477,6 +477,17 @@ def _add_prior(total: Array, prior: Array, ellipse: Array, at: Array) -> None:
 
 
 @compiled
+def _unlike(at: Array, free: int, prior: Array, ellipse: Array) -> float:
+    """Return the mean square of a fit's harmonics over what its prior expects: a prior that the
+    image contradicts is no stronger than it is right."""
+    square, radius2 = 0.0, ellipse[2] * ellipse[3]
+    for i in range(HARMONIC, free):
+        expected = prior[PRIOR_HARMONICS + (i - HARMONIC) // 2]
+        square += at[i] * at[i] / (expected * expected * radius2 * (free - HARMONIC))
+    return square
+
+
+@compiled
 def _solve(total: Array, covariance: Array, step: Array) -> bool:
     """Solve normal equations of n parameters (lower triangle, right-hand side as last row).
 
@@ -756,9 +767,9 @@ def fitted(
             excess, uneven = 1.0, 0.0
             if result[CHI2] > 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / dof):
                 excess = result[CHI2]
-            misled = excess
+            misled = excess * max(1.0, _unlike(at, free, prior[b], outline))
             if result[COVERAGE] < misled_below and count > free:
-                misled = _clustered(sector, rows, step, covariance, excess)
+                misled = _clustered(sector, rows, step, covariance, misled)
                 uneven = _light(foot, distance, pixels[2], hidden, at[BLUR], noise[0])
                 uneven *= (at[BLUR] / max(at[OUTER] - at[INNER], 1e-3)) ** 2 * _UNEVEN_LIGHT
             uu, vv = misled * covariance[0, 0] + uneven, misled * covariance[1, 1] + uneven

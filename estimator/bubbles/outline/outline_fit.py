@@ -162,6 +162,9 @@ _ENOUGH_WHOLE = 4
 _WHOLE = 0.9
 _FAR_SHIFT_PX = 0.25
 _STEPS = 3
+_MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
+_ODD, _BAD_FIT = 4.0, 1.5
+"""Standard deviations of the shapes of an image, and chi2_dof, beyond which it is no bubble."""
 
 
 def start_outlines(ellipse: Array, blur_px: Array, inner: Array) -> Outlines:
@@ -211,14 +214,28 @@ def _power(outlines: Outlines) -> Array:
     return np.asarray(np.mean(share**2, axis=2))
 
 
-def shape_oddity(outlines: Outlines) -> Array:
-    """Return how many standard deviations (B,) a whole outline's coefficients of any order are off
-    those of the others of the image; 0 where that is not known."""
-    learnt, whole = shape_spread(outlines), _whole(outlines)
+def implausible_outlines(outlines: Outlines) -> tuple[Bools, Array]:
+    """Return which outlines (B,) of an image cannot belong to a single bubble, and the variance
+    (B,) in px^2 of the centres of those that may.
+
+    They miss the rim, or they fit badly and have a shape that is unlike the others of the image: an
+    order of their coefficients is many standard deviations off. What bends an outline that fits
+    badly beyond the shapes of the image has moved it as much: this is the variance.
+    """
+    learnt, radius2 = shape_spread(outlines), radius_px(outlines) ** 2
     spread = np.full(len(HARMONICS), _UNLEARNT) if learnt is None else learnt
-    own = (outlines.sigma_outline_px / radius_px(outlines))[:, None]
-    odd = np.max(np.sqrt(_power(outlines) / (spread**2 + own**2)), axis=1)
-    return np.where(whole, odd, 0.0)
+    own2 = np.nan_to_num(outlines.sigma_outline_px, nan=np.inf)[:, None] ** 2 / radius2[:, None]
+    power = _power(outlines)
+    odd = np.max(power / (spread**2 + own2), axis=1) > _ODD**2
+    bad = outlines.chi2_dof > _BAD_FIT
+    beyond = 2.0 * np.sum(np.maximum(power - spread**2, 0.0), axis=1) * radius2
+    return (odd & bad) | missed_rims(outlines), np.where(bad, beyond, 0.0)
+
+
+def missed_rims(outlines: Outlines) -> Bools:
+    """Return which outlines (B,) do not follow the rim that they were fitted to."""
+    allowed = _MISFIT_PX + _MISFIT_SHARE * radius_px(outlines)
+    return np.asarray(outlines.misfit_px > allowed)
 
 
 def learnt_prior(outlines: Outlines, inner: Array, partial: Bools) -> Array:

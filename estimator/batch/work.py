@@ -143,8 +143,8 @@ def smooth_run(
     data = load_tracked_run(run, calibrated)
     publish("recording", path=data.path, rig=of_run(calibrated, data.cameras).cameras)
     found = results_folder.smooth_run(
-        data, calibrated, tracks, folder, **options.keywords, inputs=files, report=report,
-        stage=stage, again=again,
+        data, calibrated, tracks, folder, options, inputs=files, report=report, stage=stage,
+        again=again,
     )  # fmt: skip
     own = tracks if tracks.is_dir() else tracks.parent
     publish("results", folder=folder.resolve(), tracked=own.resolve(), recording=data.path)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from telerig.command_options import SmoothingOptions
 from telerig.errors import InputError
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import of_run
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 Stage = Callable[[str, float, int], None]
 """Called with the name of a step, the share that is done, and 1."""
 
+DEFAULT = SmoothingOptions()
 _RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "accelerometers", "fluid")
 """The tables of rig.toml on which smoothing depends."""
 _USED = ("tracks.csv", "detections.csv", "tracking.json")
@@ -42,10 +44,8 @@ def smooth_run(
     calibration: Calibration,
     tracks: Path,
     folder: Path,
+    options: SmoothingOptions = DEFAULT,
     *,
-    model: str = "auto",
-    refine_rig: bool = False,
-    accept: Sequence[str] = (),
     inputs: Sequence[Path] = (),
     report: bool = True,
     stage: Stage | None = None,
@@ -54,7 +54,7 @@ def smooth_run(
     """Smooth and write the files of `Smoothing.save`, run.json and the report.
 
     tracks : `tracks.csv`, or the folder that `telerig track` wrote.
-    refine_rig, accept : see `telerig.smooth`.
+    options : of `telerig smooth`.
     inputs : the files of the calibration.
     again : the command line that makes the files again; "" for `telerig smooth` of the run.
 
@@ -73,23 +73,20 @@ def smooth_run(
     warnings = [
         *dict.fromkeys(s for file in used for s in stale(file.parent, [file.name])),
         *window_warnings(run.rig, calibration),
-        *([] if refine_rig else _moved(followed)),
+        *([] if options.refine_rig else _moved(followed)),
     ]
     again = again or f"telerig smooth {shlex.quote(str(run.path))}"
     with replaced_results(folder, "smooth", again=again, inputs=fingerprint) as staged:
         found = smooth(
-            followed, calibration, stage=run, model=model, progress=stage or False,
-            refine_rig=refine_rig, accept=accept, folder=staged,
+            followed, calibration, stage=run, progress=stage or False, folder=staged,
+            **options.keywords,
         )  # fmt: skip
         found = replace(
             found, summary={**found.summary, "warnings": [*warnings, *found.summary["warnings"]]}
         )
         found.write_files(staged)
-        record = run_record(
-            "smooth",
-            {"model": model, "refine_rig": refine_rig, "accept": list(accept)},
-            {"smooth": time.perf_counter() - begun},
-        )  # fmt: skip
+        seconds = {"smooth": time.perf_counter() - begun}
+        record = run_record("smooth", options.record(), seconds)
         if tracked.content():
             record["tracks"] = tracked.tracks or tracked.content()
         write_json_atomic(staged / "run.json", record)

@@ -197,7 +197,7 @@ class SmoothingOptions(Options):
     @property
     def keywords(self) -> dict[str, Any]:
         """The options as keywords of `telerig.smooth`."""
-        return {"model": self.model, "refine_rig": self.refine_rig, "accept": self.accept}
+        return {field: getattr(self, field) for field in self.settings()}
 
 
 KINDS: dict[Kind, type[Options]] = {

@@ -17,6 +17,7 @@ import pytest
 from batch_dataset import make_dataset
 from killed_writers import killed_at_every_rename
 
+from telerig.command_options import SmoothingOptions
 from telerig.errors import InputError
 from telerig.estimator.batch.batch import write_batch
 from telerig.estimator.calibration.calibrate import CalibrationRun, run_calibration
@@ -112,7 +113,9 @@ class Commands:
             )  # fmt: skip
         elif command == "smooth":
             used = replace(run, accelerometers=None) if which else run
-            smooth_run(used, found, folder, folder, model="default", report=report)
+            smooth_run(
+                used, found, folder, folder, SmoothingOptions(model="default"), report=report
+            )
         else:
             job = {"dataset": f"d{which}", "run": "", "kind": "calibrate", "status": "done"}
             write_batch([{**job, "words": "", "figures": {}}], folder, report=report)

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import telerig
+from telerig.command_options import SmoothingOptions
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.smoothing.problem import tables
 from telerig.estimator.smoothing.results_folder import smooth_run
@@ -40,7 +41,9 @@ def test_a_run_is_tracked_and_smoothed_from_disk(
             report=False,
         )  # fmt: skip
         data = telerig.load_run(run)
-        return smooth_run(data, calibration, folder, folder, model="default", report=False)
+        return smooth_run(
+            data, calibration, folder, folder, SmoothingOptions(model="default"), report=False
+        )
 
     whole = done(tmp_path / "whole")
     monkeypatch.setattr(frame_table, "LARGE_BYTES", 0)
@@ -60,7 +63,7 @@ def test_a_run_is_tracked_and_smoothed_from_disk(
     pd.testing.assert_frame_equal(whole.shake, stored.shake)
     bare = smooth_run(
         telerig.load_run(run), calibration, tmp_path / "stored" / "tracks.csv", tmp_path / "bare",
-        model="default", report=False,
+        SmoothingOptions(model="default"), report=False,
     )  # fmt: skip
     assert set(bare.trajectories["particle"]) == set(whole.trajectories["particle"])
 

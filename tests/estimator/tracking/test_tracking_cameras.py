@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 import telerig
+from telerig.command_options import SmoothingOptions
 from telerig.errors import InputError
 from telerig.estimator.calibration.calibrate import calibrate
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
@@ -73,7 +74,9 @@ def test_a_run_takes_the_two_cameras_that_tracking_names(rise: Path, tmp_path: P
         assert data.cameras == ("left", "right")
         out = tmp_path / name
         write_tracking(data, calibration, out, options=TrackOptions(), record={}, report=False)
-        smooth_run(data, calibration, out, out, model="default", report=name == "three")
+        smooth_run(
+            data, calibration, out, out, SmoothingOptions(model="default"), report=name == "three"
+        )
     for table in ("tracks.csv", "trajectories.csv", "shake.csv"):
         assert (tmp_path / "two" / table).read_text() == (tmp_path / "three" / table).read_text()
     notes = load_run(run).notes

@@ -1,47 +1,23 @@
 """`telerig.plot`: pictures of results for notebooks and papers, and all pictures of the reports.
 
 In: tables as `telerig` returns and writes them, and optionally the axes to draw on. Out: matplotlib
-axes. Read ``bubbles`` first.
+axes. Each module names its functions in ``__all__``. Read ``bubbles`` first.
 """
 
-from telerig.io.report.plot.bubbles import (
-    aspect,
-    aspect_over_time,
-    drag,
-    height,
-    path,
-    sizes,
-    speed,
-    velocity,
-)
-from telerig.io.report.plot.rig import (
-    coverage,
-    residual_histogram,
-    residuals,
-    rig,
-    split_half,
-    target_in_image,
-    tilts,
-    uncertainty,
-)
-from telerig.io.report.plot.shake import (
-    accelerometer,
-    offsets,
-    shake,
-    spectra,
-    spectrum,
-    whiteness,
-)
-from telerig.io.report.plot.target import target
-from telerig.io.report.plot.tracking import bubbles_in_frames, marks, ray_miss, ray_miss_along
+from telerig.io.report.plot import bubbles as _bubbles
+from telerig.io.report.plot import rig as _rig
+from telerig.io.report.plot import shake as _shake
+from telerig.io.report.plot import target as _target
+from telerig.io.report.plot import tracking as _tracking
+from telerig.io.report.plot.bubbles import *  # noqa: F403
+from telerig.io.report.plot.rig import *  # noqa: F403
+from telerig.io.report.plot.shake import *  # noqa: F403
+from telerig.io.report.plot.target import *  # noqa: F403
+from telerig.io.report.plot.tracking import *  # noqa: F403
 
 __all__ = [
-    "accelerometer", "aspect", "aspect_over_time", "bubbles_in_frames", "coverage", "drag",
-    "height", "marks", "offsets", "path", "ray_miss", "ray_miss_along",
-    "residual_histogram", "residuals",
-    "rig", "shake", "sizes", "spectra", "spectrum", "speed", "split_half", "target",
-    "target_in_image", "tilts", "uncertainty", "velocity", "whiteness",
-]  # fmt: skip
+    name for module in (_bubbles, _rig, _shake, _target, _tracking) for name in module.__all__
+]
 
 
 def __dir__() -> list[str]:

@@ -40,6 +40,8 @@ from telerig.rig.bubble_physics import (
     tomiyama_velocity,
 )
 
+__all__ = ["aspect", "aspect_over_time", "drag", "height", "path", "sizes", "speed", "velocity"]
+
 _SUMMARY = "what telerig.bubble_summary returns, or bubble_summary.csv"
 _WAVES_FROM_M = 1.3e-3
 _MOST_CLOUD = 4000

@@ -28,6 +28,11 @@ from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.short_text import nice_below, no_formula, number, short_names
 
+__all__ = [
+    "coverage", "residual_histogram", "residuals", "rig", "split_half", "target_in_image", "tilts",
+    "uncertainty",
+]  # fmt: skip
+
 _RESIDUALS = "results/calibration/residuals.csv"
 _LEAST_WEIGHT = 0.5
 _LEVELS = 8

@@ -28,6 +28,8 @@ from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
 from telerig.short_text import is_number, no_formula
 from telerig.spectra import LEAST_FRAMES
 
+__all__ = ["accelerometer", "offsets", "shake", "spectra", "spectrum", "whiteness"]
+
 _DECADES = 6.0
 _WINDOW = 1_000
 

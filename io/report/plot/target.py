@@ -11,6 +11,8 @@ from telerig.arrays import Array
 from telerig.io.report.plot.axes import COLOURS, axes_of, nothing_to_draw
 from telerig.short_text import nice_below, number
 
+__all__ = ["target"]
+
 _MOST_LABELS = 40
 _MOST_SHAPES = 1500
 

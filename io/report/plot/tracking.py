@@ -22,6 +22,8 @@ from telerig.io.report.plot.axes import (
 from telerig.short_text import no_formula
 from telerig.statistics import robust_sd
 
+__all__ = ["bubbles_in_frames", "marks", "ray_miss", "ray_miss_along"]
+
 _MISS_BINS, _MOST_BINS = 48, 400
 _MOST_MARKS = 4_000
 _STEPS, _LEAST_IN_STEP = 12, 8

@@ -16,7 +16,6 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.mp4 import Progress, write_film
-from telerig.io.report.film.path import font
 from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
 from telerig.io.results.manifest import reading
 from telerig.io.tables.run import DETECTIONS
@@ -214,3 +213,11 @@ def _shades(images: Images, camera: str, frame_count: int) -> tuple[float, float
         return 0.0, 255.0
     ends = np.array([np.percentile(image, [0.1, 99.9]) for image in seen])
     return float(ends[:, 0].min()), float(ends[:, 1].max())
+
+
+def font(size_px: float) -> Any:
+    """Return Matplotlib's own typeface, for Pillow."""
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", size_px)

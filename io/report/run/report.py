@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report import plot
@@ -163,14 +164,18 @@ def _look(results: TrackResults) -> list[Figure]:
 def _look_smoothed(results: SmoothingResults) -> list[Figure]:
     up = up_name(results.up)
     shaken = _by_shake(results)
-    shaped = len(results.bubble_frames) >= len(results.trajectories)
-    table = results.bubble_frames if shaped else results.trajectories
-    paths = _path(table, up, "In the laboratory: the travel of the stage is added "
-                  "and the shake is removed.")  # fmt: skip
+    words = "In the laboratory: the travel of the stage is added and the shake is removed."
+    paths = _path(paths_in_space(results), up, words)
     return [
         *([paths, _height(results, "", up)] if len(results.trajectories) else []),
         *(_shake_spectrum(results, camera) for camera in shaken[:1]),
     ]
+
+
+def paths_in_space(results: SmoothingResults) -> pd.DataFrame:
+    """Return the smoothed paths, with the shapes of the bubbles where these are known."""
+    shaped = len(results.bubble_frames) >= len(results.trajectories)
+    return results.bubble_frames if shaped else results.trajectories
 
 
 def _by_shake(results: SmoothingResults) -> list[str]:

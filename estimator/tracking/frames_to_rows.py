@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,33 +11,18 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
 from telerig.estimator.bubbles.pairing.evidence import Prediction
-from telerig.estimator.bubbles.pairing.groups import (
-    Candidates,
-    Groups,
-    View,
-    candidates,
-    match,
-    views_of,
-)
+from telerig.estimator.bubbles.pairing.groups import candidates, match, views_of
 from telerig.estimator.bubbles.pairing.model import RigModel
 from telerig.estimator.bubbles.shape.body import Bodies, body_columns, fit_bodies
 from telerig.estimator.bubbles.shape.shapes import Shapes
-from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.estimator.tracking.backtracking import (
-    CENTRE_PX,
-    COVARIANCE_MM2,
     FRAMES_AFTER,
     FRAMES_BEFORE,
-    Bubbles,
-    Frame,
-    Sight,
     SmoothedTracks,
-    Tables,
     follow_back,
     fused,
-    shared_rows,
+    place_hidden,
 )
 from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
@@ -45,8 +30,23 @@ from telerig.estimator.tracking.filter import (
     FrameResult,
     TrackEvent,
 )
+from telerig.estimator.tracking.frames import (
+    CENTRE_PX,
+    Bubbles,
+    Frame,
+    Seen,
+    Sight,
+    Tables,
+    moved,
+    starts,
+)
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
+
+COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
+
+_HIDDEN_FLAG = "shared"
+"""Flag of a bubble that one image hides behind another one."""
 
 _BUBBLES_AT_ONCE = 512
 """Bubbles whose bodies are fitted and whose rows are written together."""
@@ -94,67 +94,23 @@ class RowMaker:
         counts = np.array([[len(table) for table in tables] for tables in frames], np.int64)
         joined = [pd.concat(tables, ignore_index=True) for tables in zip(*frames)]
         views = views_of(joined, self.model, WANDER * self.shapes.third)
-        ids, of_cameras = [_given_ids(table) for table in joined], []
-        for c, (table, view) in enumerate(zip(joined, views)):
-            a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
-            flags = ["|".join(words) for words in flag_words(table)]
-            noise = view.covariance_px2[:, *np.triu_indices(2)]
-            centre = np.column_stack([view.uv_px, noise])
-            ends = np.cumsum([0, *counts[:, c]]).tolist()
-            of_cameras.append(
-                [
-                    (centre[p], a[p], d_eq[p], ids[c][p], flags[p])
-                    for p in (slice(low, high) for low, high in pairwise(ends))
-                ]
-            )
-        possible = self._possible(views, ids, joined, counts)
-        every: list[tuple[Any, ...]] = [
-            (*zip(*own), *groups) for *own, groups in zip(*of_cameras, possible)
+        every = [Seen.of(t, c, v, self.cameras) for c, (t, v) in enumerate(zip(joined, views))]
+        found = candidates(views, counts, self.model, [own.given for own in every])
+        frame = np.concatenate([np.repeat(np.arange(len(counts)), many) for many in counts.T])
+        seen = Seen.concat(every).take(np.argsort(frame, kind="stable"))
+        of_camera, start = np.cumsum(counts, axis=1) - counts, np.cumsum([0, *counts.sum(1)])
+        rows = np.concatenate([
+            moved(one.groups.rows, first + begin)
+            for one, first, begin in zip(found, of_camera, start)
+        ])  # fmt: skip
+        likely = np.flatnonzero(np.concatenate([f.probability for f in found]) > _LIKELY)
+        bodies = Bodies.none(*rows.shape)
+        self._fit(bodies, likely, seen, rows)
+        ends = np.cumsum([0, *map(len, found)])
+        return [
+            Sight(seen.take(slice(*own)), one, bodies.take(slice(*groups)))
+            for own, one, groups in zip(pairwise(start), found, pairwise(ends))
         ]
-        return [Sight(*columns) for columns in every]
-
-    def _possible(
-        self,
-        views: Sequence[View],
-        ids: Sequence[Ints],
-        tables: Sequence[pd.DataFrame],
-        counts: Ints,
-    ) -> list[tuple[Candidates, Bubbles, Array]]:
-        """Return the last three fields of `Sight` for each of F frames.
-
-        counts : (F, C) detections of the frames, which follow each other in the other arguments.
-        """
-        barred = [own != NO_PARTICLE for own in ids]
-        found = candidates(views, counts, self.model, barred)
-        frames = [np.repeat(np.arange(len(counts)), many) for many in counts.T]
-        named, of_named = _named(ids, frames)
-        at = Groups.concat([Groups.of(self.model, views, named), *(f.groups for f in found)])
-        starts = np.cumsum(counts, axis=0) - counts
-        rows = [np.where(named >= 0, named - starts[of_named], -1)]
-        rows += [one.groups.rows for one in found]
-        every = np.concatenate(rows)
-        frame = np.concatenate([of_named, np.repeat(np.arange(len(found)), [*map(len, found)])])
-        given = np.max([_at(i, r) for i, r in zip(ids, named.T)], axis=0, initial=NO_PARTICLE)
-        bubbles = Bubbles(
-            every,
-            np.ones(len(every)),
-            np.zeros(len(every), bool),
-            np.concatenate([given, np.full(len(every) - len(named), NO_PARTICLE)]),
-            at.points_mm,
-            at.covariance_mm2,
-            Bodies.none(len(every), len(self.cameras)),
-            np.full(len(every), NO_PARTICLE),
-        )
-        likely = [np.arange(len(named))]
-        first = len(named) + np.cumsum([0, *map(len, found)])
-        likely += [np.flatnonzero(f.probability > _LIKELY) + s for f, s in zip(found, first)]
-        self._fit(bubbles, np.concatenate(likely), tables, starts[frame])
-        order = np.argsort(frame, kind="stable")
-        cuts = [
-            order[slice(*ends)]
-            for ends in pairwise(np.searchsorted(frame[order], range(len(counts) + 1)))
-        ]
-        return [(one, bubbles.take(cut), at.left_px[cut]) for one, cut in zip(found, cuts)]
 
     def add(
         self,
@@ -175,14 +131,14 @@ class RowMaker:
         sight = self.sights([tables])[0] if sight is None else sight
         bubbles, rays, offset_px = grouped_frame(sight, self.model, predicted)
         late = np.flatnonzero((bubbles.bodies.used == "none") & ~bubbles.alone)
-        self._fit(bubbles, late, tables, np.zeros_like(bubbles.rows))
+        self._fit(bubbles.bodies, late, sight.seen, bubbles.rows)
         measured = FrameMeasurements.create(
             bubbles.points_mm, bubbles.covariance_mm2, d_eq_mm=bubbles.d_eq_mm,
             confidence=bubbles.confidence, particle=bubbles.given, alone=bubbles.alone,
         )  # fmt: skip
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
-            number, t_s, tables, sight, offset_px, rays, bubbles, result.motion
+            number, t_s, tables, sight.seen, offset_px, rays, bubbles, result.motion
         )
         self._take_final(result)
         enough = self._waiting >= _BUBBLES_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
@@ -210,46 +166,31 @@ class RowMaker:
         window = [*self._before, *done, *self._closed]
         tracks = SmoothedTracks(window, self.cameras, self.tracker.settings)
         follow_back(tracks, {f.number for f in (*done, *self._closed)})
-        hidden = shared_rows(tracks, slice(len(self._before), len(self._before) + len(done)))
+        place_hidden(tracks, slice(len(self._before), len(self._before) + len(done)))
         self._before = [*self._before, *done][-FRAMES_BEFORE:]
-        joined = [pd.concat(own, ignore_index=True) for own in zip(*(f.tables for f in done))]
-        found = self._tracks(done, joined)
-        if hidden:
-            found = pd.concat(
-                [found, pd.DataFrame(hidden, columns=found.columns)], ignore_index=True
-            )
-            found = found.sort_values(["frame", "particle"], kind="stable", ignore_index=True)
-        return Linked(found, _detections(done, joined))
+        return Linked(self._tracks(done), _detections(done))
 
-    def _fit(
-        self, bubbles: Bubbles, some: Ints, tables: Sequence[pd.DataFrame], starts: Ints
-    ) -> None:
-        """Fit the bodies of some bubbles to their detections.
-
-        starts : (M, C) rows in the tables at which the frames of the M bubbles begin.
-        """
+    def _fit(self, bodies: Bodies, some: Ints, seen: Seen, rows: Ints) -> None:
+        """Fit some of M bodies to their detections. rows : (M, C) in ``seen``."""
         if not len(some):
             return
-        rows = bubbles.rows[some]
-        at = np.where(rows >= 0, rows + starts[some], -1)
-        sightings = [sightings_from_table(t.take(mine[mine >= 0]), c, self.cameras)
-                     for c, (t, mine) in enumerate(zip(tables, at.T))]  # fmt: skip
-        order = np.full(at.T.shape, -1)
-        order[at.T >= 0] = np.arange(np.sum(at >= 0))
         gap_px = np.hypot(self.model.mean("frame_px"), self.model.mean("gap_rms_px"))
-        bodies = fit_bodies(
-            Sightings.concat(sightings), order.T, self.cameras, self.up, self.shapes,
+        fitted = fit_bodies(
+            seen.sightings, rows[some], self.cameras, self.up, self.shapes,
             gap_sigma_px=float(gap_px),
         )  # fmt: skip
-        bubbles.bodies.put(some, bodies)
+        bodies.put(some, fitted)
 
-    def _tracks(self, frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
-        every = [f.bubbles.take(~f.bubbles.alone) for f in frames]
+    def _tracks(self, frames: Sequence[Frame]) -> pd.DataFrame:
+        every = []
+        for f in frames:
+            placed = ~f.bubbles.alone | (f.bubbles.bodies.used != "none")
+            every.append(f.bubbles.take(placed & (f.particle != NO_PARTICLE)))
         bubbles, many = Bubbles.concat(every), [*map(len, every)]
-        starts = np.repeat(_starts(frames), many, 0)
+        seen = Seen.concat([f.seen for f in frames])
+        here = moved(bubbles.rows, np.repeat(starts(frames), many)[:, None])
         bodies = bubbles.bodies
-        self._fit(bubbles, np.flatnonzero(bodies.used == "none"), joined, starts)
-        seen = bubbles.rows >= 0
+        self._fit(bodies, np.flatnonzero(bodies.used == "none"), seen, here)
         table: dict[str, Any] = {
             "frame": np.repeat([f.number for f in frames], many),
             "particle": bubbles.particle,
@@ -258,61 +199,26 @@ class RowMaker:
         table |= dict(zip(["x_mm", "y_mm", "z_mm"], bodies.points_mm.T))
         table |= dict(zip(COVARIANCE_MM2, bodies.covariance_mm2[:, *np.triu_indices(3)].T))
         words: list[set[str]] = [{"ambiguous"} if unsure else set() for unsure in bubbles.ambiguous]
-        for c, (camera, found) in enumerate(zip(self.cameras, joined)):
-            mine = np.flatnonzero(seen[:, c])
-            rows = found.take(bubbles.rows[mine, c] + starts[mine, c])
-            values = np.full((len(bubbles), 5), np.nan)
-            values[mine] = rows[CENTRE_PX].to_numpy(float)
-            values[:, 2:] += bodies.shift_covariance_px2[:, c][:, *np.triu_indices(2)]
+        for c, camera in enumerate(self.cameras):
+            mine, values = np.flatnonzero(here[:, c] >= 0), bubbles.hidden_px[:, c].copy()
+            values[mine] = seen.centre_px[here[mine, c]]
+            values[mine, 2:] += bodies.shift_covariance_px2[mine, c][:, *np.triu_indices(2)]
             table |= {f"{camera.name}_{name}": v for name, v in zip(CENTRE_PX, values.T)}
             for k, name in enumerate(("du_px", "dv_px")):
-                shift = np.where(seen[:, c], bodies.shift_px[:, c, k], np.nan)
+                shift = np.where(np.isfinite(values[:, 0]), bodies.shift_px[:, c, k], np.nan)
                 table[f"{camera.name}_{name}"] = shift
-            for k, flags in zip(mine.tolist(), flag_words(rows)):
-                words[k].update(flags)
+            for k, text in zip(mine.tolist(), seen.flags[here[mine, c]].tolist()):
+                words[k].update(text.split("|"))
+        for k in np.flatnonzero(bubbles.alone).tolist():
+            words[k].add(_HIDDEN_FLAG)
         table["ray_miss_mm"] = bodies.ray_miss_mm
         table |= body_columns(bodies, self.up)
         table["confidence"] = bubbles.confidence
         table["centre"] = bodies.used
         table |= dict(zip((f"silhouettes_{x}_mm" for x in "xyz"), bodies.silhouette_points_mm.T))
-        texts = ["|".join(sorted(own)) for own in words]
+        texts = ["|".join(sorted(own - {""})) for own in words]
         table["flags"] = pd.Series(texts, dtype=str)  # text also where there is no bubble
-        rows_of = pd.DataFrame(table)
-        return rows_of[rows_of["particle"] != NO_PARTICLE].reset_index(drop=True)
-
-
-def _named(ids: Sequence[Ints], frames: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """Return the groups (M, C) of rows with one given id in one frame, and their frames (M,)."""
-    own = [np.flatnonzero(i != NO_PARTICLE) for i in ids]
-    tall = max((int(f.max(initial=0)) for f in frames), default=0) + 1
-    keys = [i[mine] * tall + f[mine] for i, f, mine in zip(ids, frames, own)]
-    every, many = np.unique(np.concatenate(keys), return_counts=True)
-    every = every[many > 1]
-    rows = np.full((len(every), len(ids)), -1)
-    for c, (key, mine) in enumerate(zip(keys, own)):
-        _, group, one = np.intersect1d(every, key, return_indices=True)
-        rows[group, c] = mine[one]
-    frame = every % tall
-    order = np.argsort(frame, kind="stable")
-    return rows[order], frame[order]
-
-
-def _at(values: Ints, rows: Ints) -> Ints:
-    """Return values at rows, -1 where the row is -1."""
-    return np.append(values, -1)[rows]
-
-
-def _given_ids(table: pd.DataFrame) -> Ints:
-    """Return the ids (N,) that came with N detections, -1 for none."""
-    if "particle" not in table:
-        return np.full(len(table), NO_PARTICLE)
-    return table["particle"].to_numpy(np.int64)
-
-
-def _starts(frames: Sequence[Frame]) -> Ints:
-    """Return the position (F, C) of each frame's first detection in the cameras' tables."""
-    many = np.array([[len(table) for table in f.tables] for f in frames], np.int64)
-    return np.asarray(np.cumsum(many, axis=0) - many)
+        return pd.DataFrame(table).sort_values(["frame", "particle"], ignore_index=True)
 
 
 def grouped_frame(
@@ -321,8 +227,7 @@ def grouped_frame(
     """Return the bubbles of a frame, each detection by itself, and the shift of each camera's
     pixels.
 
-    Detections with given ids are joined by their ids; all others are matched, and what has no
-    partner is a bubble that one camera alone sees.
+    What has no partner is a bubble that one camera alone sees.
 
     sight : detections of all cameras.
     model : the model for matching.
@@ -333,32 +238,25 @@ def grouped_frame(
     cameras see, so that their points agree with those of the others.
     """
     found = match(sight.candidates, model, predicted)
-    given = np.arange(len(sight.possible) - len(sight.candidates))
-    chosen = np.concatenate([given, len(given) + found.candidate])
-    bubbles = sight.possible.take(chosen)
-    bubbles.confidence[len(given) :] = found.confidence
-    bubbles.ambiguous[len(given) :] = found.ambiguous
+    groups = sight.groups(found.candidate)
+    bubbles = replace(groups, confidence=found.confidence, ambiguous=found.ambiguous)
     part = (bubbles.rows < 0).any(1)
     offset = np.zeros((len(model.cameras), 2))
     if np.sum(~part) >= _LEAST_FOR_OFFSET:
-        offset = np.median(sight.left_px[chosen][~part], axis=0)
-    rays = Bubbles.on_rays(sight, offset)
-    at = np.where(bubbles.rows >= 0, bubbles.rows + sight.starts, -1)
+        offset = np.median(sight.candidates.groups.left_px[found.candidate][~part], axis=0)
+    rays = sight.rays(offset)
     for k in np.flatnonzero(part) if offset.any() else ():
-        own = rays.take(at[k, at[k] >= 0])
+        own = rays.take(bubbles.rows[k, bubbles.rows[k] >= 0])
         bubbles.points_mm[k] = fused(own.points_mm, own.covariance_mm2)[0]
     single = rays.given == NO_PARTICLE
-    single[at[at >= 0]] = False
+    single[bubbles.rows[bubbles.rows >= 0]] = False
     return Bubbles.concat([bubbles, rays.take(single)]), rays, offset
 
 
-def _detections(frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
+def _detections(frames: Sequence[Frame]) -> pd.DataFrame:
     """Return every detection with the id of its track, blank where it has none."""
     particle = np.concatenate([frame.owners() for frame in frames])
-    order = [len(joined) * k + c for c in range(len(joined)) for k, f in enumerate(frames)
-             for _ in f.sight.given[c]]  # fmt: skip
-    every = pd.concat(joined, ignore_index=True).take(np.argsort(order, kind="stable"))
-    every = every.reset_index(drop=True)
+    every = pd.concat([table for frame in frames for table in frame.tables], ignore_index=True)
     every["particle"] = pd.arrays.IntegerArray(particle, particle == NO_PARTICLE)
     leading = ["frame", "camera", "particle"]
     every = every[leading + [name for name in every if name not in leading]]

@@ -30,7 +30,6 @@ from telerig.estimator.calibration.result.calibration import (
     of_run,
 )
 from telerig.estimator.rig_drift import LEAST_SEEN_S, PairCollector, with_change
-from telerig.estimator.tracking.backtracking import Tables
 from telerig.estimator.tracking.corrections import Corrections, read_corrections
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
@@ -43,6 +42,7 @@ from telerig.estimator.tracking.detect_run import (
     mask_files,
 )
 from telerig.estimator.tracking.filter import NO_PARTICLE, TrackerSettings
+from telerig.estimator.tracking.frames import Tables
 from telerig.estimator.tracking.frames_to_rows import Linked, RowMaker
 from telerig.estimator.tracking.linked_rows import LinkedRows, Linking
 from telerig.estimator.tracking.tracker import Tracker

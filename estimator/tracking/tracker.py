@@ -50,15 +50,12 @@ class OpenFrames:
         """Add a frame; count : number of its measurements, which have no track yet."""
         self._frames[frame] = (t_s, np.full(count, NO_PARTICLE))
 
-    def write(self, track: int, frames: Ints, columns: Ints) -> None:
-        """Set the id of a track's measurements, -1 for none, in some frames."""
-        for frame, column in zip(frames.tolist(), columns.tolist()):
+    def give(self, tracks: Ints | int, frames: Ints | int, columns: Ints) -> None:
+        """Set the ids of measurements; the arguments are broadcast. columns : -1 for none."""
+        every = np.broadcast_arrays(tracks, frames, columns)
+        for track, frame, column in zip(*(one.tolist() for one in every)):
             if column >= 0:
                 self._frames[frame][1][column] = track
-
-    def seen(self, frame: int, tracks: Ints, columns: Ints) -> None:
-        """Set the ids of the measurements of K tracks (K,), -1 for none, in a frame."""
-        self._frames[frame][1][columns[columns >= 0]] = tracks[columns >= 0]
 
     def rename(self, old: int, new: int) -> None:
         """Replace the id of a track."""
@@ -229,7 +226,7 @@ class Tracker:
             else motion.shifted(found.shift.shift, found.shift.covariance_mm2)
         )
         self.states, self.conflicts, self.common = found.states, found.conflicts, found.common
-        self.frames.seen(frame, self.states.track[: found.single], found.columns[: found.single])
+        self.frames.give(self.states.track[: found.single], frame, found.columns[: found.single])
         self._decide(scan, self._single)
         self._births(scan, np.flatnonzero(found.free))
         self._deaths(scan)
@@ -335,15 +332,15 @@ class Tracker:
             waited, old, new = list[int](), list[int](), list[int]()
             kept[best.rows[0]] = True
             for row, taken in zip(best.rows[0].tolist(), best.taken[0]):
-                self.frames.write(int(track[row]), best.frames, taken)
+                self.frames.give(int(track[row]), best.frames, taken)
                 waited += [int(track[row])] if (taken >= NO_PARTICLE).sum() > 1 else []
             agreed, start = close.broken()
             for row, taken, many in zip(close.rows[0].tolist(), close.taken[0], agreed.tolist()):
-                self.frames.write(int(track[row]), close.frames[:many], taken[:many])
+                self.frames.give(int(track[row]), close.frames[:many], taken[:many])
                 old.append(int(track[row]))
                 if (taken[start:] >= 0).any():
                     track[row], kept[row] = self._take_id(), True
-                    self.frames.write(int(track[row]), close.frames[start:], taken[start:])
+                    self.frames.give(int(track[row]), close.frames[start:], taken[start:])
                     new.append(int(track[row]))
             if waited:
                 reason = f"conflict of {len(best.frames)} frames decided"
@@ -375,7 +372,7 @@ class Tracker:
             born = States.born(scan, columns, tracks, velocity, in_lab)
             found = beside(self._confirmed(), born.points_mm, tracks)
             self._parents |= zip(tracks.tolist(), found)
-            self.frames.seen(scan.frame, tracks, columns)
+            self.frames.give(tracks, scan.frame, columns)
             self.states = States.concat([self.states, born])
         now_named = self.states.given & np.isin(self.states.track, given[named])
         for row in np.flatnonzero(now_named).tolist():

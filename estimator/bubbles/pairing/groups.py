@@ -66,6 +66,9 @@ from telerig.rig.triangulation import (
     triangulate_views,
 )
 
+_CERTAIN = 1e9
+"""Log odds of a group by an id that came with the data."""
+
 NEGLIGIBLE = -9.0
 """Log odds below which a group is never considered: its probability stays under exp(-9)."""
 
@@ -465,7 +468,8 @@ def _density(groups: Groups, left_px: Array, covariance_px2: Array) -> tuple[Arr
     core = (1 - _TAIL) * np.exp(-chi2 / 2)
     tail = _TAIL * wide ** (-free / 2) * np.exp(-chi2 / wide / 2)
     odds = np.log(np.maximum(core + tail, 1e-300)) - size / 2 + groups.constant
-    return chi2, np.where(chi2 < wide * chdtri(free, chdtrc(1, GATE2)), odds, NEVER)
+    limit = chdtri(np.arange(most + 1), chdtrc(1, GATE2))[free]
+    return chi2, np.where(chi2 < wide * limit, odds, NEVER)
 
 
 def with_innovations(
@@ -563,13 +567,13 @@ def candidates_of(
 
 
 def candidates(
-    views: Sequence[View], counts: Ints, model: RigModel, barred: Sequence[Bools] | None = None
+    views: Sequence[View], counts: Ints, model: RigModel, given: Sequence[Ints] | None = None
 ) -> list[Candidates]:
     """Return the possible groups of F frames, each with the shift that its groups share.
 
     The arguments are those of `possible_groups`.
     """
-    groups, frame = possible_groups(views, counts, model, barred)
+    groups, frame = possible_groups(views, counts, model, given)
     total, _, probability = with_innovations(groups, groups.log_odds, frame, counts, model)
     groups = replace(groups, log_odds=total)
     cuts = np.searchsorted(frame, np.arange(len(counts) + 1)).tolist()
@@ -586,17 +590,18 @@ def candidates(
 
 
 def possible_groups(
-    views: Sequence[View], counts: Ints, model: RigModel, barred: Sequence[Bools] | None = None
+    views: Sequence[View], counts: Ints, model: RigModel, given: Sequence[Ints] | None = None
 ) -> tuple[Groups, Ints]:
     """Return the possible groups (G,) of F frames, and their frames (G,), ascending.
 
     views : of all detections, which follow each other frame by frame.
     counts : (F, C) number of detections in each frame and camera.
-    barred : for each camera, which detections take part in no group; None for none.
+    given : for each camera the ids (N,) that came with the detections, -1 for none. Detections of a
+        frame with one id are a group that is certain; those with an id are in no other one.
 
     A gap may be twice as large as that of a pair, because all gaps of a frame shift together.
     """
-    edges = [_edges(pair, views, counts, model, barred) for pair in model.pairs]
+    edges = [_edges(pair, views, counts, model, given) for pair in model.pairs]
     groups = _grown(edges, views, model)
     many = (groups.rows >= 0).sum(1)
     ends = np.cumsum(counts, axis=0)
@@ -609,10 +614,29 @@ def possible_groups(
     alike, log_radius = (total / pairs).T
     odds = alike * (many - 1) + prior_log_odds(groups, counts[frame], model)
     groups = replace(groups, log_odds=odds, log_radius=log_radius)
+    if given is not None and max(own.max(initial=-1) for own in given) >= 0:
+        rows, of_rows = _named(given, [np.repeat(np.arange(len(counts)), n) for n in counts.T])
+        named = Groups.of(model, views, rows)
+        named = replace(named, log_odds=np.full(len(rows), _CERTAIN))
+        groups, frame = Groups.concat([named, groups]), np.concatenate([of_rows, frame])
     order = np.argsort(frame, kind="stable")
     groups, frame = groups.take(order), frame[order]
     groups.rows[:] = np.where(groups.rows >= 0, groups.rows - (ends - counts)[frame], -1)
     return groups, frame
+
+
+def _named(ids: Sequence[Ints], frames: Sequence[Ints]) -> tuple[Ints, Ints]:
+    """Return the groups (M, C) of rows with one given id in one frame, and their frames (M,)."""
+    own = [np.flatnonzero(i >= 0) for i in ids]
+    tall = max((int(f.max(initial=0)) for f in frames), default=0) + 1
+    keys = [i[mine] * tall + f[mine] for i, f, mine in zip(ids, frames, own)]
+    every, many = np.unique(np.concatenate(keys), return_counts=True)
+    every = every[many > 1]
+    rows = np.full((len(every), len(ids)), -1)
+    for c, (key, mine) in enumerate(zip(keys, own)):
+        _, group, one = np.intersect1d(every, key, return_indices=True)
+        rows[group, c] = mine[one]
+    return rows, every % tall
 
 
 @dataclass(frozen=True)
@@ -653,7 +677,7 @@ def _edges(
     views: Sequence[View],
     counts: Ints,
     model: RigModel,
-    barred: Sequence[Bools] | None,
+    given: Sequence[Ints] | None,
 ) -> _Edges:
     """Return the possible pairs of F frames."""
     own, axis = model.pairs[pair], model.gap_axes[pair]
@@ -671,8 +695,8 @@ def _edges(
     found, rows, _ = near_pairs(model, pair, views, counts, near)
     alike = appearance_log_odds(found, own)
     good = alike > 2 * NEGLIGIBLE
-    if barred is not None:
-        good &= ~(barred[pair[0]][rows[:, 0]] | barred[pair[1]][rows[:, 1]])
+    if given is not None:
+        good &= (given[pair[0]][rows[:, 0]] < 0) & (given[pair[1]][rows[:, 1]] < 0)
     values = np.stack([alike, 0.25 * found.size_sum.sum(-1)], -1)
     return _Edges(pair, rows[good], values[good])
 

@@ -61,8 +61,8 @@ _LIKELY = 0.01
 _START_SCATTER_PX = 1.5
 """Scatter of gaps and of frames' shifts before anything is learned."""
 
-_PASSES = 6
-"""Passes of expectation-maximisation."""
+_PASSES, _SETTLED = 6, 1e-3
+"""Largest number of passes of expectation-maximisation, and the relative change that ends them."""
 
 _LEAST_UNMATCHED, _MOST_UNMATCHED = 0.05, 0.9
 """Limits of the share of detections without a partner."""
@@ -239,17 +239,26 @@ class _Sample:
 
 def _learned(model: RigModel, sample: _Sample) -> RigModel:
     """The model with offsets of the number of terms that predicts groups best."""
-    for _ in range(_PASSES):
-        model, total, left = _improved(model, sample, 1)
-    best, most, least = model, total, left
+    constant, total, left = _settled(model, sample, _BIAS_TERMS[0])
+    best, most, least = constant, total, left
     for terms in _BIAS_TERMS[1:]:
         if total >= _PAIRS_PER_TERM * terms:
-            trial = model
-            for _ in range(_PASSES):
-                trial, many, left = _improved(trial, sample, terms)
+            trial, many, left = _settled(constant, sample, terms)
             if many >= _BETTER * most and left < _BETTER * least:
                 best, most, least = trial, many, left
     return best
+
+
+def _settled(model: RigModel, sample: _Sample, terms: int) -> tuple[RigModel, float, float]:
+    """Repeat `_improved` until neither the number of groups nor what is left of them changes."""
+    before = np.zeros(2)
+    for _ in range(_PASSES):
+        model, total, left = _improved(model, sample, terms)
+        now = np.array([total, left])
+        if np.allclose(now, before, rtol=_SETTLED, atol=0.0):
+            break
+        before = now
+    return model, total, left
 
 
 def _improved(model: RigModel, sample: _Sample, terms: int) -> tuple[RigModel, float, float]:

@@ -117,8 +117,11 @@ def number_words(axes: Mapping[str, AxisVerdict], vertical: str) -> str:
     and to what the paths are good.
 
     axes : the verdicts by axis.
-    vertical : the axis nearest to the vertical. Returns "" where it or its numbers are missing.
+    vertical : the axis nearest to the vertical. Returns "" where it or its numbers are missing, and
+    where measurements disagree, so that no path is good to anything.
     """
+    if any(axis.verdict == Verdict.CONTRADICTED for axis in axes.values()):
+        return ""
     sds = {name: axis.sigma_mm for name, axis in axes.items() if axis.sigma_mm is not None}
     if vertical not in sds:
         return ""

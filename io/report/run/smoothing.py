@@ -71,10 +71,12 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVe
         colour, good = _COLOURS[file.verdict], number_words(file.axes, file.vertical)
         headline, meaning = VERDICT_WORDS[file.verdict].headline, consequence_words(file)
     of_axes = words_of_axes(file)
-    sentences = [good, meaning, *map(words_of_contradiction, file.contradictions)]
-    sentences += of_axes if not good else []
+    contradicted = file.verdict == Verdict.CONTRADICTED
+    sentences = [good, meaning]
+    sentences += map(words_of_contradiction, file.contradictions)
+    sentences += of_axes if not good and not contradicted else []
     sentences += [file.words] if not of_axes else []
-    sentences.append(_size_words(results))
+    sentences.append("" if contradicted else _size_words(results))
     if file.rig_change is not None and file.rig_change.words:
         sentences.append(f"Rig: {file.rig_change.words}.")
     in_words = file.words and not of_axes  # files from before hold the remedy in their words

@@ -82,6 +82,7 @@ def test_marks_of_another_time_are_named_and_the_bands_are_widened() -> None:
     np.testing.assert_allclose(wide["sy_mm"], factor * plain["sy_mm"])
     assert verdict["axes"]["y"]["verdict"] == "CONTRADICTED"
     assert {use["grade"] for use in verdict["usable_for"]} <= {"limited", "no"}
+    assert "good to" not in verdict["words"], "no path is good to anything"
 
 
 @pytest.mark.slow

@@ -684,7 +684,7 @@ def fitted(
     steps : largest number of steps; none is a first look, at some pixels in a narrow band, that
         finds the ellipse, blur and levels.
     misled_below : coverage of an outline below which its centre's covariance has what misleads its
-        fit.
+        fit; so has that of one that fits worse than the noise explains.
     """
     first_look = steps == 0
     at, began, step = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -768,7 +768,7 @@ def fitted(
             if result[CHI2] > 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / dof):
                 excess = result[CHI2]
             misled = excess * max(1.0, _unlike(at, free, prior[b], outline))
-            if result[COVERAGE] < misled_below and count > free:
+            if (result[COVERAGE] < misled_below or excess > 1.0) and count > free:
                 misled = _clustered(sector, rows, step, covariance, misled)
                 uneven = _light(foot, distance, pixels[2], hidden, at[BLUR], noise[0])
                 uneven *= (at[BLUR] / max(at[OUTER] - at[INNER], 1e-3)) ** 2 * _UNEVEN_LIGHT

@@ -282,7 +282,8 @@ def fit_outlines(
     Pixels inside or near another bubble are left out, and so are glare, dirt and other pixels that
     do not look like a rim. A first fit to some of the pixels yields blur and levels. The fit to all
     pixels is repeated for outlines that moved far or are partly hidden. The covariance of the
-    latter has what their residuals show of neighbours that mislead them.
+    latter, and of outlines that fit worse than the noise explains, has what their residuals show of
+    neighbours that mislead them.
     """
     image, below = np.ascontiguousarray(ratio, np.float32), 2.0 if shadows else _WHOLE
     others = start.take(slice(0, 0)) if beside is None else beside

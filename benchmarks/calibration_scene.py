@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from telerig.estimator.calibration.calibrate import nominal_cameras
 from telerig.estimator.calibration.solver.problem import (
     Problem,
-    eccentricity_px,
     nominal_state,
     problem_from_dots,
 )
@@ -90,12 +89,11 @@ def make_scene(
     nominal = nominal_cameras(rig)
     side = next(iter(rig.rotvec_from_first_deg.values()), None)
     scene = Scene(cameras, target, poses, nominal, rig.target, side, dots)
-    problem = scene.problem()
-    if not np.array_equal(problem.uv_px, dots[["u_px", "v_px"]].to_numpy()):
+    uv = dots[["u_px", "v_px"]].to_numpy()
+    if not np.array_equal(scene.problem().uv_px, uv):
         raise RuntimeError("the table is not in the problem's order")
-    discs = eccentricity_px(problem, scene.true_state(problem, held_centres=False))
     noise = config.sigma_px * rng.standard_normal((len(dots), 2))
-    return replace(scene, dots=dots.assign(**_pixels(problem.uv_px + discs + noise)))
+    return replace(scene, dots=dots.assign(**_pixels(uv + noise)))
 
 
 def _pixels(uv_px: Array) -> dict[str, Array]:

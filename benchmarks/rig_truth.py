@@ -183,6 +183,7 @@ def linear_deviations(scene: Scene, config: SimulationConfig, model: str) -> Arr
     """
     problem = replace(scene.problem().with_model(model), solver="numpy")
     discs = eccentricity_px(problem, scene.true_state(problem, held_centres=False))
+    problem = replace(problem, eccentricity_px=discs)
     exact = exact_dots(config, scene.cameras, scene.true_target, scene.views)
     true_px = exact.loc[exact["inside"] == 1, ["u_px", "v_px"]].to_numpy()
     start = held_at_nominal(problem, scene.true_state(problem))
@@ -192,8 +193,7 @@ def linear_deviations(scene: Scene, config: SimulationConfig, model: str) -> Arr
         true_mm = float(np.linalg.norm(np.subtract(*start.dots_mm[list(ends)])))
         known = replace(known, scale=(ends, true_mm, sigma))
     truth = solve(known, start).state
-    measured = replace(problem, uv_px=problem.uv_px - discs)
-    gaussian = System(measured).gaussian(truth)
+    gaussian = System(problem).gaussian(truth)
     step, _ = gaussian.step()
     count = sum(map(len, problem.free)) + 6
     sd = np.sqrt(np.diag(gaussian.marginal(np.arange(count))))

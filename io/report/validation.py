@@ -34,6 +34,20 @@ from telerig.io.results.validation import (
 NAME = "validation.html"
 TERMS = ("Marks", "NEES", "Covariance, standard deviation (sd)", "Verdict")
 _MOST_DRAWN = 12
+_SAYS = {
+    Stillness.PASSED: "marks stand still within the stated standard deviations",
+    Stillness.FAILED: "marks move more than the stated standard deviations allow",
+}
+_NEXT = {
+    Stillness.PASSED: (
+        "Next: bubbles of runs with this rig, these sensors and this calibration are good to what "
+        "their results state."
+    ),
+    Stillness.FAILED: (
+        "Next: telerig doctor DATASET/runs/NAME looks for a wrong sensor, clock or calibration in "
+        "this recording. Until it is found, do not rely on standard deviations of other runs."
+    ),
+}
 
 
 def write_validation_report(folder: Path, out: Path | None = None) -> Path:
@@ -48,8 +62,8 @@ def render(content: ValidationFile) -> str:
     """Return the page as text."""
     passed = content.verdict is Stillness.PASSED
     verdict = Verdict(
-        str(content.verdict), "good" if passed else "rejected",
-        tuple(validation_words(content)), tuple(content.warnings),
+        f"{content.verdict}: {_SAYS[content.verdict]}", "good" if passed else "rejected",
+        (*validation_words(content), _NEXT[content.verdict]), tuple(content.warnings),
     )  # fmt: skip
     rows = tuple(
         Row(cells, strong=mark.verdict is Stillness.FAILED)

@@ -152,7 +152,7 @@ def test_default_run_is_the_only_one(place: Path, to: str) -> None:
         ("telerig export data --to mat --run rize", "did you mean rise?"),
         ("telerig export data --to halcon --calibration nowhere.json", "no such calibration"),
         ("telerig export data --to halcon --volume 1,2", "six numbers"),
-        ("telerig export data --to halcon --volume 90,95,0,1,0,1", "inside the images"),
+        ("telerig export data --to halcon --volume 90,95,0,1,0,1", "points of the volume"),
         ("telerig export data/runs/rise --to opencv", "neither a dataset nor a folder of results"),
         ("telerig export data --to halcon --run rise", "have it: hdf5, netcdf, mat, vtk, trackpy"),
         ("telerig export data --to vtk --volume 0,1,0,1,0,1", "have it: halcon, opencv"),

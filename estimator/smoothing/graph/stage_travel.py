@@ -8,14 +8,16 @@ Schmidt, parameter). Marks fixed to the tank show the scale; it is a variable of
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.estimator.smoothing.graph.layout import points_in_rig
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import Travel
+from telerig.rig.camera import Camera
 from telerig.rig.pose import across
 
 SCALE_SIGMA = 1e-3
@@ -114,11 +116,28 @@ def offset_sigma(solution: Solution) -> Array:
 def considered_variance(solution: Solution) -> tuple[Array, Array]:
     """Return variances of the bubbles that the uncertain encoder scale and travel axis cause.
 
+    A scale in dispute may be that of the magnifications: then bubbles are as far off in the images.
+
     Returns (rows, 3) in mm^2 for positions and (rows, 3) in mm^2/s^2 for velocities.
     """
-    at = solution.graph.frame_of_row
+    graph = solution.graph
+    at, axis = graph.frame_of_row, graph.problem.axis
     places, speeds = carriage(solution)
-    return _variance(solution, places[at]), _variance(solution, speeds[at])
+    place, speed = _variance(solution, places[at]), _variance(solution, speeds[at])
+    off = disputed_scale(solution)
+    if off:
+        middle = _middle(graph.problem.cameras)
+        place += (off * (points_in_rig(graph, solution.state) - middle)) ** 2
+        speed += (off * (solution.velocities_mm_s - speeds[at, None] * axis)) ** 2
+    return place, speed
+
+
+def _middle(cameras: Sequence[Camera]) -> Array:
+    """Return the rig point (3,) that is nearest to the middle of all images."""
+    rows = np.concatenate([camera.camera_from_rig.rotation[:2] for camera in cameras])
+    centres = [c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2)[0] for c in cameras]
+    seen = rows * np.repeat(np.concatenate(centres), 2, axis=0)
+    return np.asarray(np.linalg.lstsq(rows, seen.sum(1), rcond=None)[0])
 
 
 def carriage(solution: Solution) -> tuple[Array, Array]:

@@ -194,6 +194,7 @@ def test_an_encoder_that_marks_contradict_may_be_right() -> None:
     solution = solve(replace(off, travel=replace(travel(1e-3), source="assumed")), model)
     variance, _ = considered_variance(solution)
     assert np.sqrt(variance[-1, 1]) == pytest.approx(0.01 * SPEED * off.t_s[-1], rel=0.05)
+    assert np.sqrt(variance[-1, [0, 2]]) == pytest.approx([0.01, 0.01], rel=0.1)  # 1 mm off-centre
     assert scale_sigma(solution) == pytest.approx(0.01, rel=0.05)
     assert len(scale_warnings(solution)) == 1
     stated = solve(replace(off, travel=travel(1e-3)), model)

@@ -104,7 +104,7 @@ def _constants(result: Smoothing, run: Run) -> tuple[float, float]:
     delay = scale = np.nan
     if solution.graph.sensor_flags[1] and len(solution.delays_s):
         delay = 1e3 * float(np.mean(solution.delays_s) - run.case.delay_s)
-    if solution.graph.encoder_flags[0] and solution.state.encoder.size:
+    if solution.graph.encoder_size and solution.state.encoder.size:
         scale = 1e6 * float(solution.state.encoder[0] - run.case.encoder_scale)
     return delay, scale
 

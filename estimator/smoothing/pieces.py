@@ -307,7 +307,7 @@ def _flat(values: Mapping[str, Array]) -> Array:
 def _sizes(problem: SmoothingProblem, model: ShakeModel) -> Sizes:
     """Number and dimension of the run's constants by family."""
     read, share = problem.stage is not None, problem.calibration
-    encoder = read * ((model.encoder_scale_sigma > 0) + (model.encoder_delay_sigma_s > 0))
+    encoder = int(read and model.encoder_scale_sigma > 0)
     directions = 0 if share is None else share.root.shape[1]
     clocks = int(clocks_of(problem).max(initial=-1)) + 1
     return {

@@ -351,26 +351,21 @@ def _residuals(pixels: Pixels) -> dict[str, Any]:
 
 
 def _encoder(solution: Solution) -> dict[str, Any]:
-    """Return the estimated scale and delay of the encoder; empty without an encoder.
+    """Return the estimated scale of the encoder; empty without an encoder.
 
     ``scale_from`` is "run" if marks determined the scale in this run, otherwise it names where the
     scale was known from.
     """
-    graph, block = solution.graph, _block(solution, "encoder")
+    graph = solution.graph
     if graph.problem.stage is None:
         return {}
     travel = graph.problem.travel
     known = "given" if travel is None else travel.source
-    out: dict[str, Any] = {
+    return {
         "scale": total_scale(solution),
         "sscale": scale_sigma(solution),
-        "scale_from": "run" if graph.encoder_flags[0] else known,
+        "scale_from": "run" if graph.encoder_size else known,
     }
-    if graph.encoder_flags[1]:
-        out["delay_s"] = float(solution.state.encoder[-1])
-        if block is not None:
-            out["sdelay_s"] = float(np.sqrt(block[-1, -1]))
-    return out
 
 
 def _travel(solution: Solution) -> dict[str, Any]:

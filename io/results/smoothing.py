@@ -115,8 +115,8 @@ class AxisVerdict(Part):
     sigma_mm, sigma_shake_known_mm : these two standard deviations of a position in mm.
     sigma_encoder_mm : standard deviation that the encoder's scale and the travel axis add to all
         positions alike, in mm. `sigma_mm` is without it.
-    sigma_offset_mm : standard deviation in mm of an offset that all positions share, as the
-        encoder's delay is not known; no other standard deviation contains it.
+    sigma_offset_mm : standard deviation in mm of an offset that all positions share: the encoder's
+        delay and where the cameras stood are not known. No other standard deviation contains it.
     shake_rms_mm : RMS of the shake in mm of the camera that shakes most.
     """
 

@@ -145,7 +145,7 @@ def number_words(axes: Mapping[str, AxisVerdict], vertical: str) -> str:
     if offset is not None and offset[0] > _MUCH * sds.get(offset[1], 0.0):
         text += (
             f". Places of all bubbles share an unknown offset of {number(1e3 * offset[0], 2)} µm "
-            f"along {offset[1]}, from the encoder's delay; motion is free of it"
+            f"along {offset[1]}; motion is free of it"
         )
     return f"{text}."
 

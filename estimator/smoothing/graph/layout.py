@@ -354,7 +354,7 @@ class State:
         the other.
     means : (K, 3) mean velocities of K bubbles.
     sensors : (A, 3 or 4) biases of A accelerometers, and their scale errors if these are estimated.
-    encoder : (0 to 2,) scale error and delay of the encoder, as far as they are estimated.
+    encoder : (0 or 1,) scale error of the encoder, if it is estimated.
     calibration : (r,) error along r directions.
     marks : (Q, 3) positions of Q marks.
     clocks : (G, 0 or 1) delay of G accelerometers' clocks beyond that at which the nodes are
@@ -372,11 +372,7 @@ class State:
 
     def encoder_scale(self, graph: GraphLayout) -> float:
         """Return the scale error of the encoder; 0 if it is held."""
-        return float(self.encoder[0]) if graph.encoder_flags[0] else 0.0
-
-    def encoder_delay_s(self, graph: GraphLayout) -> float:
-        """Return the delay of the encoder in s; 0 if it is held."""
-        return float(self.encoder[-1]) if graph.encoder_flags[1] else 0.0
+        return float(self.encoder[0]) if graph.encoder_size else 0.0
 
 
 @dataclass(frozen=True)
@@ -519,20 +515,9 @@ class GraphLayout:
         return model.accelerometer_scale_sigma > 0, model.accelerometer_delay_sigma_s > 0
 
     @property
-    def encoder_flags(self) -> tuple[bool, bool]:
-        """Whether the encoder's scale and its delay are variables."""
-        read = self.problem.stage is not None
-        model = self.model
-        return read and model.encoder_scale_sigma > 0, read and model.encoder_delay_sigma_s > 0
-
-    def by_encoder(self, by_scale: Array, by_delay: Array) -> Array:
-        """Return the columns (..., n, 0 to 2) of derivatives by the encoder's free constants."""
-        return np.asarray(np.stack([by_scale, by_delay], -1)[..., np.array(self.encoder_flags)])
-
-    @property
     def encoder_size(self) -> int:
-        """Return how many constants of the encoder are estimated."""
-        return sum(self.encoder_flags)
+        """Return 1 if the encoder's scale is a variable, else 0."""
+        return int(self.problem.stage is not None and self.model.encoder_scale_sigma > 0)
 
     @property
     def share_size(self) -> int:

@@ -131,8 +131,7 @@ def constant_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
         out.append(_priors(base.sensors, state.sensors, sigma))
         if delay:
             out.append(_priors(base.clocks, values["clocks"], model.accelerometer_delay_sigma_s))
-    sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
-    sigmas = np.concatenate([sigmas[np.array(graph.encoder_flags)], np.ones(graph.share_size)])
+    sigmas = np.r_[[model.encoder_scale_sigma] * graph.encoder_size, np.ones(graph.share_size)]
     out.append(_priors(base.constants, values["constants"], sigmas))
     if problem.marks:
         guess = np.array([m.guess_mm for m in problem.marks])
@@ -300,13 +299,12 @@ def _one_camera(
     if problem.calibration is not None and len(state.calibration):
         by_rig = _by_calibration(graph, camera, moving.point_mm, position, shake)
         off += by_rig @ state.calibration
-    by_travel = seen.by_position * (-gain * position)[:, None]
-    by_encoder = graph.by_encoder(by_travel, np.zeros_like(by_travel))
+    by_encoder = (seen.by_position * (-gain * position)[:, None])[..., None]
     node = graph.nodes.of_frame[frame]
     blocks = (
         w @ (seen.by_point @ moving.by_state + moving.by_shift),
         graph.in_shake_basis(w @ by_shake, node),
-        w @ np.concatenate([by_encoder, by_rig], -1),
+        w @ np.concatenate([by_encoder[..., : graph.encoder_size], by_rig], -1),
     )
     return LinearFactors((), blocks, -np.einsum("mij,mj->mi", w, off), log_det_of(w))
 
@@ -335,11 +333,9 @@ def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
         return []
     if model.carriage.kind != "readings":
         node, reading = nodes.of_encoder, stage.position_mm
-        rows, rates = (np.tile(r, (len(node), 1)) for r in (layout.position, layout.velocity))
+        rows = np.tile(layout.position, (len(node), 1))
         if graph.to_encoder is not None:
             rows = np.einsum("i,mij->mj", layout.position, graph.to_encoder)
-            rates = np.einsum("i,mij->mj", layout.velocity, graph.to_encoder)
-        speed = (state.shake[node] * rates).sum(-1)
     else:
         inside = problem.in_encoder_record
         if not inside.any():
@@ -347,15 +343,11 @@ def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
         node = nodes.of_frame[inside]
         reading = graph.nominal_mm[node]
         rows = np.tile(layout.position, (len(node), 1))
-        speed = np.gradient(graph.nominal_mm, nodes.t_s)[node]
-    position = (state.shake[node] * rows).sum(-1) - state.encoder_delay_s(graph) * speed
-    constants = [
-        graph.by_encoder(np.zeros_like(speed), -speed),
-        np.zeros((len(node), graph.share_size)),
-    ]
+    position = (state.shake[node] * rows).sum(-1)
+    nothing = np.zeros((len(node), 1, graph.encoder_size + graph.share_size))
     by_shake = rows[:, None] @ graph.shake_basis(node)
     sigma = model.encoder_sigma_mm
-    blocks = (by_shake / sigma, np.concatenate(constants, -1)[:, None] / sigma)
+    blocks = (by_shake / sigma, nothing)
     log_det = np.full(len(node), -np.log(sigma))
     return [
         LinearFactors(

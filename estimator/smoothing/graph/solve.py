@@ -328,7 +328,6 @@ def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
     flat = all(not np.any(c.intrinsics[lens]) for c in problem.cameras)
     held = (
         model.encoder_scale_sigma,
-        model.encoder_delay_sigma_s,
         model.accelerometer_scale_sigma,
         model.accelerometer_delay_sigma_s,
     )
@@ -418,7 +417,7 @@ def _finish(
     if isinstance(last.done, EliminatedCrowd) and options.covariances and graph.share_size:
         shared = _joint_covariance(graph, last.done, (4,))
     by_scale = None
-    if options.covariances and graph.encoder_flags[0] and graph.rows:
+    if options.covariances and graph.encoder_size and graph.rows:
         by_scale = _scale_variances(graph, last.done)
     last.factors.clear()
     give_back_freed_memory()

@@ -68,7 +68,7 @@ def wider_scale_sigma(solution: Solution) -> float | None:
     """
     prior, travel = solution.graph.model.encoder_scale_sigma, solution.graph.problem.travel
     assumed = travel is None or travel.source == "assumed"
-    if not solution.graph.encoder_flags[0] or not assumed:
+    if not solution.graph.encoder_size or not assumed:
         return None
     off = abs(solution.state.encoder_scale(solution.graph))
     return 2 * off if off > _FAR * prior else None
@@ -102,15 +102,22 @@ def scale_warnings(solution: Solution) -> list[str]:
 def offset_sigma(solution: Solution) -> Array:
     """Return the standard deviation (3,) in mm of an offset that all places of a run share.
 
-    It is the way that the stage moves in the uncertain delay of its encoder. The motion of the
-    bubbles about their means is free of it.
+    It is the way that the stage moves in the uncertain delay of its encoder, and half of that by
+    which a camera has moved on from one half of the run to the other: where it was calibrated,
+    before or after a bump, is not known. The bubbles' motion about their means is free of it.
     """
-    problem = solution.graph.problem
+    graph = solution.graph
+    problem, half = graph.problem, len(graph.problem.t_s) // 2
+    shake = graph.shake_at_frames(solution.state.shake)
+    offsets = np.einsum("cid,fd->fci", graph.shake.offset[:-1], shake)
+    moved = np.zeros(3)
+    if half:
+        moved = np.abs(offsets[half:].mean(0) - offsets[:half].mean(0)).max(0) / 2
     if problem.stage is None:
-        return np.zeros(3)
+        return np.asarray(moved)
     _, speed = carriage(solution)
     way = problem.stage.delay_sigma_s * float(np.sqrt(np.mean(speed**2)))
-    return np.asarray(np.abs(problem.axis) * way)
+    return np.asarray(np.hypot(np.abs(problem.axis) * way, moved))
 
 
 def considered_variance(solution: Solution) -> tuple[Array, Array]:
@@ -167,7 +174,7 @@ def scale_sigma(solution: Solution) -> float:
     If the scale is no variable of the graph, it is the standard deviation that was known before.
     """
     graph, found = solution.graph, solution.covariances
-    if graph.encoder_flags[0]:
+    if graph.encoder_size:
         own = 0.0 if found is None else float(np.sqrt(found.encoder[0, 0]))
         return float(np.hypot(own, disputed_scale(solution)))
     travel = graph.problem.travel

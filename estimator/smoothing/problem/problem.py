@@ -98,7 +98,7 @@ class ShakeModel:
     encoder_sigma_mm : standard deviation of an encoder reading.
     encoder_scale_sigma, accelerometer_scale_sigma : prior standard deviations of the relative scale
         errors; 0 if they are not estimated.
-    encoder_delay_sigma_s, accelerometer_delay_sigma_s : the same for the delays.
+    accelerometer_delay_sigma_s : the same for the delay.
     pixel_inflation : factor on the stated noise of pixels.
     name : origin of the values: "given", "default" or "learned".
     learned : {hyper-parameter: standard deviation of its natural logarithm} of the learned ones.
@@ -110,7 +110,6 @@ class ShakeModel:
     carriage: CarriageModel = CarriageModel()
     encoder_sigma_mm: float = 0.005
     encoder_scale_sigma: float = 0.0
-    encoder_delay_sigma_s: float = 0.0
     accelerometer_scale_sigma: float = 0.0
     accelerometer_delay_sigma_s: float = 0.0
     pixel_inflation: float = 1.0

@@ -211,3 +211,23 @@ def test_an_unknown_delay_of_the_encoder_is_an_offset_of_all_places_and_of_no_mo
     np.testing.assert_allclose(offset_sigma(late), [0, 5e-3 * SPEED, 0], rtol=0.02)
     a, b = trajectories(exact, None), trajectories(late, None)
     np.testing.assert_array_equal(a["sy_mm"], b["sy_mm"])
+
+
+def test_a_camera_that_moves_on_in_a_run_leaves_an_offset_of_its_axes() -> None:
+    """Marks show that it did, and not which of both places is that of the calibration."""
+    known = problem(marks=True)
+
+    def bumped(seen: Observations) -> Observations:
+        late = (seen.camera == 1) & (seen.frame >= len(known.t_s) // 2)
+        return replace(seen, uv_px=seen.uv_px + np.where(late, 3.0, 0.0)[:, None] * [1.0, 0.0])
+
+    bands = tuple(BroadBand((0.3,) * 3, camera, 1.0, 60.0, 1.0) for camera in (0, 1))
+    model = replace(STILL, broad_bands=bands)
+    moved = replace(
+        known, observations=bumped(known.observations), references=bumped(known.references)
+    )
+    sound, found = (offset_sigma(solve(one, model)) for one in (known, moved))
+    scale = known.cameras[1]["scale_px_per_mm"]
+    assert sound[2] < 0.02
+    assert found[2] == pytest.approx(1.5 / scale, rel=0.2)
+    assert found[0] < 0.02

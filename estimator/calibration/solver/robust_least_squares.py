@@ -19,6 +19,7 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, GeometryError
+from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.gaussian import Gaussian
 from telerig.estimator.calibration.solver.problem import Problem, on_a_line
 from telerig.estimator.calibration.solver.system import System
@@ -141,7 +142,7 @@ def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:
     return np.asarray((residual_px * solved).sum(-1))
 
 
-def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float) -> float:
+def noise_floor_px(residual_px: Array, covariance_px2: Array, dof: float) -> float:
     """Return the noise floor: the standard deviation of scatter beyond the dots' image noise.
 
     It is taken as equal along u and v, and is 0 if it is not significant. It follows from the
@@ -149,9 +150,9 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float
 
     residual_px : (M, 2) residuals of all dots.
     covariance_px2 : (M, 2, 2) their image noise.
-    dof_per_row : degrees of freedom per measured coordinate.
+    dof : degrees of freedom of the residuals.
     """
-    expected = _MEDIAN * dof_per_row
+    expected = _MEDIAN * max(dof, 1.0) / residual_px.size
 
     def excess(floor: float) -> float:
         covariance = covariance_px2 + floor**2 * np.eye(2)
@@ -163,27 +164,6 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float
 
     top = 2 * float(np.abs(residual_px).max()) + 1e-9
     return float(brentq(excess, 0.0, top, xtol=1e-7)) if excess(top) < 0 else top
-
-
-def dof_per_row(problem: Problem) -> float:
-    """Return the approximate number of degrees of freedom per measured coordinate.
-
-    A coordinate of a dot counts as the share of it that the images, and not its prior, determine.
-    """
-    kept = problem.kept
-    rows = int(2 * np.sum(kept))
-    # rotation and offset across the axis; of the second camera along the common normal only
-    others = len(problem.cameras) - 1
-    used = float(sum(len(f) for f in problem.free) + 5 * others - (others > 0))
-    used += 6 * len(problem.views)
-    # an image of a target of any tilt shows two of three directions in space
-    scale = np.array([c["scale_px_per_mm"] for c in problem.cameras])[problem.camera]
-    variance = np.trace(problem.covariance_px2, axis1=1, axis2=2) / 2
-    shown = 2 / 3 * scale**2 / variance
-    information = np.bincount(problem.dot[kept], shown[kept], len(problem.dot_ids))
-    gain = information[:, None] * problem.dot_sigma_mm**2
-    used += float(np.sum(gain / (1 + gain)))
-    return float(max(0.3, 1 - used / max(rows, 1)))
 
 
 def robust_solve(
@@ -199,11 +179,12 @@ def robust_solve(
     begin = _without_lost_views(problem, np.ones(len(problem.view)))
     problem, placed = replace(problem, weight=begin), begin > 0
     solution = solve(problem, start, progress=progress)
-    limit, floor = np.inf, 0.0
+    dof = joint_covariance(problem, solution, whole=False).effective_dof
+    limit, floor, rows = np.inf, 0.0, np.sum(problem.kept)
     for _ in range(rounds):
         residual = pixel_residuals(problem, solution.state)
         sound = problem.kept
-        floor = noise_floor_px(residual[sound], base[sound], dof_per_row(problem))
+        floor = noise_floor_px(residual[sound], base[sound], dof * np.sum(sound) / rows)
         covariance = base + floor**2 * np.eye(2)
         distance = np.sqrt(squared_distance(residual, covariance))
         worst = float(distance[placed].max())

@@ -54,7 +54,8 @@ def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Arra
     determinant = m11 * m22 - m12 * m12
     x, y = (m22 * du_px - m12 * dv_px) / determinant, (m11 * dv_px - m12 * du_px) / determinant
     radius = np.sqrt(x * x + y * y) + 1e-12
-    slope = np.hypot(m22 * x - m12 * y, m11 * y - m12 * x) / (determinant * radius) + 1e-12
+    across, along = m22 * x - m12 * y, m11 * y - m12 * x
+    slope = np.sqrt(across * across + along * along) / (determinant * radius) + 1e-12
     distance: Array = np.maximum((radius - 1.0) / slope, -0.5 * (m11 + m22))
     return distance
 

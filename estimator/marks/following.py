@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import GeometryError
+from telerig.estimator.dots.grid.numbering import DOT_FALSE, DOT_LOST, WRONG_ODDS
 from telerig.estimator.marks.strip_dots import DotLook, DotSightings
 from telerig.rig.camera import Camera
 
@@ -117,7 +118,9 @@ _FIRST_STEP_MM = 0.3
 _LEAST_STEP_MM = 0.1
 _REACH = 5.0
 _LEARN = 0.1
-_UNMATCHED, _MISSED, _SURE = 4.5, 2.5, 6.0
+_UNMATCHED, _MISSED, _SURE = (-float(np.log(p)) for p in (DOT_FALSE, DOT_LOST, WRONG_ODDS))
+"""Log-likelihood that a stray dot, a mark in view without a dot, and a second shift cost at most:
+with the probabilities by which the dots of a target are numbered."""
 _TOLERANCE, _SAME, _APART = 0.06, 0.5, 0.4
 _GATE, _PLACE_PX, _PLACE_GAIN = 5.0, 0.1, 0.3
 _CONFIRM, _FORGET, _MOVED_PX = 3, 50, 2.0

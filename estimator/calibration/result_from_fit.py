@@ -16,12 +16,11 @@ from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.robust_least_squares import (
     RobustFit,
-    Solution,
     lost_views,
     pixel_residuals,
     squared_distance,
 )
-from telerig.estimator.calibration.solver.system import System
+from telerig.estimator.calibration.solver.system import Solution, System
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
 from telerig.estimator.calibration.thresholds import SURE_SD, UNEXPLAINED
 from telerig.factors.calibration import State

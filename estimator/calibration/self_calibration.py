@@ -41,11 +41,10 @@ from telerig.estimator.calibration.solver.problem import (
 from telerig.estimator.calibration.solver.robust_least_squares import (
     Progress,
     RobustFit,
-    Solution,
     robust_solve,
     solve,
 )
-from telerig.estimator.calibration.solver.system import System
+from telerig.estimator.calibration.solver.system import Solution, System
 from telerig.estimator.calibration.start import (
     known_target,
     mirror_ambiguity,

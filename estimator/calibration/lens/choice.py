@@ -35,8 +35,8 @@ from telerig.estimator.calibration.lens.search import (
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
-from telerig.estimator.calibration.solver.robust_least_squares import Solution, solve
-from telerig.estimator.calibration.solver.system import System
+from telerig.estimator.calibration.solver.robust_least_squares import solve
+from telerig.estimator.calibration.solver.system import Solution, System
 from telerig.estimator.calibration.thresholds import CONSIDERED_P_VALUE, UNDETERMINED
 from telerig.factors.calibration import State
 from telerig.rig.lens_parameters import AUTO, GROUPS, INDEX, groups_of, joint_name, name_of, ordered

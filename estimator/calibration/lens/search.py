@@ -24,7 +24,7 @@ from telerig.estimator.calibration.quality.residual_structure import residual_te
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
-from telerig.estimator.calibration.solver.robust_least_squares import Solution
+from telerig.estimator.calibration.solver.system import Solution
 from telerig.estimator.calibration.thresholds import GROUP_PENALTY
 from telerig.factors.calibration import whitened_error
 from telerig.rig.lens_parameters import GROUPS, INDEX, PLAIN_GROUPS, ordered

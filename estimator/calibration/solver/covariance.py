@@ -4,18 +4,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.gaussian import Gaussian
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.estimator.calibration.solver.system import MANY_PARAMETERS, System, images_of
+from telerig.estimator.calibration.solver.system import (
+    MANY_PARAMETERS,
+    Solution,
+    System,
+    images_of,
+)
 from telerig.rig.triangulation import POSE_COMPONENTS
-
-if TYPE_CHECKING:
-    from telerig.estimator.calibration.solver.robust_least_squares import Solution
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.gaussian import Gaussian
 from telerig.estimator.calibration.solver.problem import Problem, on_a_line
-from telerig.estimator.calibration.solver.system import System
+from telerig.estimator.calibration.solver.system import Solution, System
 from telerig.estimator.calibration.thresholds import LEAST_DOTS
 from telerig.factors.calibration import State, pixels
 from telerig.factors.robust_loss import calibration_weights, next_limit
@@ -35,25 +35,6 @@ NEARLY_UNDAMPED = 1e-6
 gain."""
 LEAST_DAMPING = 1e-12
 Progress = Callable[[int, float], None]
-
-
-@dataclass(frozen=True)
-class Solution:
-    """The result of a least-squares solution.
-
-    state : the minimum.
-    gaussian : the Gaussian of the problem there.
-    iterations : number of steps.
-    """
-
-    state: State
-    gaussian: Gaussian
-    iterations: int
-
-    @property
-    def cost(self) -> float:
-        """Half the sum of squared whitened residuals, including those of the priors."""
-        return self.gaussian.cost
 
 
 def solve(

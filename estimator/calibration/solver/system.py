@@ -194,6 +194,25 @@ class System:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Solution:
+    """The result of a least-squares solution.
+
+    state : the minimum.
+    gaussian : the Gaussian of the problem there.
+    iterations : number of steps.
+    """
+
+    state: State
+    gaussian: Gaussian
+    iterations: int
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squared whitened residuals, including those of the priors."""
+        return self.gaussian.cost
+
+
 class _Sums:
     """The parts of a `Gaussian` while the products of derivatives and residuals are added up.
 

@@ -443,10 +443,10 @@ def _planned(run: RunData, tracks: Tracks, smoothing: Smoothing) -> Experiment:
 def _verdict(expected: Verdict, seconds: float, smoothing: Smoothing) -> Check:
     """Check which verdict the planned run may expect."""
     file = SmoothingFile.model_validate(smoothing.verdict)
+    numbers = number_words(file.axes, file.vertical) or "its measurements disagree"
     return _judged(
         "expected verdict",
-        f"{expected} of a run of {seconds:.3g} s; of this recording {file.verdict}: "
-        f"{number_words(file.axes, file.vertical)}",
+        f"{expected} of a run of {seconds:.3g} s; of this recording {file.verdict}: {numbers}",
         expected is Verdict.RESOLVED,
         "add an accelerometer to each arm or marks fixed to the tank; `telerig plan` compares them",
     )

@@ -94,6 +94,7 @@ STUDIES = (
         page="shake_oblique",
     ),
     Study("shake_faults"),
+    Study("rig_faults"),
     Study("plan"),
     Study("sensor_faults", "faults --scenarios S1 --configurations one,marks --clocks unknown"),
     Study("sound_runs", "--out {work}/sound_runs.jsonl", writes=False),

@@ -59,6 +59,7 @@ def test_a_changed_magnification_and_a_wrong_axis_are_refused(
         np.testing.assert_allclose(refusals[0].fix["stage_axis"], [0, -1, 0], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_regression_knows_its_own_errors() -> None:
     """Shake moves all marks alike for a while: the jackknife leaves out what moved together."""
     off = []

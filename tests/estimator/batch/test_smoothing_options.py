@@ -47,14 +47,14 @@ def asked(tank: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """What smoothings are asked for from now on. None is done; their result is the dataset's."""
     found, calls = telerig.load_smoothing(tank / "results" / "rise"), list[dict[str, Any]]()
 
-    def smooth_run(run: Any, _: Any, tracks: Path, folder: Path, **options: Any) -> Any:
+    def smooth_run(
+        run: Any, _: Any, tracks: Path, folder: Path, options: SmoothingOptions, **others: Any
+    ) -> Any:
         if not (Path(tracks) / "tracks.csv").is_file():
             raise InputError("not tracked", where=str(tracks))
-        kept = ("model", "refine_rig", "accept", "report")
-        options = {"accept": [], "refine_rig": False} | options
         where = {"run": run.path, "tracks": Path(tracks), "out": Path(folder)}
-        calls.append(where | {name: options[name] for name in kept})
-        calls[-1]["accept"] = list(options["accept"])
+        said = options.keywords | {"accept": list(options.accept), "report": others["report"]}
+        calls.append(where | said)
         return found
 
     monkeypatch.setattr(results_folder, "smooth_run", smooth_run)

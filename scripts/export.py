@@ -35,7 +35,7 @@ def export(
         typer.Option(help="For trajectories: name of the run [the only one with results]."),
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="calibration.json [the dataset's own].")
+        Path | None, typer.Option(help="calibration.json [the run's or dataset's].")
     ] = None,
     out: Annotated[
         Path | None,

@@ -12,19 +12,16 @@ import pandas as pd
 from telerig.errors import InputError
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.names import absent
+from telerig.io.results.folders.tracking import TrackResults, read_track_table
 from telerig.io.results.manifest import reading, replaced_results
 from telerig.io.results.tracking import TrackingFile, share_words
-from telerig.io.tables.run import DETECTIONS, EVENTS, REFERENCES, TRACKS
-from telerig.io.tables.table import PIXEL, POINT
+from telerig.io.tables.run import DETECTIONS, EVENTS, TRACKS
 from telerig.short_text import ShortText, counted, first_of
 
 if TYPE_CHECKING:
     import xarray
 
     from telerig.estimator.tracking.filter import TrackEvent
-
-_NEED, _OF_IMAGES = ("frame", "particle", "t_s", *POINT), ("frame", "camera", *PIXEL)
-"""Columns that the tables of tracks and of detections of other programs must have."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -137,24 +134,24 @@ def open_tracks(folder: str | Path) -> Tracks | StoredTracks:
     place = Path(folder)
     if not place.is_dir():
         raise absent(place, "folder of results", f"run `{TrackingFile.MAKE}` first")
-    files = _files(place)
-    marks = place / "references.csv"
-    with reading(place, [file.name for file in (*files, marks)]):
-        table = FrameTable.of(files[1], TRACKS.reader_of_parts(files[1], need=_NEED), _unseen)
-        detections = FrameTable.of(
-            files[0], DETECTIONS.reader_of_parts(files[0], need=_OF_IMAGES), _unseen
+    files = [place / name for name in ("tracks.csv", "detections.csv")]
+    found = TrackResults(place)
+    with reading(place, TrackResults.FILES[:-1]):
+        table, detections = (
+            FrameTable.of(file, one.reader_of_parts(file, need=need), _unseen)
+            for file, one, need in zip(files, (TRACKS, DETECTIONS), (TrackResults.NEED, None))
         )
         if table is None or detections is None:
             return load_tracks(folder)
-        summary = TrackingFile.read(files[3]).content()
-        references = REFERENCES.read(marks) if marks.is_file() else None
+        references = found.references if found.has("references.csv") else None
+        summary = found.content
     return StoredTracks(str(summary.get("run", place.name)), table, detections, summary, references)
 
 
 def open_track_table(file: Path) -> pd.DataFrame | StoredTracks:
     """Read a table as `read_track_table` does; of a large file return a `StoredTracks`, which reads
     the rows of single frames when they are needed."""
-    table = FrameTable.of(file, TRACKS.reader_of_parts(file, need=_NEED), _unseen)
+    table = FrameTable.of(file, TRACKS.reader_of_parts(file, need=TrackResults.NEED), _unseen)
     return read_track_table(file) if table is None else StoredTracks("", table, None)
 
 
@@ -180,35 +177,17 @@ def load_tracks(folder: str | Path) -> Tracks:
     place = Path(folder)
     if not place.is_dir():
         raise absent(place, "folder of results", f"run `{TrackingFile.MAKE}` first")
-    files = _files(place)
-    marks = place / "references.csv"
-    with reading(place, [file.name for file in (*files, marks)]):
-        summary = TrackingFile.read(files[3]).content()
-        detections = DETECTIONS.read(files[0], need=_OF_IMAGES)
-        table = read_track_table(files[1])
-        events = EVENTS.read(files[2])
-        references = REFERENCES.read(marks) if marks.is_file() else None
-    return Tracks(
-        str(summary.get("run", place.name)), detections, table, events, summary, references
-    )
-
-
-def _files(place: Path) -> list[Path]:
-    """Return detections.csv, tracks.csv, events.csv and tracking.json, all of which are there."""
-    files = [place / n for n in ("detections.csv", "tracks.csv", "events.csv", "tracking.json")]
-    for file in files:
-        if not file.is_file():
-            raise InputError(f"there is no {file.name}", where=str(place), todo="run telerig track")
-    return files
-
-
-def read_track_table(file: Path) -> pd.DataFrame:
-    """Read tracks.csv, or a table of tracks that another program made.
-
-    Returns all columns of the file. Raises InputError for a table without frame, particle, t_s and
-    the position (mm), and for cells that are not what their column says.
-    """
-    return TRACKS.read(file, need=_NEED)
+    for name in TrackResults.FILES[:4]:
+        if not (place / name).is_file():
+            raise InputError(f"there is no {name}", where=str(place), todo="run telerig track")
+    found = TrackResults(place)
+    with reading(place, TrackResults.FILES[:-1]):
+        summary = found.content
+        references = found.references if found.has("references.csv") else None
+        return Tracks(
+            str(summary.get("run", place.name)), found.detections, found.tracks, found.events,
+            summary, references,
+        )  # fmt: skip
 
 
 def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") -> str:

@@ -132,7 +132,8 @@ def export_results(
 
     source : a dataset, one of its results folders, or a calibration.json.
     run : name of the run; None takes the only one with results.
-    calibration : calibration.json to use in place of that of the dataset.
+    calibration : calibration.json to use in place of the cameras that the run was tracked with, or
+        of the dataset's calibration where the run's folder does not state them.
     out : file or folder to write; None writes into the folder results/export of the dataset.
     accept : ("stale",) also exports results whose inputs have changed.
     volume : as for `export_cameras`.
@@ -154,10 +155,12 @@ def export_results(
         raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
     _refuse_options_of_others(to, run=run, calibration=calibration, volume=volume)
     rig, results = CalibratedCameras(), None
-    if to in CAMERA_EXPORTS or "cameras" in known[to].options:
-        rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
     if to in RUN_EXPORTS:
         results = read_results(run_folder(source, run), accept=accept)
+    if results is not None and results.cameras and calibration is None:
+        rig = CalibratedCameras(results.cameras)
+    elif to in CAMERA_EXPORTS or "cameras" in known[to].options:
+        rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
     name = to if results is None else results.name
     place = out or results_root(source) / "export" / f"{name}{known[to].suffix}"
     if results is None:

@@ -112,6 +112,12 @@ def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = Fals
     return table[list(kinds)].astype(kinds)
 
 
+def no_rows(columns: Sequence[Column]) -> pd.DataFrame:
+    """Return the table of these columns that a file must have, without rows."""
+    kinds = {one.name: _DTYPES[one.kind, one.blank] for one in columns if one.required}
+    return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
+
+
 def write_table(table: pd.DataFrame, path: str | PathLike[str]) -> None:
     """Write a CSV table, completely or not at all; floats have the same values when read again.
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from telerig.io.files.csv_table import Column, read_columns, read_part, read_table
+from telerig.io.files.csv_table import Column, no_rows, read_columns, read_part, read_table
 from telerig.io.files.frame_table import Read
 
 CAMERA = "{camera}"
@@ -65,13 +65,17 @@ class Table:
         return None
 
     def read(
-        self, file: Path, cameras: Sequence[str] = (), *, need: Collection[str] | None = None
-    ) -> pd.DataFrame:
+        self, file: Path, cameras: Sequence[str] = (), *, need: Collection[str] | None = None,
+        optional: bool = False,
+    ) -> pd.DataFrame:  # fmt: skip
         """Read the table with all columns of the file, also unknown ones; it may have no rows.
 
-        need : as for `of`. Raises InputError as `read_table` does.
+        need : as for `of`. optional : a missing file is a table without rows. Raises InputError as
+        `read_table` does.
         """
         columns = self.of(cameras, need=need)
+        if optional and not file.is_file():
+            return no_rows(columns)
         return read_table(file, columns, extra=True, empty=True).reset_index(drop=True)
 
     def reader_of_parts(self, file: Path, *, need: Collection[str] | None = None) -> Read:

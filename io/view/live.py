@@ -23,9 +23,10 @@ from telerig.errors import TelerigError
 from telerig.io.dataset.run import RunData, RunSource, recordings
 from telerig.io.images.read import list_images, read_image
 from telerig.io.recording.clock import unwrap
-from telerig.io.report.film.views import outlines_of, read_outlines
+from telerig.io.report.film.views import outlines_of
 from telerig.io.report.plot.axes import COLOURS, KEPT, LEFT_OUT, MUTED
 from telerig.io.rig_file.description import DeviceDescription
+from telerig.io.tables.run import DETECTIONS
 from telerig.io.tables.smoothing import AXES
 from telerig.io.view.names import (
     FRAME,
@@ -120,7 +121,7 @@ class LiveView:
 
     def detected(self, file: Path, frame: int) -> None:
         """Show a frame's images with the bubbles found in them, from a file of detections."""
-        found = read_outlines(file, self.cameras)
+        found = outlines_of(DETECTIONS.read(file), self.cameras)
         self._frame(frame, found[found["frame"] == frame].assign(particle=np.nan))
 
     def linked(self, tracks: pd.DataFrame, detections: pd.DataFrame) -> None:

@@ -54,7 +54,7 @@ def log_run(
 ) -> None:
     """Log a run, on the time lines "frame" and "time".
 
-    cameras : of the rig, empty where they are not known. detections : what `read_outlines` returns.
+    cameras : of the rig, empty where they are not known. detections : from `found_outlines`.
     image : returns the image of a camera and frame, or None. frames : those whose images, outlines
     and bodies are shown; paths and series are whole.
     """

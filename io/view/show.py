@@ -15,7 +15,7 @@ from telerig.errors import InputError, TelerigWarning
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import RunData, RunSource, load_run, recordings
 from telerig.io.files.atomic import atomic_path
-from telerig.io.report.film.views import read_outlines
+from telerig.io.report.film.views import found_outlines
 from telerig.io.results.folders.calibration import read_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
@@ -121,7 +121,7 @@ def log_results(
     shown = every[:: -(-len(every) * len(tracks.cameras) // MOST_IMAGES) or 1]
     smoothed = ("height_less_line_mm", "shake_um", "speed_mm_s", "encoder_residual_um")
     plots = ["ray_miss_um", "step_mm", *(() if smoothing is None else smoothed)]
-    found = read_outlines(found_in / "detections.csv", tracks.cameras)
+    found = found_outlines(tracks, tracks.cameras)
     if "chi2_dof" in found and found["chi2_dof"].notna().any():
         plots.insert(2, "outline_chi2")
     if data is not None and data.accelerometers is not None:

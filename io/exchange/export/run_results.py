@@ -14,15 +14,14 @@ import pandas as pd
 
 from telerig.arrays import Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import read_table
 from telerig.io.files.names import absent
 from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.folders.tracking import TrackResults
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import SmoothingFile
 from telerig.io.results.stale import refuse_stale
 from telerig.io.tables.run import TRACKS
 from telerig.io.tables.smoothing import SHAKE, TRAJECTORIES
-from telerig.io.tables.table import POINT
 from telerig.rig.camera import Camera
 
 _TRAJECTORIES = ("trajectories.csv", "tracks.csv")
@@ -46,6 +45,7 @@ class RunResults:
     source : the name of the file from which ``points`` was read.
     accepted : why the results are stale, if they were read although they are.
     folder : the results folder from which they were read; None for a run in memory.
+    cameras : those that the run was tracked with; empty where the folder does not state them.
     """
 
     name: str
@@ -56,6 +56,7 @@ class RunResults:
     source: str = ""
     accepted: tuple[str, ...] = ()
     folder: Path | None = None
+    cameras: tuple[Camera, ...] = ()
 
 
 def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -> RunResults:
@@ -74,15 +75,17 @@ def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -
         )
     smoothed = names[0] == "trajectories.csv"
     files = (names[0], "shake.csv", "smoothing.json") if smoothed else names[:1]
-    with reading(place, files):
+    with reading(place, (*files, "tracking.json")):
         accepted = refuse_stale(place, files, accept)
         return _read_results(place, names[0], accepted)
 
 
 def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunResults:
     shake, smoothed = place / "shake.csv", source == "trajectories.csv"
-    columns = TRACKS.of(need=("frame", "particle", "t_s", *POINT))
-    points = read_table(place / source, columns, extra=True)
+    file, tracked = place / source, TrackResults(place)
+    points = TRAJECTORIES.read(file, need=TrackResults.NEED) if smoothed else tracked.tracks
+    if not len(points):
+        raise InputError("has no rows below its header", where=str(file))
     return RunResults(
         name=place.name,
         frame=LAB if smoothed else RIG,
@@ -92,6 +95,7 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
         source=source,
         accepted=accepted,
         folder=place,
+        cameras=tracked.file.rig_cameras() if tracked.has("tracking.json") else (),
     )
 
 

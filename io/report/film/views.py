@@ -17,8 +17,7 @@ from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.mp4 import Progress, write_film
 from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
-from telerig.io.results.manifest import reading
-from telerig.io.tables.run import DETECTIONS
+from telerig.io.results.folders.tracking import TrackResults, read_track_results
 from telerig.rig.outline import HARMONICS, points_on
 
 Picture = NDArray[np.uint8]
@@ -77,9 +76,7 @@ def write_views_film(
     InputError for a folder without detections.csv, and a file that cannot be written.
     """
     cameras = tuple(image_sizes_px)
-    folder = Path(results_folder)
-    with reading(folder, ["detections.csv"]):
-        table = read_outlines(folder / "detections.csv", cameras)
+    table = found_outlines(read_track_results(Path(results_folder)), cameras)
     step = -(-frame_count // MOST_FRAMES)
     frames = list(view_frames(table, cameras, range(0, frame_count, step), t_s))
     shades = {name: _shades(images, name, frame_count) for name in cameras}
@@ -89,20 +86,28 @@ def write_views_film(
     return (f"both views: every {step}. of {frame_count} frames is shown",) if step > 1 else ()
 
 
-def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
-    """Read detections.csv with the columns of the outlines; blank shape coefficients are 0."""
-    if not file.is_file():
+def found_outlines(results: TrackResults, cameras: Sequence[str]) -> pd.DataFrame:
+    """Return the outlines of a tracked run, as `outlines_of` does.
+
+    Raises InputError for a folder without detections.csv.
+    """
+    if not results.has("detections.csv"):
         raise InputError(
-            "is not there, so nothing can be drawn into the images", where=str(file),
+            "is not there, so nothing can be drawn into the images",
+            where=str(results.folder / "detections.csv"),
             todo="track the run again (`telerig track`)",
-        )  # fmt: skip
-    return outlines_of(DETECTIONS.read_known(file), cameras)
+        )
+    return outlines_of(results.detections, cameras)
 
 
 def outlines_of(table: pd.DataFrame, cameras: Sequence[str]) -> pd.DataFrame:
-    """Return rows of detections.csv with a place, as `read_outlines` does."""
+    """Return rows of detections.csv with a place, with the columns of the outlines.
+
+    Blank shape coefficients are 0.
+    """
     absent: dict[str, Any] = {name: 0.0 for name in _SHAPE if name not in table}
     absent |= {name: np.nan for name in _ELLIPSE if name not in table}
+    absent |= {} if "flags" in table else {"flags": ""}
     table = table.assign(**absent)
     table[_SHAPE] = table[_SHAPE].fillna(0.0)
     seen = np.isfinite(table[["u_px", "v_px"]].to_numpy(float)).all(1)

@@ -398,18 +398,18 @@ def _images(results: TrackResults) -> list[Block]:
         "space."
     )
     figures: list[Block] = []
-    if len(results.detections):
+    if len(results.outlines):
         figures.append(
             Figure("Bubbles per frame", partial(plot.bubbles_in_frames, counts), caption)
         )
     for i, camera in enumerate(results.cameras):
-        mine = results.detections[results.detections["camera"] == camera]
+        mine = results.outlines[results.outlines["camera"] == camera]
         alone, size = int(mine["particle"].isna().sum()), results.image_size_px(camera)
         caption = (
             f"{number(len(mine))} bubbles; red dots: {number(alone)} ({share(alone, len(mine))}) "
             "in no track, which should not gather anywhere but at the border."
         )
-        draw = partial(plot.coverage, results.detections, camera, size, colour=camera_colour(i))
+        draw = partial(plot.coverage, results.outlines, camera, size, colour=camera_colour(i))
         height = image_height_in(size) if size else 3.6
         if len(mine):
             figures.append(Figure(f"Bubbles in the image, camera {camera}", draw, caption, height,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from telerig.arrays import Array
 from telerig.io.report.page.page import Row, Tile, Verdict, link_to
@@ -52,7 +53,7 @@ def _many(count: int, word: str) -> str:
 
 def _matched(results: TrackResults) -> tuple[int, int] | None:
     """Detections that belong to a bubble seen by two cameras or more, of all."""
-    found = len(results.detections) or results.file.detections or 0
+    found = len(results.outlines) or results.file.detections or 0
     if found <= 0:
         return None
     seen = results.tracks[[f"{c}_u_px" for c in results.cameras]].notna().to_numpy().sum()
@@ -145,7 +146,7 @@ def key_numbers(results: TrackResults) -> list[Tile]:
     if sd is not None:
         of_noise = f"{number(_normal_median(sd), 2)} µm from the outlines' noise; "
     frames = frame_count(results)
-    ambiguous = word_counts(tracks["flags"])[_AMBIGUOUS]
+    ambiguous = word_counts(tracks)[_AMBIGUOUS]
     each = len(tracks) / frames if frames else None
     return [
         Tile("Tracks", number(len(lengths)),
@@ -171,9 +172,9 @@ def _normal_median(sd_mm: Array) -> float | None:
     return None if middle is None else 1e3 * NORMAL_MEDIAN * middle
 
 
-def word_counts(flags: Iterable[str]) -> Counter[str]:
-    """Return how often each of the words joined by | occurs."""
-    whole = Counter(flags)
+def word_counts(table: pd.DataFrame) -> Counter[str]:
+    """Return how often each of the words occurs in ``flags``; none where a table has no flags."""
+    whole = Counter(table.get("flags", ()))
     counts: Counter[str] = Counter()
     for text, times in whole.items():
         for word in filter(None, text.split("|")):
@@ -207,8 +208,8 @@ def _offset(bias_px: float | Sequence[float] | None) -> tuple[float | None, str]
 
 def flag_rows(results: TrackResults) -> list[Row]:
     """Flags of bubbles and reasons for frames without one: a row each, a column per camera."""
-    found = results.detections
-    counts = {c: word_counts(found["flags"][found["camera"] == c]) for c in results.cameras}
+    found = results.outlines
+    counts = {c: word_counts(found[found["camera"] == c]) for c in results.cameras}
     words = sorted({word for count in counts.values() for word in count})
     rows = [
         Row((f"flag: {word}", *(number(counts[c][word]) for c in results.cameras)))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -18,48 +19,133 @@ from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
 from telerig.io.results.tracking import Pairs, TrackingFile
 from telerig.io.tables.run import DETECTIONS, EVENTS, REFERENCES, TRACKS
-from telerig.io.tables.table import POINT
+from telerig.io.tables.table import POINT, Table
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 from telerig.statistics import median
 
-_FILES = (
-    "tracking.json", "tracks.csv", "detections.csv", "events.csv", "references.csv", "run.json"
-)  # fmt: skip
 UP = (0.0, -1.0, 0.0)
 """In the rig frame, where tracking.json has no ``up``."""
 
 
 @dataclass(frozen=True)
 class TrackResults:
-    """A results folder in memory.
+    """The results folder of a tracked run; each file is read and checked when it is asked for.
 
-    file : tracking.json.
-    cameras : names, in the rig's order.
-    rig : these cameras; empty for a folder of an older version, whose tracking.json has none.
-    tracks, detections, events, references : the tables; rows of detections.csv that only say why a
-        frame has no bubble are left out (tracking.json counts them).
-    up : (3,) unit vector in the rig frame.
-    pictures : (camera, frame as six digits) -> file.
-    absent : what optional files are missing, in words.
+    Reading raises InputError for what is missing, cannot be read or does not fit together.
     """
 
-    file: TrackingFile
-    cameras: tuple[str, ...]
-    rig: tuple[Camera, ...]
-    tracks: pd.DataFrame
-    detections: pd.DataFrame
-    events: pd.DataFrame
-    references: pd.DataFrame
-    run: Mapping[str, Any]
-    up: Array
-    pictures: Mapping[tuple[str, str], Path]
-    absent: tuple[str, ...]
+    folder: Path
+
+    FILES: ClassVar[tuple[str, ...]] = (
+        "tracking.json", "tracks.csv", "detections.csv", "events.csv", "references.csv", "run.json",
+    )  # fmt: skip
+    NEED: ClassVar[tuple[str, ...]] = ("frame", "particle", "t_s", *POINT)
+    """Columns of tracks.csv without which it is no table of tracks."""
+
+    @cached_property
+    def file(self) -> TrackingFile:
+        """tracking.json."""
+        return TrackingFile.read(self.folder / "tracking.json")
 
     @property
     def content(self) -> Mapping[str, Any]:
         """tracking.json as it stands."""
         return self.file.content()
+
+    @cached_property
+    def tracks(self) -> pd.DataFrame:
+        """tracks.csv, also with columns that telerig does not know; ids may be names."""
+        return read_track_table(self.folder / "tracks.csv")
+
+    @cached_property
+    def cameras(self) -> tuple[str, ...]:
+        """Names, in the order of the columns."""
+        found = _cameras_of(self.tracks.columns)
+        known = list(self.file.frames_without_bubbles or found)
+        if sorted(known) != sorted(found):
+            what = f"its columns are of cameras {list(found)}, tracking.json's are {known}"
+            raise InputError(
+                what, where=f"{self.folder / 'tracks.csv'} row 1", todo=TrackingFile.AGAIN
+            )
+        return found
+
+    @cached_property
+    def rig(self) -> tuple[Camera, ...]:
+        """These cameras; empty for a folder of an older version, whose tracking.json has none."""
+        known = {camera.name: camera for camera in self.file.rig_cameras()}
+        if known and not set(self.cameras) <= set(known):
+            what = f"its cameras are {list(known)}, those of tracks.csv {list(self.cameras)}"
+            raise InputError(
+                what, where=str(self.folder / "tracking.json"), todo=TrackingFile.AGAIN
+            )
+        return tuple(known[name] for name in self.cameras if known)
+
+    def has(self, name: str) -> bool:
+        """Return whether the folder has a file."""
+        return (self.folder / name).is_file()
+
+    def _table(self, table: Table) -> pd.DataFrame:
+        return table.read(self.folder / table.file, optional=True)
+
+    @cached_property
+    def detections(self) -> pd.DataFrame:
+        """detections.csv, with the rows that only say why an image gave nothing."""
+        found = self._table(DETECTIONS)
+        camera = found["camera"].to_numpy()
+        Rows(self.folder / "detections.csv", np.arange(len(found)) + 2).refuse(
+            ~np.isin(camera, self.cameras or camera),
+            "camera",
+            lambda i: f"tracks.csv has no camera {camera[i]!r}",
+            "the files are of two runs; " + TrackingFile.AGAIN,
+        )
+        return found
+
+    @cached_property
+    def outlines(self) -> pd.DataFrame:
+        """The rows of detections.csv that have a place."""
+        found: pd.DataFrame = self.detections[np.isfinite(self.detections["u_px"])]
+        return found.reset_index(drop=True)
+
+    @cached_property
+    def events(self) -> pd.DataFrame:
+        """events.csv."""
+        return self._table(EVENTS)
+
+    @cached_property
+    def references(self) -> pd.DataFrame:
+        """references.csv."""
+        return self._table(REFERENCES)
+
+    @cached_property
+    def run(self) -> Mapping[str, Any]:
+        """run.json."""
+        return RunFile.read_if_there(self.folder / "run.json").content()
+
+    @cached_property
+    def up(self) -> Array:
+        """(3,) unit vector in the rig frame."""
+        return unit_vector(UP if self.file.up is None else self.file.up)
+
+    @cached_property
+    def pictures(self) -> Mapping[tuple[str, str], Path]:
+        """(camera, frame as six digits) -> file."""
+        return {
+            (camera, picture.stem): picture
+            for camera in self.cameras
+            for picture in sorted((self.folder / "overlays" / camera).glob("*.jpg"))
+        }
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """What optional files are missing, in words."""
+        there = {
+            "detections.csv (no numbers on single images)": self.has("detections.csv"),
+            "events.csv (no history of births, gaps and ends)": self.has("events.csv"),
+            "run.json (no versions, no options)": bool(self.run),
+            "overlays/ (no pictures of the bubbles that were found)": bool(self.pictures),
+        }
+        return tuple(text for text, present in there.items() if not present)
 
     @property
     def points_mm(self) -> Array:
@@ -91,72 +177,54 @@ class TrackResults:
         return self.file.image_size_px.get(camera)
 
 
-def read_track_results(folder: Path) -> TrackResults:
-    """Read a tracked run's results folder.
+def read_track_table(file: Path) -> pd.DataFrame:
+    """Read tracks.csv, or a table of tracks that another program made.
 
-    tracking.json and tracks.csv are needed; detections.csv, events.csv, references.csv, run.json,
-    overlays/<camera>/<frame>.jpg are used when they are there.
-    Raises InputError for what is missing, cannot be read or does not fit together.
+    Returns all columns of the file. Raises InputError for a table without frame, particle, t_s and
+    the position (mm), and for cells that are not what their column says.
     """
-    with reading(folder, _FILES):
-        return _read_track_results(folder)
+    cameras = _cameras_of(header_of(file, TrackingFile.AGAIN))
+    return TRACKS.read(file, cameras, need=TrackResults.NEED)
 
 
-def _read_track_results(folder: Path) -> TrackResults:
-    stated = TrackingFile.read(folder / "tracking.json")
-    file = folder / "tracks.csv"
-    header = header_of(file, TrackingFile.AGAIN)
-    cameras = tuple(name.removesuffix("_u_px") for name in header if name.endswith("_u_px"))
-    known = list(stated.frames_without_bubbles or cameras)
-    if not cameras or sorted(known) != sorted(cameras):
-        what = f"its columns are of cameras {list(cameras)}, tracking.json's are {known}"
-        raise InputError(what, where=f"{file} row 1", todo=TrackingFile.AGAIN)
-    tables = {
-        one.file: one.read_known(folder / one.file, optional=True)
-        for one in (DETECTIONS, EVENTS, REFERENCES)
-    }
-    found = tables[DETECTIONS.file]
-    camera = found["camera"].to_numpy()
-    Rows(folder / "detections.csv", np.arange(len(found)) + 2).refuse(
-        ~np.isin(camera, cameras),
-        "camera",
-        lambda i: f"tracks.csv has no camera {camera[i]!r}",
-        "the files are of two runs; " + TrackingFile.AGAIN,
-    )
-    run = RunFile.read_if_there(folder / "run.json").content()
-    pictures = {
-        (camera, picture.stem): picture
-        for camera in cameras
-        for picture in sorted((folder / "overlays" / camera).glob("*.jpg"))
-    }
-    absent = {
-        "detections.csv (no numbers on single images)": (folder / "detections.csv").is_file(),
-        "events.csv (no history of births, gaps and ends)": (folder / "events.csv").is_file(),
-        "run.json (no versions, no options)": bool(run),
-        "overlays/ (no pictures of the bubbles that were found)": bool(pictures),
-    }
-    return TrackResults(
-        file=stated,
-        cameras=cameras,
-        rig=_rig(stated, cameras, folder),
-        tracks=TRACKS.read_known(file, cameras),
-        detections=found[np.isfinite(found["u_px"])].reset_index(drop=True),
-        events=tables[EVENTS.file],
-        references=tables[REFERENCES.file],
-        run=run,
-        up=unit_vector(UP if stated.up is None else stated.up),
-        pictures=pictures,
-        absent=tuple(text for text, present in absent.items() if not present),
-    )
+def _cameras_of(columns: Iterable[str]) -> tuple[str, ...]:
+    return tuple(name.removesuffix("_u_px") for name in columns if name.endswith("_u_px"))
 
 
-def _rig(stated: TrackingFile, names: tuple[str, ...], folder: Path) -> tuple[Camera, ...]:
-    """Return the cameras of tracks.csv."""
-    known = {camera.name: camera for camera in stated.rig_cameras()}
-    if known and not set(names) <= set(known):
-        what = f"its cameras are {list(known)}, those of tracks.csv {list(names)}"
-        raise InputError(what, where=str(folder / "tracking.json"), todo=TrackingFile.AGAIN)
-    return tuple(known[name] for name in names if known)
+def read_track_results(folder: Path) -> TrackResults:
+    """Read a tracked run's results folder for a page, a film or the viewer.
+
+    tracking.json and tracks.csv are needed, with all columns that telerig writes and with whole
+    numbers as ids; detections.csv, events.csv, references.csv, run.json and
+    overlays/<camera>/<frame>.jpg are used when they are there. Raises InputError for anything else.
+    """
+    results = TrackResults(folder)
+    with reading(folder, TrackResults.FILES):
+        file = folder / "tracks.csv"
+        lacking = [n for n in _needed(results.cameras) if n not in results.tracks]
+        if lacking:
+            what = f"has no column {lacking[0]}, which a page needs"
+            raise InputError(what, where=f"{file} row 1", todo=TrackingFile.AGAIN)
+        for table, place in (
+            (results.tracks, file),
+            (results.detections, folder / DETECTIONS.file),
+        ):
+            ids = table["particle"]
+            names = [] if ids.dtype.kind in "if" else [name for name in ids.unique() if name]
+            if names:
+                name = next((n for n in names if not n.isdecimal()), names[0])
+                raise InputError(
+                    f"particle {name!r} is no whole number, which a page needs",
+                    where=f"{place}, column particle",
+                    todo="number the bubbles in the run's detections.csv, and track again",
+                )
+        _ = results.rig, results.events, results.references, results.run, results.up
+    return results
+
+
+def _needed(cameras: tuple[str, ...]) -> list[str]:
+    """Return the columns of tracks.csv without which there is no page."""
+    return [one.name for one in TRACKS.of(cameras or ("CAMERA",)) if one.required]
 
 
 def unit_vector(vector: ArrayLike) -> Array:
@@ -247,7 +315,7 @@ def ray_miss_ratio(
 
 def frame_count(results: TrackResults) -> int:
     """Return the number of frames of the run, or up to the last one with a bubble."""
-    tables = (results.tracks, results.detections)
+    tables = (results.tracks, results.outlines)
     seen = max((int(t["frame"].max()) + 1 for t in tables if len(t)), default=0)
     return max(results.file.frames or 0, seen)
 
@@ -255,7 +323,7 @@ def frame_count(results: TrackResults) -> int:
 def per_frame(results: TrackResults) -> dict[str, Ints]:
     """Bubbles in each frame (F,): by camera, and "both" for those with a place in space."""
     frames = frame_count(results)
-    found = results.detections
+    found = results.outlines
     counts = {
         camera: np.bincount(found["frame"][found["camera"] == camera], minlength=frames)
         for camera in results.cameras

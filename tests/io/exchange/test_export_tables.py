@@ -26,6 +26,7 @@ from telerig.io.exchange.export.run_results import (
 from telerig.io.exchange.export.tables import write_hdf5, write_mat, write_trackpy
 from telerig.io.exchange.formats import export_results
 from telerig.io.files.csv_table import write_table
+from telerig.io.results.cameras import CameraRecord
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -201,7 +202,8 @@ def test_trackpy_computes_with_it(folder: Path, tmp_path: Path) -> None:
 
 def test_given_names_reach_the_export_unchanged(folder: Path, tmp_path: Path) -> None:
     given = table().assign(particle=lambda t: t["particle"].map({3: "007", 7: "7", 12: "12"}))
-    write_table(given, folder / "trajectories.csv")
+    (folder / "trajectories.csv").unlink()
+    write_table(given, folder / "tracks.csv")
     write_trackpy(read_results(folder), tmp_path / "out.csv")
     read = pd.read_csv(tmp_path / "out.csv", dtype={"particle_name": str})
     assert read.groupby("particle_name").size().to_dict() == {"007": 25, "7": 30, "12": 1}
@@ -224,6 +226,20 @@ def test_only_the_results_of_runs_are_taken_for_runs(folder: Path, tmp_path: Pat
     elsewhere.mkdir()
     with pytest.raises(InputError, match="neither a dataset nor a folder of results"):
         run_folder(elsewhere, None)
+
+
+def test_cameras_are_those_that_the_run_was_tracked_with(folder: Path) -> None:
+    own = Camera.create("left", (512, 500), 11.0)
+    said = {"kind": "telerig tracks", "cameras": {"left": CameraRecord.of_camera(own).content()}}
+    (folder / "tracking.json").write_text(json.dumps(said))
+    beside = folder.parent / "calibration"
+    beside.mkdir()
+    (beside / "calibration.json").write_text("{")
+    export_results(folder, "hdf5", out=folder / "out.h5")
+    with h5py.File(folder / "out.h5") as file:
+        values = file["cameras/left"].attrs
+        names = values["parameter_names"].split(", ")
+        assert values["parameters"][names.index("scale_px_per_mm")] == 11.0
 
 
 def test_only_formats_with_cameras_read_the_calibration(folder: Path, tmp_path: Path) -> None:

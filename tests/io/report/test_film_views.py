@@ -21,8 +21,8 @@ from telerig.io.report.film import views
 from telerig.io.report.film.mp4 import write_film
 from telerig.io.report.film.views import (
     draw_views,
+    found_outlines,
     outlines_px,
-    read_outlines,
     view_frames,
     write_views_film,
 )
@@ -83,7 +83,7 @@ def test_both_views_film(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_outlines_and_tails_are_drawn_where_they_were_found(run: Path) -> None:
-    table = read_outlines(run / "detections.csv", ("left", "right"))
+    table = found_outlines(read_track_results(run), ("left", "right"))
     frames = list(view_frames(table, ("left", "right"), range(FRAMES), None))
     tracks = read_track_results(run).tracks
     np.testing.assert_allclose(

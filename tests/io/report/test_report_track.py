@@ -13,6 +13,7 @@ import pytest
 from report_page import Page, edit
 from tracked_folder import SCALE, SIGMA_PX, WORST, write_folder
 
+import telerig
 from telerig.errors import InputError
 from telerig.io.report.plot.tracking import miss_steps
 from telerig.io.report.plot.tracks import thinned
@@ -80,7 +81,7 @@ def test_page_is_whole_small_and_loads_nothing(whole: Path) -> None:
 def test_page_says_what_the_files_say(whole: Path, results: TrackResults) -> None:
     text = Page(whole / "report.html").text
     sd = np.median(1e3 * np.sqrt(results.tracks[["sxx_mm2", "syy_mm2", "szz_mm2"]]), axis=0)
-    found = int(np.isfinite(results.detections["u_px"]).sum())
+    found = int(np.isfinite(results.outlines["u_px"]).sum())
     for words in (
         f"12 tracks, {len(results.tracks)} positions in space, 120 frames",
         f"known to {sd[0]:.1f}, {sd[1]:.1f} and {sd[2]:.1f} µm in x, y and z",
@@ -156,7 +157,7 @@ def test_covariances_too_small_and_few_partners_are_warned_of(folder: Path) -> N
 def test_per_frame_counts_add_up(results: TrackResults) -> None:
     counts = per_frame(results)
     for camera in ("left", "right"):
-        assert counts[camera].sum() == (results.detections["camera"] == camera).sum()
+        assert counts[camera].sum() == (results.outlines["camera"] == camera).sum()
     assert counts["both"].sum() == len(results.tracks)
     frame = int(results.tracks["frame"].iloc[40])
     assert counts["both"][frame] == (results.tracks["frame"] == frame).sum()
@@ -210,7 +211,7 @@ def test_hostile_names_stay_text(folder: Path) -> None:
         ("tracking.json", '{"kind": "telerig tracks", "schema": 9}', "newer"),
         ("tracking.json", '{"kind": "telerig tracks", "schema": 1, "pairs": 3}', "garbles 'pairs'"),
         ("tracks.csv", None, "does not exist"),
-        ("tracks.csv", "frame,particle\n1,2\n", "its columns are of cameras"),
+        ("tracks.csv", "frame,particle\n1,2\n", "missing columns: t_s, x_mm"),
         ("detections.csv", "frame,camera,u_px,v_px\n1,left,2,3\n", "particle"),
         ("detections.csv", "frame,camera,particle,u_px,v_px\n1,left,,2,x\n", "row 2, column v_px"),
         ("detections.csv", "frame,camera,particle,u_px,v_px\n1,left,,2\n", "row 2: has 4 cells"),
@@ -230,6 +231,22 @@ def test_bad_files_are_named_and_the_old_report_stays(
         write_track_report(folder)
     assert file in str(caught.value) and "->" in str(caught.value)
     assert (folder / "report.html").read_text() == "old"
+
+
+def test_pages_and_load_tracks_read_by_the_same_rules(folder: Path) -> None:
+    loaded, results = telerig.load_tracks(folder), read_track_results(folder)
+    pd.testing.assert_frame_equal(loaded.table, results.tracks)
+    pd.testing.assert_frame_equal(loaded.detections, results.detections)
+    text = (folder / "tracks.csv").read_text()
+    _edit_table(folder, "tracks", particle="b", own="x")
+    assert set(telerig.load_tracks(folder).table["particle"]) == {"b"}
+    with pytest.raises(InputError, match="'b' is no whole number, which a page needs"):
+        read_track_results(folder)
+    (folder / "tracks.csv").write_text(text)
+    _edit_table(folder, "tracks", left_u_px="x")
+    for read in (telerig.load_tracks, read_track_results):
+        with pytest.raises(InputError, match="row 2, column left_u_px"):
+            read(folder)
 
 
 def test_quick_and_strict_reading_agree(folder: Path) -> None:

@@ -31,7 +31,7 @@ from PIL import Image
 from telerig.io.report.calibration import report as calibration_report
 from telerig.io.report.page import figures
 from telerig.io.report.run import report as run_report
-from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.calibration import read_calibration_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import read_track_results
 
@@ -115,7 +115,7 @@ def calibration_pictures(folder: Path) -> Iterator[tuple[str, Any]]:
         "Distribution of the residuals": "residual-histogram",
         "Print errors in the plane": "target",
     }  # fmt: skip
-    return of_page(calibration_report.page_of(read_results(folder), (), folder), titles)
+    return of_page(calibration_report.page_of(read_calibration_results(folder), (), folder), titles)
 
 
 def run_pictures(folder: Path) -> Iterator[tuple[str, Any]]:

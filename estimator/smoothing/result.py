@@ -463,25 +463,23 @@ def load_smoothing(folder: str | Path) -> Smoothing:
 
     from telerig.io.files.hdf5 import read_arrays
     from telerig.io.files.names import absent
+    from telerig.io.results.folders.smoothing import SmoothingResults
     from telerig.io.results.manifest import reading
     from telerig.io.results.smoothing import SmoothingFile
-    from telerig.io.tables.smoothing import BODY_COLUMNS, BUBBLES, SHAKE, TRAJECTORIES
+    from telerig.io.tables.smoothing import BODY_COLUMNS
 
     place = Path(folder)
     if not place.is_dir():
         raise absent(place, "folder of results", f"run `{SmoothingFile.MAKE}` first")
     tables: Tables | StoredTables = StoredTables(place)
-    names = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5", "bubbles.csv")
-    with reading(place, names):
-        record = SmoothingFile.read(place / "smoothing.json")
-        file = place / "results.h5"
+    found = SmoothingResults(place)
+    with reading(place, (*SmoothingResults.FILES[:-1], "results.h5")):
+        record, file = found.file, place / "results.h5"
         if not (file.is_file() and StoredTables(place).of_pieces()):
             states = read_arrays(file, "states") if file.is_file() else {}
-            paths = TRAJECTORIES.read(place / names[0])
-            offsets = SHAKE.read(place / names[1], record.cameras)
-            file = place / "bubbles.csv"
-            bodies = BUBBLES.read(file)[BODY_COLUMNS] if file.is_file() else None
-            tables = Tables(paths, offsets, states, bodies)
+            there = (place / "bubbles.csv").is_file()
+            bodies = found.bubble_frames[BODY_COLUMNS] if there else None
+            tables = Tables(found.rows, found.shake, states, bodies)
     content = record.content()
     verdict = {name: content.pop(name) for name in record.VERDICT if name in content}
     try:

@@ -75,7 +75,7 @@ def read_table(
     text with control characters, a row with too few or too many cells, and an empty table.
     """
     file = Path(path)
-    table = _sound_table(file, columns, "keep" if extra else "refuse")
+    table = _sound_table(file, columns, extra)
     if table is not None and (empty or len(table)):
         return table
     header, content, numbers = _cells(file)
@@ -93,23 +93,6 @@ def read_table(
         convert = _CONVERT[column.kind] if column else _extra
         values[name] = convert(cells, column or Column(name), Rows(file, numbers))
     return pd.DataFrame(values, index=pd.Index(numbers, name="file_row"))
-
-
-def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = False) -> pd.DataFrame:
-    """Read a CSV table of results and return those of its columns that ``columns`` names.
-
-    A text column that the file lacks is filled with "". The table may have no rows; with
-    ``optional`` a missing file counts as such a table. Raises InputError as `read_table` does.
-    """
-    if optional and not file.is_file():
-        table = pd.DataFrame({c.name: [] for c in columns if c.required})
-    else:
-        sound = _sound_table(file, columns, "leave out")
-        table = read_table(file, columns, extra=True) if sound is None else sound
-    missing = {c.name: "" for c in columns if c.kind in _TEXTS and c.name not in table}
-    table = table.reset_index(drop=True).assign(**missing)
-    kinds = {c.name: _DTYPES[c.kind, c.blank] for c in columns if c.name in table}
-    return table[list(kinds)].astype(kinds)
 
 
 def no_rows(columns: Sequence[Column]) -> pd.DataFrame:
@@ -180,11 +163,11 @@ def read_part(
     Returns None if the text is unusual, so that the whole file has to be read with `read_table`,
     which finds any fault.
     """
-    return _sound_table(file, columns, "keep", content, row)
+    return _sound_table(file, columns, True, content, row)
 
 
 def _sound_table(
-    file: Path, columns: Sequence[Column], others: Literal["refuse", "keep", "leave out"],
+    file: Path, columns: Sequence[Column], extra: bool,
     content: bytes | None = None, row: int = 2,
 ) -> pd.DataFrame | None:  # fmt: skip
     """Read a CSV table with pandas' fast reader; None for an unusual file, left to `_cells`."""
@@ -196,22 +179,21 @@ def _sound_table(
     if len(header) > MOST_COLUMNS:
         return None
     known = {column.name: column for column in columns}
-    names = header if others != "leave out" else [name for name in header if name in known]
     if (
         b'"' in content
         or _CONTROL.search(content)
         or not _same_cells(content, len(header))
         or len(set(header)) < len(header)
         or any(column.required and column.name not in header for column in columns)
-        or (others == "refuse" and not set(header) <= set(known))
+        or (not extra and not set(header) <= set(known))
     ):
         return None
-    kinds = {n: _DTYPES[known[n].kind, known[n].blank] if n in known else str for n in names}
+    kinds = {n: _DTYPES[known[n].kind, known[n].blank] if n in known else str for n in header}
     numeric = [name for name, kind in kinds.items() if kind is not str]
     try:
         with np.errstate(invalid="ignore"):  # a number too large for a whole one; found below
             table: pd.DataFrame = pd.read_csv(
-                BytesIO(content), usecols=names, dtype=kinds, keep_default_na=False,
+                BytesIO(content), usecols=header, dtype=kinds, keep_default_na=False,
                 na_values={name: [""] for name in numeric}, skip_blank_lines=False,
                 encoding="utf-8-sig", **_EVERY_DIGIT,
             )  # fmt: skip
@@ -219,7 +201,7 @@ def _sound_table(
         return None
     rows = Rows(file, pd.RangeIndex(row, len(table) + row, name="file_row"))
     values: dict[str, Any] = {}
-    for name in names:
+    for name in header:
         cells, column = table[name], known.get(name)
         if column is None:
             values[name] = _extra(cells.tolist(), Column(name), rows)

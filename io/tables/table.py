@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from telerig.io.files.csv_table import Column, no_rows, read_columns, read_part, read_table
+from telerig.io.files.csv_table import Column, no_rows, read_part, read_table
 from telerig.io.files.frame_table import Read
 
 CAMERA = "{camera}"
@@ -35,7 +35,7 @@ class Table:
         cameras: Sequence[str] = (),
         *,
         need: Collection[str] | None = None,
-        ids: Literal["id", "whole", "name"] = "id",
+        ids: Literal["id", "name"] = "id",
     ) -> list[Column]:
         """Return the columns for these cameras.
 
@@ -89,12 +89,6 @@ class Table:
             return None if table is None else table.reset_index(drop=True)
 
         return read
-
-    def read_known(
-        self, file: Path, cameras: Sequence[str] = (), *, optional: bool = False
-    ) -> pd.DataFrame:
-        """Read only the known columns, with whole numbers as ids; see `read_columns`."""
-        return read_columns(file, self.of(cameras, ids="whole"), optional=optional)
 
     def rows_of_words(self) -> Iterator[tuple[list[str], str, str]]:
         """Yield names, unit and meaning of columns; those of one meaning that follow each other are

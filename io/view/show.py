@@ -16,7 +16,7 @@ from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import RunData, RunSource, load_run, recordings
 from telerig.io.files.atomic import atomic_path
 from telerig.io.report.film.views import found_outlines
-from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.calibration import read_calibration_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
 from telerig.io.tables.calibration import REJECTED
@@ -99,7 +99,7 @@ def log_results(
     tracked : the results folder of a smoothed run's tracks; None for the same.
     """
     if (place / "calibration.json").is_file():
-        results = read_results(place)
+        results = read_calibration_results(place)
         rejected = pd.DataFrame()
         if (place / "rejected.csv").is_file():
             rejected = REJECTED.read(place / "rejected.csv")

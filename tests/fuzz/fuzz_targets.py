@@ -139,9 +139,9 @@ def _exported(file: Path, to: str) -> Path:
 
 
 def _calibration_folder(file: Path) -> Any:
-    from telerig.io.results.folders.calibration import read_results
+    from telerig.io.results.folders.calibration import read_calibration_results
 
-    found = read_results(file.parent)
+    found = read_calibration_results(file.parent)
     return [found.points_mm, found.joint, found.residuals[["u_px", "v_px", "du_px", "dv_px"]]]
 
 

@@ -31,7 +31,7 @@ from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.exchange.formats import export_results
 from telerig.io.report.batch.report import write_batch_report
 from telerig.io.report.remake import remake_report, results_folders
-from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.calibration import read_calibration_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import read_track_results
 
@@ -74,7 +74,8 @@ def page(folder: Path) -> Any:
 
 READERS: dict[str, dict[str, Reader]] = {
     "calibrate": {
-        "load_calibration": load_calibration, "report": read_results, "export": exported("opencv"),
+        "load_calibration": load_calibration, "report": read_calibration_results,
+        "export": exported("opencv"),
     },
     "track": {"load_tracks": load_tracks, "report": read_track_results},
     "smooth": {

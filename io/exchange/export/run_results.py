@@ -16,6 +16,7 @@ from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.files.names import absent
 from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.folders.smoothing import SmoothingResults
 from telerig.io.results.folders.tracking import TrackResults
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import SmoothingFile
@@ -81,17 +82,17 @@ def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -
 
 
 def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunResults:
-    shake, smoothed = place / "shake.csv", source == "trajectories.csv"
-    file, tracked = place / source, TrackResults(place)
-    points = TRAJECTORIES.read(file, need=TrackResults.NEED) if smoothed else tracked.tracks
+    tracked, lab = TrackResults(place), SmoothingResults(place)
+    smoothed = source == "trajectories.csv"
+    points = lab.trajectories if smoothed else tracked.tracks
     if not len(points):
-        raise InputError("has no rows below its header", where=str(file))
+        raise InputError("has no rows below its header", where=str(place / source))
     return RunResults(
         name=place.name,
         frame=LAB if smoothed else RIG,
         points=points.sort_values(["particle", "frame"], kind="stable").reset_index(drop=True),
-        shake=SHAKE.read(shake) if shake.is_file() and smoothed else None,
-        verdict=_verdict(place / "smoothing.json") if smoothed else "",
+        shake=lab.shake if smoothed and (place / "shake.csv").is_file() else None,
+        verdict=_verdict(lab.file) if smoothed else "",
         source=source,
         accepted=accepted,
         folder=place,
@@ -99,11 +100,8 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
     )
 
 
-def _verdict(file: Path) -> str:
-    """Read the verdict and its flags from smoothing.json; returns "" when there is no such file."""
-    if not file.is_file():
-        return ""
-    found = SmoothingFile.read(file)
+def _verdict(found: SmoothingFile) -> str:
+    """Return the verdict and its flags."""
     flags = ", ".join(found.flags)
     return (found.verdict or "") + (f" ({flags})" if flags else "")
 

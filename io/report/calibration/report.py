@@ -34,7 +34,7 @@ from telerig.io.report.plot.rig import sd_in_plane
 from telerig.io.report.plot.target import target_shape
 from telerig.io.results.calibration_words import telecentricity_words
 from telerig.io.results.findings import ASK_FOR_VIEWS, TRUST, Status
-from telerig.io.results.folders.calibration import CalibrationResults, read_results
+from telerig.io.results.folders.calibration import CalibrationResults, read_calibration_results
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
 from telerig.rig.pose import Pose
@@ -71,7 +71,9 @@ def write_calibration_report(
     """
     folder = Path(results_folder)
     with reading(folder, ()):
-        page = page_of(read_results(folder), stale(folder), page_folder or out or folder)
+        page = page_of(
+            read_calibration_results(folder), stale(folder), page_folder or out or folder
+        )
         text = render_page(page)
     file = (folder if out is None else Path(out)) / "report.html"
     write_text_atomic(file, text)

@@ -194,7 +194,7 @@ def _means(start: Array, arrow: Array, size_px: float) -> tuple[Array, Array]:
 def residual_histogram(table: pd.DataFrame, *, axes: Any = None) -> Any:
     """Draw the distribution of the residuals beside the normal one that is predicted; returns axes.
 
-    table : residuals.csv; with ``whitened_u`` and ``whitened_v`` (`read_results` adds them),
+    table : residuals.csv; with ``whitened_u``, ``whitened_v`` (from `read_calibration_results`),
     residuals over their own noise beside the unit normal, otherwise in px beside that of their RMS.
     """
     whitened = "whitened_u" in table

@@ -100,16 +100,16 @@ class CalibrationResults:
         return [camera.name for camera in self.cameras]
 
 
-def read_results(folder: Path) -> CalibrationResults:
+def read_calibration_results(folder: Path) -> CalibrationResults:
     """Read a calibration's results folder: calibration.json, residuals.csv, and what else is there.
 
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
     with reading(folder, _FILES):
-        return _read_results(folder)
+        return _read_calibration_results(folder)
 
 
-def _read_results(folder: Path) -> CalibrationResults:
+def _read_calibration_results(folder: Path) -> CalibrationResults:
     file = CalibrationFile.read(folder / "calibration.json")
     cameras = file.rig_cameras(windows=file.medium == "water")
     views = {name: pose.pose() for name, pose in file.views.items()}

@@ -5,10 +5,11 @@ Standard deviations are computed here; the files are checked as they are read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -21,37 +22,87 @@ from telerig.io.results.smoothing import SmoothingFile
 from telerig.io.tables.smoothing import AXES, BUBBLES, SHAKE, STATE, SUMMARY, TRAJECTORIES
 from telerig.io.tables.smoothing import POSITION as PLACE
 from telerig.io.tables.smoothing import VELOCITY as SPEED
+from telerig.io.tables.table import POINT
 from telerig.statistics import median, rms
 
 __all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
 
-_FILES = ("smoothing.json", "shake.csv", "trajectories.csv", "bubbles.csv", "bubble_summary.csv")
 _ALONG = 0.9
 
 
 @dataclass(frozen=True)
 class SmoothingResults:
-    """The smoothing in memory.
+    """The results folder of a smoothed run; each file is read and checked when it is asked for.
 
-    file : smoothing.json.
-    cameras : names, in the rig's order.
-    trajectories, shake : the tables, by bubble and frame.
     up : (3,) unit vector in rig axes.
-    bubble_frames, bubble_summary : bubbles.csv and bubble_summary.csv, empty where they are not.
+    Reading raises InputError for what is missing, cannot be read or does not fit together.
     """
 
-    file: SmoothingFile
-    cameras: tuple[str, ...]
-    trajectories: pd.DataFrame
-    shake: pd.DataFrame
-    up: Array
-    bubble_frames: pd.DataFrame
-    bubble_summary: pd.DataFrame
+    folder: Path
+    up: Array = field(default_factory=lambda: np.array([0.0, -1.0, 0.0]))
+
+    FILES: ClassVar[tuple[str, ...]] = (
+        "smoothing.json", "shake.csv", "trajectories.csv", "bubbles.csv", "bubble_summary.csv",
+    )  # fmt: skip
+
+    @cached_property
+    def file(self) -> SmoothingFile:
+        """smoothing.json."""
+        return SmoothingFile.read(self.folder / "smoothing.json")
 
     @property
     def content(self) -> Mapping[str, Any]:
         """smoothing.json as it stands."""
         return self.file.content()
+
+    @cached_property
+    def cameras(self) -> tuple[str, ...]:
+        """Names, in the rig's order."""
+        file = self.folder / "shake.csv"
+        header = header_of(file, SmoothingFile.AGAIN)
+        found = [name.removesuffix("_x_mm") for name in header if name.endswith("_x_mm")]
+        cameras = tuple(n for n in found if not (n[:1] == "s" and n[1:] in found))
+        known = self.file.cameras or cameras
+        if not cameras or sorted(known) != sorted(cameras):
+            what = f"its columns are of cameras {list(cameras)}, smoothing.json's are {list(known)}"
+            raise InputError(what, where=f"{file} row 1", todo=SmoothingFile.AGAIN)
+        return tuple(known)
+
+    @cached_property
+    def shake(self) -> pd.DataFrame:
+        """shake.csv, by frame."""
+        file = self.folder / "shake.csv"
+        table = SHAKE.read(file, self.cameras)
+        _check_times(table, file, "")
+        return table
+
+    @cached_property
+    def rows(self) -> pd.DataFrame:
+        """trajectories.csv as it stands, also with columns that telerig does not know."""
+        file = self.folder / "trajectories.csv"
+        table = TRAJECTORIES.read(file)
+        _check_columns(table, POINT, file)
+        return table
+
+    @cached_property
+    def trajectories(self) -> pd.DataFrame:
+        """The same by bubble and frame; columns that a run without bubbles leaves out are there."""
+        empty = {name: np.zeros(0) for name in STATE if not len(self.rows)}
+        table = self.rows.assign(**empty)
+        table = table.sort_values(["particle", "frame"], kind="stable", ignore_index=True)
+        for particle, mine in table.groupby("particle", sort=False):
+            _check_times(mine, self.folder / "trajectories.csv", f" of bubble {particle}")
+        return table
+
+    @cached_property
+    def bubble_frames(self) -> pd.DataFrame:
+        """bubbles.csv; empty where it is not."""
+        return BUBBLES.read(self.folder / BUBBLES.file, optional=True)
+
+    @cached_property
+    def bubble_summary(self) -> pd.DataFrame:
+        """bubble_summary.csv; empty where it is not."""
+        return SUMMARY.read(self.folder / SUMMARY.file, optional=True)
 
     def part(self, name: str) -> Mapping[str, Any]:
         """Return an object of smoothing.json; {} if it is missing."""
@@ -94,41 +145,24 @@ class SmoothingResults:
 
 
 def read_smoothing_results(folder: Path, up: Array) -> SmoothingResults | None:
-    """Read smoothing.json, trajectories.csv and shake.csv; None where there is no smoothing.json.
+    """Read a smoothed run's folder for a page, a film or the viewer; None without smoothing.json.
 
-    Trajectories are by bubble and frame; columns that a run without bubbles leaves out are there,
-    empty. Raises InputError for what is missing, cannot be read or does not fit together.
+    Raises InputError for what is missing, cannot be read or does not fit together.
     """
     if not (folder / "smoothing.json").is_file():
         return None
-    with reading(folder, _FILES):
-        return _read_smoothing_results(folder, up)
+    results = SmoothingResults(folder, up)
+    with reading(folder, SmoothingResults.FILES):
+        _ = results.shake, results.bubble_frames, results.bubble_summary
+        _check_columns(results.trajectories, STATE, folder / "trajectories.csv")
+    return results
 
 
-def _read_smoothing_results(folder: Path, up: Array) -> SmoothingResults:
-    stated = SmoothingFile.read(folder / "smoothing.json")
-    file = folder / "shake.csv"
-    header = header_of(file, SmoothingFile.AGAIN)
-    found = [name.removesuffix("_x_mm") for name in header if name.endswith("_x_mm")]
-    cameras = tuple(n for n in found if not (n[:1] == "s" and n[1:] in found))
-    known = stated.cameras or cameras
-    if not cameras or sorted(known) != sorted(cameras):
-        what = f"its columns are of cameras {list(cameras)}, smoothing.json's are {list(known)}"
-        raise InputError(what, where=f"{file} row 1", todo=SmoothingFile.AGAIN)
-    shake = SHAKE.read_known(file, known)
-    _check_times(shake, file, "")
-    file = folder / "trajectories.csv"
-    table = TRAJECTORIES.read_known(file)
-    missing = [name for name in STATE if name not in table]
+def _check_columns(table: pd.DataFrame, needed: Sequence[str], file: Path) -> None:
+    missing = [name for name in needed if name not in table]
     if len(table) and missing:
         what = f"has no column {missing[0]}"
         raise InputError(what, where=f"{file} row 1", todo=SmoothingFile.AGAIN)
-    table = table.assign(**{name: np.zeros(0) for name in missing})
-    table = table.sort_values(["particle", "frame"], kind="stable", ignore_index=True)
-    for particle, mine in table.groupby("particle", sort=False):
-        _check_times(mine, file, f" of bubble {particle}")
-    more = (one.read_known(folder / one.file, optional=True) for one in (BUBBLES, SUMMARY))
-    return SmoothingResults(stated, tuple(known), table, shake, up, *more)
 
 
 def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:

@@ -39,7 +39,7 @@ from telerig.io.exchange.export.halcon import halcon_cameras
 from telerig.io.exchange.export.opencv import camera_matrices
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.findings import Code
-from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.calibration import read_calibration_results
 from telerig.io.rig_file.description import WallDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.io.simulation.calibration.scene import true_cameras
@@ -204,7 +204,7 @@ def test_files_keep_walls_and_medium(tank: Path, in_air: Calibration, tmp_path: 
         c.wall is not None
         for c in CalibrationFile.read(tmp_path / "calibration.json").rig_cameras(windows=True)
     )
-    assert all(c.wall is None for c in read_results(tmp_path).cameras)
+    assert all(c.wall is None for c in read_calibration_results(tmp_path).cameras)
 
     content = json.loads((tmp_path / "calibration.json").read_text(encoding="utf-8"))
     del content["walls"], content["medium"]

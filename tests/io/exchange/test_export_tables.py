@@ -60,7 +60,8 @@ def folder(tmp_path: Path) -> Path:
     out = tmp_path / "results" / "rise"
     out.mkdir(parents=True)
     write_table(table(), out / "trajectories.csv")
-    shake = pd.DataFrame({"frame": [0, 1], "t_s": [0.0, 0.01], "left-1_x_mm": [0.1, -0.2]})
+    offsets = {f"left-1_{axis}_mm": [0.1, -0.2] for axis in "xyz"}
+    shake = pd.DataFrame({"frame": [0, 1], "t_s": [0.0, 0.01]} | offsets)
     write_table(shake, out / "shake.csv")
     said = {"verdict": "PARTIAL", "flags": ["SHAKE_UNMEASURED"]}
     (out / "smoothing.json").write_text(json.dumps(said))

@@ -23,7 +23,7 @@ from telerig.io.report.calibration.tables import held_everywhere, parameter_rows
 from telerig.io.report.page.figures import Figure
 from telerig.io.report.remake import ResultsFolder, remake_report
 from telerig.io.results.calibration_words import telecentricity_words
-from telerig.io.results.folders.calibration import read_results
+from telerig.io.results.folders.calibration import read_calibration_results
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 
@@ -81,7 +81,7 @@ def test_every_figure_is_one_of_plot_with_a_caption(report: Path) -> None:
     drawn = page.pictures("svg+xml")
     assert len(drawn) == 3 + 1 + 3 + 2
     assert report.read_text(encoding="utf-8").count("<figcaption>") == len(drawn)
-    blocks = page_of(read_results(report.parent), (), report.parent)
+    blocks = page_of(read_calibration_results(report.parent), (), report.parent)
     figures = [*blocks.look, *(b for s in blocks.sections for b in s.contents)]
     for figure in (one for one in figures if isinstance(one, Figure)):
         assert figure.draw.func.__name__ in telerig.plot.__all__
@@ -175,16 +175,16 @@ def test_files_that_do_not_fit_together_are_refused(folder: Path) -> None:
     with pytest.raises(
         InputError, match=r"row 181, column camera: calibration.json has no camera 'middle'"
     ):
-        read_results(folder)
+        read_calibration_results(folder)
     with pytest.raises(InputError, match="garbles 'views'"):
         content = json.loads((folder / "calibration.json").read_text())
         del content["views"]
         (folder / "calibration.json").write_text(json.dumps(content))
-        read_results(folder)
+        read_calibration_results(folder)
 
 
 def test_whitened_residuals_are_unit_normal(folder: Path) -> None:
-    table = read_results(folder).residuals
+    table = read_calibration_results(folder).residuals
     white = table.loc[table["kept"], ["whitened_u", "whitened_v"]].to_numpy()
     raw = table.loc[table["kept"], ["du_px", "dv_px"]].to_numpy()
     inverse = np.linalg.inv(SIGMA_PX**2 * np.array([[1.0, 0.6], [0.6, 1.0]]))
@@ -193,7 +193,7 @@ def test_whitened_residuals_are_unit_normal(folder: Path) -> None:
 
 
 def test_parameter_rows_tell_held_from_free_and_distortion_in_px(folder: Path) -> None:
-    results = read_results(folder)
+    results = read_calibration_results(folder)
     rows = {row.cells[0]: row for row in parameter_rows(results)}
     assert "skew" in held_everywhere(results) and "skew (skew)" not in rows
     centre = rows["image centre u, px (centre_u_px)"]
@@ -204,12 +204,12 @@ def test_parameter_rows_tell_held_from_free_and_distortion_in_px(folder: Path) -
 
 
 def test_worst_dots_are_those_left_out(folder: Path) -> None:
-    (row,) = worst_rows(read_results(folder))
+    (row,) = worst_rows(read_calibration_results(folder))
     assert row.strong and row.cells[2] == "3" and row.cells[-1] == "90 deviations"
 
 
 def test_many_residuals_become_means_of_cells(folder: Path) -> None:
-    table = read_results(folder).residuals
+    table = read_calibration_results(folder).residuals
     many = pd.concat([table] * 20)
     few, means = (
         telerig.plot.residuals(one, "left", (512, 400), axes=Figure_().add_subplot())

@@ -14,7 +14,9 @@ import pytest
 from report_page import Page
 from smoothed_folder import changed, read, write_folder
 
+import telerig
 from telerig.errors import InputError
+from telerig.io.exchange.export.run_results import read_results
 from telerig.io.report.page.figures import Figure, drawn
 from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.report import write_track_report
@@ -286,6 +288,18 @@ def test_bad_files_are_named(folder: Path, file: str, content: str | None, words
         write_track_report(folder)
     assert words in str(caught.value) and file in str(caught.value)
     assert list(folder.iterdir()) == before
+
+
+def test_pages_load_smoothing_and_exports_read_by_the_same_rules(folder: Path) -> None:
+    loaded, results = telerig.load_smoothing(folder), read(folder)
+    pd.testing.assert_frame_equal(loaded.trajectories, results.rows)
+    pd.testing.assert_frame_equal(loaded.shake, results.shake)
+    pd.testing.assert_frame_equal(read_results(folder).points, results.trajectories)
+    shake = pd.read_csv(folder / "shake.csv")
+    shake.drop(columns="left_z_mm").to_csv(folder / "shake.csv", index=False)
+    for reader in (telerig.load_smoothing, read, read_results):
+        with pytest.raises(InputError, match="missing column: left_z_mm"):
+            reader(folder)
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,9 @@ def content(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tobytes()
     if is_dataclass(value):
-        return {f.name: content(getattr(value, f.name)) for f in fields(value)}
+        named = {f.name: getattr(value, f.name) for f in fields(value)}
+        read = named | getattr(value, "__dict__", {})
+        return {name: content(each) for name, each in read.items()}
     if isinstance(value, Mapping):
         timed = ("finished", "seconds")
         return {str(key): content(each) for key, each in value.items() if key not in timed}

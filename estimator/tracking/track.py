@@ -253,7 +253,7 @@ def track(
 ) -> Tracks:
     """Detect the bubbles of a run, find the same ones in all views, and follow them in time.
 
-    run : the run as read by `telerig.io.dataset.run.load_run` or ``dataset.runs[name].load()``.
+    run : the run as read by `telerig.load_run` or ``dataset.runs[name].load()``.
     calibration : calibration of the rig.
     options : None for the defaults.
     progress : True to show a progress bar; or a function that is called with the name of the step,
@@ -262,6 +262,11 @@ def track(
     Raises InputError for recordings that cannot be used, and CalibrationError for the calibration
     of another rig.
     """
+    if not isinstance(run, RunData):
+        raise InputError(
+            f"this is a {type(run).__name__} and no run", where="telerig.track",
+            todo="give what telerig.load_run returns",
+        )  # fmt: skip
     stage = None if isinstance(progress, bool) else progress
     with tempfile.TemporaryDirectory(prefix="telerig-") as work:
         stream = tracking_stream(run, calibration, Path(work) / "work", options, stage)

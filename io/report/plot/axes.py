@@ -44,13 +44,17 @@ def axes_of(axes: Any, **settings: Any) -> Any:
 
 
 def columns_of(table: pd.DataFrame, *names: str, made_by: str) -> list[Array]:
-    """Return columns of a table as numbers. Raises InputError for a missing one."""
+    """Return columns of a table as numbers. Raises InputError for one that is missing or text."""
     out = []
     for name in names:
         if name not in getattr(table, "columns", ()):
             what = f"the {type(table).__name__} has no column {name}"
             raise InputError(what, where="telerig.plot", todo=f"give {made_by}")
-        out.append(table[name].to_numpy(float))
+        try:
+            out.append(table[name].to_numpy(float))
+        except ValueError as error:
+            what = f"the column {name} of the {type(table).__name__} is not of numbers: {error}"
+            raise InputError(what, where="telerig.plot", todo="give numbers") from error
     return out
 
 

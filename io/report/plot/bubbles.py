@@ -65,12 +65,12 @@ def path(
     up : the axis of the rig that points upwards, drawn as the height; "-y" for upright cameras.
 
     bubbles.csv and tracks.csv have the shapes of bubbles; of diameters alone spheres are drawn, and
-    with ``colour_by`` none. Slender paths are drawn
-    wider than true, by a factor that stands above them.
-    Raises InputError for a table without positions.
+    with ``colour_by`` none. Slender paths are drawn wider than true, by a factor that stands above
+    them.
+    Raises InputError for a table without positions, or with names in place of numbers of bubbles.
     """
     axes, vertical = axes_of(axes, projection="3d"), Vertical.of(up)
-    columns_of(trajectories, "x_mm", "y_mm", "z_mm", made_by="Smoothing.trajectories")
+    columns_of(trajectories, "particle", "x_mm", "y_mm", "z_mm", made_by="Smoothing.trajectories")
     chosen = trajectories
     if particles is not None:
         chosen = trajectories[trajectories["particle"].isin(list(particles))]

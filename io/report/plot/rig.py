@@ -44,9 +44,8 @@ _GRID = 6
 _MOST_LABELS, _LABEL_DEG = 30, 12.0
 """Labels of views, which are left out where they would cover that of an earlier view."""
 
-_FINER, _MOST_NODES = 8, 9
-"""A map has so many steps between the points of its grid, where these are few: the variance is
-nearly a polynomial in space."""
+_FINER = 8
+"""Steps of a map between the points of its grid, between which the variance is smooth."""
 
 _MARGIN = 1 / 12
 """Round the dots of the plate, over its longer side: about half a spacing."""
@@ -314,27 +313,22 @@ def uncertainty(
     are near that of x where the cameras stand side by side, and near that of y where one stands
     above the other. Returns axes. Raises InputError for a file that is not one.
     """
+    from scipy.interpolate import RectBivariateSpline
+
     arrays = source if isinstance(source, Mapping) else _npz(source)
     name = f"{share}_mm2"
     if "points_mm" not in arrays or name not in arrays:
         what = f"holds no {name}"
         raise InputError(what, where="telerig.plot.uncertainty", todo="give uncertainty.npz")
     side, z, sd_um = sd_in_plane(arrays, name, "xy".index(across))
-    if max(sd_um.shape) <= _MOST_NODES:
-        (side, of_side), (z, of_z) = _between(side), _between(z)
-        sd_um = np.sqrt(np.maximum(of_side @ sd_um**2 @ of_z.T, 0.0))
+    degrees = [min(3, len(nodes) - 1) for nodes in (side, z)]
+    variance = RectBivariateSpline(side, z, sd_um**2, kx=degrees[0], ky=degrees[1])
+    side, z = (np.linspace(x[0], x[-1], _FINER * (len(x) - 1) + 1) for x in (side, z))
+    sd_um = np.sqrt(np.maximum(variance(side, z), 0.0))
     axes = axes_of(axes, xlabel=f"{across} / mm", ylabel="z / mm", aspect="equal")
     drawn = axes.contourf(side, z, sd_um.T, levels=_LEVELS, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label=f"1 sd / µm, share of the {share}")
     return axes
-
-
-def _between(nodes: Array) -> tuple[Array, Array]:
-    """Return places (M,) over the nodes (N,), and the matrix (M, N) that interpolates there."""
-    fine = np.linspace(nodes[0], nodes[-1], _FINER * (len(nodes) - 1) + 1)
-    scale = max(float(np.ptp(nodes)), 1e-9)
-    powers = [np.vander((x - nodes.mean()) / scale, len(nodes)) for x in (fine, nodes)]
-    return fine, np.asarray(powers[0] @ np.linalg.inv(powers[1]))
 
 
 def sd_in_plane(arrays: Mapping[str, Array], name: str, across: int) -> tuple[Array, Array, Array]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -48,6 +49,26 @@ def frames(count: int = 200) -> pd.DataFrame:
              "vy_mm_s": -250.0 + swing, "vz_mm_s": swing, "slip_mm_s": 250 + swing,
              "reynolds": 700.0 + swing, "drag": 0.6, "d_eq_mm": 3.0}  # fmt: skip
     return table.assign(**known)
+
+
+@pytest.mark.parametrize("draw", [telerig.plot.path, telerig.plot.height, telerig.plot.velocity])
+def test_names_in_place_of_numbers_of_bubbles_are_refused(draw: Callable[..., Any]) -> None:
+    with pytest.raises(InputError, match="particle of the DataFrame is not of numbers: .*'b'"):
+        draw(frames().assign(particle="b"))
+
+
+def test_a_map_of_uncertainty_is_smooth_between_its_points() -> None:
+    """The variance of a grid of five is a polynomial that the finer map has, too."""
+    side = np.linspace(-10, 10, 5)
+    points = np.stack(np.meshgrid(side, [0.0], side, indexing="ij"), -1).reshape(-1, 3)
+    variance = 1e-6 * (3 + 1e-2 * points[:, 0] ** 2 + 2e-2 * points[:, 2] ** 2)
+    arrays = {"points_mm": points, "calibration_mm2": variance[:, None, None] * np.eye(3) / 3}
+    drawn = telerig.plot.uncertainty(arrays).collections[0]
+    assert len(drawn.get_paths()) >= 5
+    for low, high, path in zip(drawn.levels, drawn.levels[1:], drawn.get_paths()):
+        x, z = path.vertices[(np.abs(path.vertices) < 9.9).all(1)].T
+        found = np.sqrt(3 + 1e-2 * x**2 + 2e-2 * z**2)
+        assert (np.minimum(np.abs(found - low), np.abs(found - high)) < 0.01).all()
 
 
 def test_a_path_rises_on_the_screen() -> None:

@@ -11,8 +11,8 @@ from crossing_scenes import Scene
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from telerig.estimator.tracking.filter import FrameMeasurements, TrackerSettings
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.filter import FrameMeasurements, TrackerSettings
+from telerig.estimator.tracking.linking.tracker import Tracker
 
 Ids = list[NDArray[np.int64]]
 Linker = Callable[[Scene], Ids]

@@ -43,9 +43,9 @@ from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.rig_drift import PairCollector
 from telerig.estimator.tracking.detect_run import lab_shift_px
-from telerig.estimator.tracking.filter import TrackerSettings, transition
-from telerig.estimator.tracking.frames_to_rows import RowMaker
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.filter import TrackerSettings, transition
+from telerig.estimator.tracking.linking.frames_to_rows import RowMaker
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.io.machine.parallel import keep_freed_memory
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset

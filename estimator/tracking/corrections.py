@@ -17,8 +17,8 @@ import pandas as pd
 
 from telerig.errors import InputError
 from telerig.estimator.tracking.detect_run import CORRECTIONS
-from telerig.estimator.tracking.filter import TrackEvent
-from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.estimator.tracking.linking.filter import TrackEvent
+from telerig.estimator.tracking.linking.frames_to_rows import Linked
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_path
 from telerig.io.files.csv_table import read_table, write_table

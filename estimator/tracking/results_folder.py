@@ -26,7 +26,7 @@ from telerig.estimator.tracking.detect_run import (
     joined,
     mask_files,
 )
-from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.estimator.tracking.linking.frames_to_rows import Linked
 from telerig.estimator.tracking.track import (
     TrackingStream,
     TrackOptions,

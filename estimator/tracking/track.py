@@ -41,11 +41,11 @@ from telerig.estimator.tracking.detect_run import (
     make_scene,
     mask_files,
 )
-from telerig.estimator.tracking.filter import NO_PARTICLE, TrackerSettings
-from telerig.estimator.tracking.frames import Tables
-from telerig.estimator.tracking.frames_to_rows import Linked, RowMaker
-from telerig.estimator.tracking.linked_rows import LinkedRows, Linking
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.filter import NO_PARTICLE, TrackerSettings
+from telerig.estimator.tracking.linking.frames import Tables
+from telerig.estimator.tracking.linking.frames_to_rows import Linked, RowMaker
+from telerig.estimator.tracking.linking.linked_rows import LinkedRows, Linking
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import plain
@@ -60,8 +60,8 @@ from telerig.progress import showing_progress
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
-    from telerig.estimator.tracking.filter import TrackEvent
     from telerig.estimator.tracking.follow_marks import FollowedMarks
+    from telerig.estimator.tracking.linking.filter import TrackEvent
 
 
 MODEL_FRAMES = 60

@@ -21,7 +21,7 @@ from telerig.short_text import ShortText, counted, first_of
 if TYPE_CHECKING:
     import xarray
 
-    from telerig.estimator.tracking.filter import TrackEvent
+    from telerig.estimator.tracking.linking.filter import TrackEvent
 
 
 @dataclass(frozen=True, repr=False)

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.tracking.filter import (
+from telerig.estimator.tracking.linking.filter import (
     FrameMeasurements,
     FrameResult,
     TrackerSettings,
     TrackEvent,
 )
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 

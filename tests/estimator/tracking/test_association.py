@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from telerig.estimator.tracking.association import Conflict, joined
-from telerig.estimator.tracking.filter import TrackerSettings
-from telerig.estimator.tracking.ranked_ways import Options, Way, alternatives
+from telerig.estimator.tracking.linking.association import Conflict, joined
+from telerig.estimator.tracking.linking.filter import TrackerSettings
+from telerig.estimator.tracking.linking.ranked_ways import Options, Way, alternatives
 
 
 def every_way(tables: list[tuple[float, Options]]) -> list[Way]:

@@ -15,8 +15,8 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.tracking import track as track_module
 from telerig.estimator.tracking.corrections import Corrections, add_correction, read_corrections
-from telerig.estimator.tracking.filter import TrackEvent
-from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.estimator.tracking.linking.filter import TrackEvent
+from telerig.estimator.tracking.linking.frames_to_rows import Linked
 from telerig.estimator.tracking.results_folder import WORK
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.results.stale import stale

@@ -16,8 +16,8 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
-from telerig.estimator.tracking.frames_to_rows import WANDER, RowMaker
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.frames_to_rows import WANDER, RowMaker
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.io.dataset.run import RunData
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset

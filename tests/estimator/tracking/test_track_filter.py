@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from tracker_runs import SIGMA_MM, UP, Array, frame_of
 
-from telerig.estimator.tracking.filter import (
+from telerig.estimator.tracking.linking.filter import (
     DRIFT,
     FrameMeasurements,
     TrackerSettings,
     birth_covariance,
     transition,
 )
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.factors.state_space import exact_step
 
 # --- motion

@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from telerig.estimator.tracking.backtracking import smooth_points
-from telerig.estimator.tracking.filter import Motion, TrackerSettings, birth_covariance, transition
+from telerig.estimator.tracking.linking.backtracking import smooth_points
+from telerig.estimator.tracking.linking.filter import (
+    Motion,
+    TrackerSettings,
+    birth_covariance,
+    transition,
+)
 
 Reading = tuple[np.ndarray, np.ndarray, np.ndarray]
 

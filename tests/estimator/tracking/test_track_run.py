@@ -23,7 +23,7 @@ from telerig.estimator.calibration.result.calibration import (
 )
 from telerig.estimator.tracking import detect_run
 from telerig.estimator.tracking import track as track_module
-from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.estimator.tracking.linking.frames_to_rows import Linked
 from telerig.estimator.tracking.results_folder import WORK, _Worst, write_tracking
 from telerig.estimator.tracking.track import TrackOptions, tracking_stream
 from telerig.estimator.tracking.tracks import Tracks
@@ -530,5 +530,5 @@ def test_only_doubtful_frames_are_worst_and_where_none_is_three_are_shown() -> N
 
 
 def test_a_path_in_place_of_a_run_says_what_to_give(rise: Path) -> None:
-    with pytest.raises(InputError, match="no run(.|\n)*load_run"):
+    with pytest.raises(InputError, match=r"no run(.|\n)*load_run"):
         telerig.track(rise, None)  # type: ignore[arg-type]

@@ -10,8 +10,8 @@ import pytest
 from tracker_runs import SIGMA_MM, STILL, UP, Array, cameras, frame_of, kinds, run
 
 from telerig.errors import InputError
-from telerig.estimator.tracking.filter import FrameMeasurements, TrackerSettings
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.filter import FrameMeasurements, TrackerSettings
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.rig.triangulation import on_rays
 
 # --- association

@@ -53,7 +53,7 @@ def frames(count: int = 200) -> pd.DataFrame:
 
 @pytest.mark.parametrize("draw", [telerig.plot.path, telerig.plot.height, telerig.plot.velocity])
 def test_names_in_place_of_numbers_of_bubbles_are_refused(draw: Callable[..., Any]) -> None:
-    with pytest.raises(InputError, match="particle of the DataFrame is not of numbers: .*'b'"):
+    with pytest.raises(InputError, match=r"particle of the DataFrame is not of numbers: .*'b'"):
         draw(frames().assign(particle="b"))
 
 

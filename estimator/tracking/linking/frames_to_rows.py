@@ -16,7 +16,7 @@ from telerig.estimator.bubbles.pairing.groups import candidates, match, views_of
 from telerig.estimator.bubbles.pairing.model import RigModel
 from telerig.estimator.bubbles.shape.body import Bodies, body_columns, fit_bodies
 from telerig.estimator.bubbles.shape.shapes import Shapes
-from telerig.estimator.tracking.backtracking import (
+from telerig.estimator.tracking.linking.backtracking import (
     FRAMES_AFTER,
     FRAMES_BEFORE,
     SmoothedTracks,
@@ -24,13 +24,13 @@ from telerig.estimator.tracking.backtracking import (
     fused,
     place_hidden,
 )
-from telerig.estimator.tracking.filter import (
+from telerig.estimator.tracking.linking.filter import (
     NO_PARTICLE,
     FrameMeasurements,
     FrameResult,
     TrackEvent,
 )
-from telerig.estimator.tracking.frames import (
+from telerig.estimator.tracking.linking.frames import (
     CENTRE_PX,
     Bubbles,
     Frame,
@@ -40,7 +40,7 @@ from telerig.estimator.tracking.frames import (
     moved,
     starts,
 )
-from telerig.estimator.tracking.tracker import Tracker
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.rig.camera import Camera
 
 COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.evidence import Prediction
-from telerig.estimator.tracking.association import Conflict, advance, expected
-from telerig.estimator.tracking.filter import (
+from telerig.estimator.tracking.linking.association import Conflict, advance, expected
+from telerig.estimator.tracking.linking.filter import (
     NO_PARTICLE,
     POSITION,
     STATES,

@@ -36,7 +36,7 @@ from telerig.estimator.bubbles.pairing.evidence import (
     evidence,
     gate2,
 )
-from telerig.estimator.tracking.filter import (
+from telerig.estimator.tracking.linking.filter import (
     NO_PARTICLE,
     POSITION,
     STATES,
@@ -46,7 +46,7 @@ from telerig.estimator.tracking.filter import (
     States,
     TrackerSettings,
 )
-from telerig.estimator.tracking.ranked_ways import alternatives
+from telerig.estimator.tracking.linking.ranked_ways import alternatives
 
 _SHIFT_ROUNDS = 5
 """Largest number of assignments and common shifts in turn."""

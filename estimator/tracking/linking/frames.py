@@ -15,7 +15,7 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import columns, flag_wor
 from telerig.estimator.bubbles.pairing.groups import Candidates, View
 from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
-from telerig.estimator.tracking.filter import NO_PARTICLE, Motion
+from telerig.estimator.tracking.linking.filter import NO_PARTICLE, Motion
 from telerig.rig.camera import Camera
 
 Tables = tuple["pd.DataFrame", ...]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing.model import Finding, LogRatioModel, PairModel
 from telerig.estimator.bubbles.shape.shapes import Shapes
-from telerig.estimator.tracking.filter import NO_PARTICLE, TrackEvent
-from telerig.estimator.tracking.frames_to_rows import Linked
+from telerig.estimator.tracking.linking.filter import NO_PARTICLE, TrackEvent
+from telerig.estimator.tracking.linking.frames_to_rows import Linked
 from telerig.io.files.atomic import atomic_path, write_text_atomic
 
 _TABLES = ("tracks", "detections")

@@ -21,8 +21,8 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.estimator.bubbles.pairing.evidence import Prediction, gate2
 from telerig.estimator.bubbles.shape.body import Bodies
-from telerig.estimator.tracking.association import clear_assignment, gated_pairs
-from telerig.estimator.tracking.filter import (
+from telerig.estimator.tracking.linking.association import clear_assignment, gated_pairs
+from telerig.estimator.tracking.linking.filter import (
     NO_PARTICLE,
     POSITION,
     Common,
@@ -31,7 +31,7 @@ from telerig.estimator.tracking.filter import (
     TrackerSettings,
     birth_covariance,
 )
-from telerig.estimator.tracking.frames import Bubbles, Frame, Seen
+from telerig.estimator.tracking.linking.frames import Bubbles, Frame, Seen
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import UNKNOWN_MM, stacked_jacobian
 
@@ -57,7 +57,7 @@ def smooth_points(
     points_mm, covariance_mm2 : (F, K, 3), (F, K, 3, 3) measured; NaN where a bubble was not.
     motions : motion of the bubbles from the frame before into each frame; the first is not used.
     """
-    from telerig.estimator.tracking import kernels
+    from telerig.estimator.tracking.linking import kernels
 
     prior = birth_covariance(settings, UNKNOWN_MM**2 * np.eye(3), encoder=False)
     x = np.zeros((points_mm.shape[1], len(prior)))

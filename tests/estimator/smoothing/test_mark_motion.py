@@ -71,7 +71,8 @@ def test_the_regression_knows_its_own_errors() -> None:
         assert marks is not None
         gain = marks.gain()
         off.append(float((gain.value[0] - 1) / gain.sd[0]))
-    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 2.0
+    # of Student's t with 11 degrees of freedom the RMS is 1.11 +- 0.2
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.5
 
 
 def test_records_that_show_late_images_leave_the_encoder_as_late() -> None:

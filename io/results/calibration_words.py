@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from telerig.short_text import with_sd
+
 NO_COVARIANCE = (
     "the uncertainty of the imported calibration is unknown and taken as zero, so standard "
     "deviations of points contain the noise of the pixels only"
@@ -34,8 +36,7 @@ def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
         depth = lens["depth_mm"]
         change, sd = (100 * depth * lens[key] for key in ("change_per_mm", "sd_per_mm"))
         amount = (
-            f"its scale changes by {change:.2g} ± {sd:.1g} % over the views' {depth:.3g} mm of "
-            "depth"
+            f"its scale changes by {with_sd(change, sd)} % over the views' {depth:.3g} mm of depth"
         )
         if abs(change) < 100 * TELECENTRIC:
             kind = "telecentric"

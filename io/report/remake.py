@@ -9,8 +9,8 @@ from typing import Literal
 
 from telerig.errors import InputError
 from telerig.io.files.names import absent
-from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.findings import Status
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.results.manifest import replaced_results
 
 Kind = Literal["calibration", "run", "validation", "batch"]
@@ -90,8 +90,7 @@ def _write_page(results: ResultsFolder, out: Path, page_folder: Path) -> Path:
 def _is_imported(results: ResultsFolder) -> bool:
     if results.kind != "calibration":
         return False
-    file = CalibrationFile.read(results.folder / "calibration.json")
-    return file.verdict.status == Status.IMPORTED
+    return CalibrationResults(results.folder).file.verdict.status == Status.IMPORTED
 
 
 def _of(folder: Path) -> ResultsFolder | None:

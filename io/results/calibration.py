@@ -295,6 +295,14 @@ class CalibrationFile(Record):
         return self
 
     @model_validator(mode="after")
+    def _covariance_is_of_all_parameters(self) -> Self:
+        free = sum(len(camera.free) for camera in self.cameras.values())
+        count = free + 6 * (len(self.cameras) - 1)
+        if self.covariance is not None and len(self.covariance.names) != count:
+            raise ValueError("the size of its covariance is not the number of its parameters")
+        return self
+
+    @model_validator(mode="after")
     def _says_what_was_found(self) -> Self:
         findings = self._earlier_findings() if self.findings is None else self.findings
         verdict = verdict_of(findings)

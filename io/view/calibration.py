@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
@@ -21,13 +20,10 @@ Images = Callable[[str, str], NDArray[Any] | None]
 _BOX = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
 
 
-def log_calibration(
-    stream: Any, results: CalibrationResults, rejected: pd.DataFrame, image: Images
-) -> None:
+def log_calibration(stream: Any, results: CalibrationResults, image: Images) -> None:
     """Log a calibration, with a time line of its views.
 
-    rejected : rejected.csv, or an empty table. image : returns the image of a camera and view, or
-    None.
+    image : returns the image of a camera and view, or None.
     """
     rr = need_rerun()
     stream.log(RIG, rr.ViewCoordinates.RDF, static=True)
@@ -42,7 +38,7 @@ def log_calibration(
         stream.log(f"{RIG}/target/plate", rr.LineStrips3D([loop], labels=[view]))
         stream.log(f"{RIG}/target/dots", rr.Points3D(outline.dots_mm[k], radii=0.15))
         for camera in results.camera_names:
-            _log_view(stream, results, rejected, camera, view, image, levels[camera])
+            _log_view(stream, results, camera, view, image, levels[camera])
     plates = outline.plates_mm[:, [0, 1, 2, 3, 0]]
     thin = rr.Radius.ui_points(0.5)
     poses = rr.LineStrips3D(list(plates), colors=[170, 170, 170], radii=thin)
@@ -61,8 +57,8 @@ def _flat(points_mm: Any) -> Any:
 
 
 def _log_view(
-    stream: Any, results: CalibrationResults, rejected: pd.DataFrame, camera: str, view: str,
-    image: Images, levels: tuple[float, float],
+    stream: Any, results: CalibrationResults, camera: str, view: str, image: Images,
+    levels: tuple[float, float],
 ) -> None:  # fmt: skip
     rr = need_rerun()
     place, picture = of_image(camera), image(camera, view)
@@ -80,6 +76,7 @@ def _log_view(
                                             labels=words, show_labels=False))  # fmt: skip
     arrows = MAGNIFIED * mine[["du_px", "dv_px"]].to_numpy(float)
     stream.log(f"{place}/residuals", rr.Arrows2D(origins=uv, vectors=arrows, colors=[255, 160, 0]))
+    rejected = results.rejected
     if len(rejected):
         those = rejected[(rejected["camera"] == camera) & (rejected["view"] == view)]
         points = those[["u_px", "v_px"]].to_numpy(float)

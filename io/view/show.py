@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import InputError, TelerigWarning
@@ -19,7 +18,6 @@ from telerig.io.report.film.views import found_outlines
 from telerig.io.results.folders.calibration import read_calibration_results
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
-from telerig.io.tables.calibration import REJECTED
 from telerig.io.view.calibration import log_calibration
 from telerig.io.view.names import calibration_layout, need_rerun, run_layout
 from telerig.io.view.run import log_run, log_sensors
@@ -100,12 +98,9 @@ def log_results(
     """
     if (place / "calibration.json").is_file():
         results = read_calibration_results(place)
-        rejected = pd.DataFrame()
-        if (place / "rejected.csv").is_file():
-            rejected = REJECTED.read(place / "rejected.csv")
         stream.send_blueprint(calibration_layout(results.camera_names))
         images = _views_of(dataset or place.resolve().parent.parent)
-        log_calibration(stream, results, rejected, images)
+        log_calibration(stream, results, images)
         return
     found_in = tracked or place
     if not (found_in / "tracking.json").is_file():

@@ -142,7 +142,7 @@ def _calibration_folder(file: Path) -> Any:
     from telerig.io.results.folders.calibration import read_calibration_results
 
     found = read_calibration_results(file.parent)
-    return [found.points_mm, found.joint, found.residuals[["u_px", "v_px", "du_px", "dv_px"]]]
+    return [found.points_mm, found.joint[1], found.residuals[["u_px", "v_px", "du_px", "dv_px"]]]
 
 
 def _tracks(file: Path) -> Any:

@@ -11,12 +11,15 @@ import cv2
 import numpy as np
 import pandas as pd
 from report_page import edit
+from scipy.linalg import block_diag
 
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.triangulation import POSE_COMPONENTS
 
 SIGMA_PX, BUMP_MM = 0.01, 0.05
+LENS_SD = {"scale_px_per_mm": 3.4e-4, "k1": 4.8e-5}
 _edit = partial(edit, "calibration.json")
 
 
@@ -48,14 +51,22 @@ def _camera_json(camera: Camera) -> dict[str, Any]:
         "image_size_px": list(camera.image_size_px),
         "rho_mm": camera.rho_mm,
         "parameters": {p: camera[p] for p in PARAMETERS},
-        "free": ["scale_px_per_mm", "k1"],
-        "standard_deviations": {"scale_px_per_mm": 3.4e-4, "k1": 4.8e-5},
+        "free": list(LENS_SD),
+        "standard_deviations": LENS_SD,
         "camera_from_rig": _pose_json(camera.camera_from_rig),
     }
 
 
+def _rig_block(cameras: tuple[Camera, ...]) -> tuple[list[str], np.ndarray]:
+    lens = {f"{camera.name}.{name}": sd for camera in cameras for name, sd in LENS_SD.items()}
+    poses = {f"{camera.name}.{name}": float(k) for camera in cameras[1:]
+             for k, name in enumerate(POSE_COMPONENTS, start=1)}  # fmt: skip
+    sd = lens | poses
+    return list(sd), np.diag(np.square(list(sd.values())))
+
+
 def _content(cameras: tuple[Camera, ...], views: dict[str, Pose]) -> dict[str, Any]:
-    tangent = [f"right.{n}" for n in ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")]
+    names, matrix = _rig_block(cameras)
     rung = {"model": "none", "chi2_gain": None}
     return {
         "schema": 1,
@@ -66,7 +77,7 @@ def _content(cameras: tuple[Camera, ...], views: dict[str, Pose]) -> dict[str, A
         "cameras": {c.name: _camera_json(c) for c in cameras},
         "target": {"dots": list(range(15)), "points_mm": _points().tolist()},
         "views": {name: _pose_json(pose) for name, pose in views.items()},
-        "covariance": {"names": tangent, "matrix": np.diag(np.arange(1.0, 7.0) ** 2).tolist()},
+        "covariance": {"names": names, "matrix": matrix.tolist()},
         "model": {"name": "none", "words": "none was enough", "ladder": [rung]},
         "twin": {"cost": 12.5, "other_cost": 99.25, "decided_by": "nominal rotation", "words": "w"},
         "statistics": {"rms_px": 0.01, "chi2_dof": 1.01, "dots_kept": 178, "dots_measured": 180,
@@ -105,9 +116,11 @@ def write_calibration_folder(folder: Path, cameras: int) -> Path:
     residuals, dots = _tables(rig, views, rng)
     residuals.to_csv(folder / "residuals.csv", index=False)
     dots.to_csv(folder / "dots.csv", index=False)
-    names = [f"dot {i}.{axis}_mm" for i in range(15) for axis in "xyz"]
+    names, block = _rig_block(rig)
+    dot_names = [f"dot {i}.{axis}_mm" for i in range(15) for axis in "xyz"]
     root = 1e-3 * rng.standard_normal((45, 45))
-    np.savez(folder / "covariance.npz", names=np.array(names), covariance=root @ root.T)
+    np.savez(folder / "covariance.npz", names=np.array([*names, *dot_names]),
+             covariance=block_diag(block, root @ root.T))  # fmt: skip
     (folder / "run.json").write_text(json.dumps({"packages": {"numpy": "9.9"}, "seed": 3}))
     for camera in rig:
         (folder / "overlays" / camera.name).mkdir(parents=True)

@@ -20,7 +20,6 @@ from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.result.summary import summary
 from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
-from telerig.io.files.names import absent
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
 
     from telerig.io.results.calibration import CalibrationFile
     from telerig.io.results.findings import Finding
+    from telerig.io.results.folders.calibration import CalibrationResults
 
 _AT_ONCE = 8192
 _SCALE_STEP_MM = 1.0
@@ -67,8 +67,8 @@ class Calibration(ShortText):
         projected or triangulated lie in the water behind them.
     joint_names, joint_covariance : of all parameters of the estimate, including the dots and the
         views' poses; empty if they were not loaded.
-    tables : `dots.csv` and `residuals.csv`, by these names; after loading, the `calibration.json`
-        beside which they lie.
+    tables : `dots.csv` and `residuals.csv`, by these names; after loading, the results folder
+        from which they are read.
     """
 
     cameras: tuple[Camera, ...]
@@ -88,7 +88,7 @@ class Calibration(ShortText):
     medium: str = "air"
     joint_names: tuple[str, ...] = ()
     joint_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    tables: Mapping[str, pd.DataFrame] | Path = field(default_factory=dict)
+    tables: Mapping[str, pd.DataFrame] | CalibrationResults = field(default_factory=dict)
 
     @cached_property
     def dots(self) -> pd.DataFrame:
@@ -105,29 +105,17 @@ class Calibration(ShortText):
         return self._table("residuals.csv")
 
     def _table(self, name: str) -> pd.DataFrame:
-        from telerig.io.results.calibration import CalibrationFile
-        from telerig.io.results.manifest import reading
-        from telerig.io.tables.calibration import DOTS, RESIDUALS
+        from telerig.io.results.folders.calibration import CalibrationResults
 
-        if not isinstance(self.tables, Path):
-            if name in self.tables:
-                return self.tables[name]
-            raise InputError(
-                f"this calibration has no {name}: it was not made from dots",
-                where=f"Calibration {self.name!r}",
-                todo="use a calibration of telerig.calibrate, or load one from its folder",
-            )
-        file = self.tables.parent / name
-        if not file.is_file():
-            raise InputError("does not exist", where=str(file), todo=CalibrationFile.AGAIN)
-        with reading(file.parent, (self.tables.name, name)):
-            if CalibrationFile.read(self.tables).statistics != self.statistics:
-                raise InputError(
-                    "this calibration has been replaced since it was loaded",
-                    where=str(self.tables),
-                    todo="load it again",
-                )
-            return (DOTS if name == "dots.csv" else RESIDUALS).read(file)
+        if isinstance(self.tables, CalibrationResults):
+            return self.tables.table(name)
+        if name in self.tables:
+            return self.tables[name]
+        raise InputError(
+            f"this calibration has no {name}: it was not made from dots",
+            where=f"Calibration {self.name!r}",
+            todo="use a calibration of telerig.calibrate, or load one from its folder",
+        )
 
     @property
     def covariance_known(self) -> bool:
@@ -593,13 +581,13 @@ class Calibration(ShortText):
 
     def write_files(self, folder: Path) -> None:
         """Write the files of `save` into an existing folder, one after the other."""
+        from telerig.io.results.folders.calibration import CalibrationResults
+
         self.record().write(folder / "calibration.json")
         self._write_covariance(folder)
         for name in ("dots.csv", "residuals.csv"):
-            if not isinstance(self.tables, Path):
-                if name in self.tables:
-                    write_table(self.tables[name], folder / name)
-            elif (self.tables.parent / name).is_file():
+            tables = self.tables
+            if tables.has(name) if isinstance(tables, CalibrationResults) else name in tables:
                 write_table(self._table(name), folder / name)
 
     def _write_covariance(self, folder: Path) -> None:
@@ -618,37 +606,22 @@ def load_calibration(path: str | Path) -> Calibration:
     Raises InputError if a file is missing, was not written by telerig, has a newer schema, or if
     the two files belong to different calibrations.
     """
-    from telerig.io.results.calibration import CalibrationFile, read_joint_covariance
+    from telerig.io.results.calibration import CalibrationFile
+    from telerig.io.results.folders.calibration import CalibrationResults
     from telerig.io.results.manifest import reading
 
-    place = Path(path)
-    if not place.exists():
-        raise absent(place, "calibration", f"run `{CalibrationFile.MAKE}` first")
-    file = place / "calibration.json" if place.is_dir() else place
-    with reading(file.parent, (file.name, "covariance.npz")):
-        record = CalibrationFile.read(file)
-        if record.covariance is None:
-            raise InputError("has no covariance", where=str(file), todo=CalibrationFile.AGAIN)
-        poses = len(record.cameras) - 1
-        free = sum(len(camera.free) for camera in record.cameras.values())
-        if len(record.covariance.names) != free + len(POSE_COMPONENTS) * poses:
-            what = "the size of its covariance is not the number of its parameters"
-            raise InputError(what, where=str(file), todo=CalibrationFile.AGAIN)
-        names, joint = read_joint_covariance(file.parent / "covariance.npz")
-    rig = record.covariance.matrix
-    block = joint[: len(rig), : len(rig)]
-    if names and not (block.shape == rig.shape and np.allclose(block, rig, rtol=1e-9, atol=0)):
-        raise InputError(
-            "this covariance belongs to another calibration than the calibration.json beside it",
-            where=str(file.parent / "covariance.npz"),
-            todo="copy both files together, or delete covariance.npz",
-        )
+    found = CalibrationResults.at(Path(path))
+    with reading(found.folder, (found.name, "covariance.npz")):
+        record, (names, joint) = found.file, found.joint
+    if record.covariance is None:
+        todo = CalibrationFile.AGAIN
+        raise InputError("has no covariance", where=str(found.path), todo=todo)
     return Calibration(
-        cameras=record.rig_cameras(windows=True),
-        dot_ids=record.target.dots,
-        target_points_mm=record.target.points_mm,
-        target_poses={view: pose.pose() for view, pose in record.views.items()},
-        covariance=rig,
+        cameras=found.rig,
+        dot_ids=found.dot_ids,
+        target_points_mm=found.points_mm,
+        target_poses=found.views,
+        covariance=record.covariance.matrix,
         covariance_names=record.covariance.names,
         free=tuple(camera.free for camera in record.cameras.values()),
         name=record.name,
@@ -661,7 +634,7 @@ def load_calibration(path: str | Path) -> Calibration:
         medium=record.medium,
         joint_names=names,
         joint_covariance=joint,
-        tables=file,
+        tables=found,
     )
 
 
@@ -696,8 +669,10 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
             )
         return load_calibration(default), [default]
     if len(files) == 1 and files[0].suffix != ".txt":
-        only = files[0]
-        return load_calibration(only), [only / "calibration.json" if only.is_dir() else only]
+        from telerig.io.results.folders.calibration import CalibrationResults
+
+        found = load_calibration(files[0])
+        return found, [CalibrationResults.at(files[0]).path]
     if len(files) == 2 and all(p.suffix == ".txt" for p in files):
         from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 

@@ -15,7 +15,7 @@ import pandas as pd
 from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.files.names import absent
-from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.results.folders.smoothing import SmoothingResults
 from telerig.io.results.folders.tracking import TrackResults
 from telerig.io.results.manifest import reading
@@ -202,11 +202,10 @@ def cameras_of(
         trials.insert(0, source / "calibration.json")
     place = calibration or next((p for p in trials if p.is_file()), None)
     if place is not None:
-        file = place / "calibration.json" if place.is_dir() else place
-        with reading(file.parent, [file.name]):
-            accepted = refuse_stale(file.parent, [file.name], accept)
-            cameras = CalibrationFile.read(file).rig_cameras(windows=True)
-        return CalibratedCameras(cameras, accepted)
+        found = CalibrationResults.at(place)
+        with reading(found.folder, [found.name]):
+            accepted = refuse_stale(found.folder, [found.name], accept)
+            return CalibratedCameras(found.rig, accepted)
     if required:
         raise InputError(
             "there is no calibration",

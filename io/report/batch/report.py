@@ -28,16 +28,9 @@ from telerig.io.report.page.page import (
     texts,
 )
 from telerig.io.report.plot.axes import colour_of
-from telerig.io.results.batch import (
-    BatchFile,
-    short_names,
-    verdict_and_flags,
-    verdict_counts,
-    verdict_of,
-)
-from telerig.io.results.manifest import reading
+from telerig.io.results.batch import short_names, verdict_and_flags, verdict_counts, verdict_of
+from telerig.io.results.folders.batch import BatchResults, read_batch_results
 from telerig.io.results.smoothing import Verdict as Resolved
-from telerig.io.tables.smoothing import BATCH_BUBBLES
 from telerig.short_text import ABSENT, counted, is_number, number
 
 Job = Mapping[str, Any]
@@ -51,26 +44,18 @@ _LEFT_OUT, _MOST_LOST = "left out", 4
 
 def write_batch_report(folder: Path, out: Path | None = None) -> Path:
     """Write report.html beside batch.json, or into ``out``; InputError where there is no batch."""
-    bubbles = pd.DataFrame()
-    with reading(Path(folder), ["batch.json", "bubbles.csv"]):
-        file = BatchFile.read(Path(folder) / "batch.json")
-        if (Path(folder) / "bubbles.csv").is_file():
-            bubbles = BATCH_BUBBLES.read(Path(folder) / "bubbles.csv")
-    jobs = [job.content() for job in file.jobs]
-    name = file.name or Path(folder).resolve().name
     place = Path(folder) if out is None else Path(out)
-    page = page_of(jobs, place, name, bubbles, file.fluid)
+    page = page_of(read_batch_results(Path(folder)), place)
     write_text_atomic(place / "report.html", render_page(page))
     return place / "report.html"
 
 
-def page_of(
-    jobs: Sequence[Job], folder: Path, name: str, bubbles: pd.DataFrame, fluid: Mapping[str, Any]
-) -> Page:
+def page_of(results: BatchResults, folder: Path) -> Page:
     """Return what the page says.
 
-    folder : where it will lie, for the links. name : of the batch. bubbles, fluid : of all runs.
+    folder : where it will lie, for the links.
     """
+    jobs = results.jobs
     names = short_names(str(j["dataset"]) for j in jobs)
     failed = [j for j in jobs if j["status"] != _DONE]
     runs = {(j["dataset"], j["run"]) for j in jobs if j["run"]}
@@ -92,12 +77,12 @@ def page_of(
     own = _lost(failed, names)
     verdict = Verdict(headline, _colour(jobs), (_words(jobs),), (f"Failed: {own}.",) if own else ())
     return Page(
-        "telerig report of a batch", "Batch", name, verdict,
+        "telerig report of a batch", "Batch", results.name, verdict,
         sections=[
             Section("key", "", [Tiles(tuple(_key_numbers(jobs)))]),
             Section("failures", "What failed",
                     table(["where", "job", "why, and what to do"], failures, (98, 99))),
-            Section("bubbles", "Bubbles", _of_bubbles(bubbles, fluid, names), open=True),
+            Section("bubbles", "Bubbles", _of_bubbles(results, names), open=True),
             Section("calibrations", "Calibrations", table(heads, calibrations, (2, 99))),
             Section("runs", "Runs", [*table(of_runs, rows, (2, 99)), *texts(sd if rows else "")]),
         ],
@@ -148,14 +133,13 @@ def _lost(failed: Sequence[Job], names: Mapping[str, str]) -> str:
     return "; ".join(words[:_MOST_LOST]) + (f"; and {more} more" if more > 0 else "")
 
 
-def _of_bubbles(
-    bubbles: pd.DataFrame, fluid: Mapping[str, Any], names: Mapping[str, str]
-) -> list[Block]:
+def _of_bubbles(results: BatchResults, names: Mapping[str, str]) -> list[Block]:
     """Return the bubbles of all runs beside published laws, with boxes to choose runs."""
+    bubbles = results.bubbles
     if not len(bubbles):
         return []
     whose = bubbles["dataset"].map(lambda place: names.get(place, place)) + " / " + bubbles["run"]
-    every, liquid = bubbles.assign(whose=whose), fluid or None
+    every, liquid = bubbles.assign(whose=whose), results.file.fluid or None
     drawings = (
         ("Speed against diameter", partial(plot.speed, every, liquid, by="whose"),
          "Mean speed along the path against the diameter"

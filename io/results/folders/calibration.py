@@ -1,11 +1,12 @@
-"""What a calibration's results folder holds, read and checked for its report."""
+"""What a calibration's results folder holds, read and checked."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ import pandas as pd
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import read_table, rows_of
+from telerig.io.files.names import absent
 from telerig.io.results.calibration import (
     CalibrationFile,
     ComparisonFile,
@@ -22,7 +24,7 @@ from telerig.io.results.calibration import (
 from telerig.io.results.findings import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
-from telerig.io.tables.calibration import DOTS, RESIDUALS
+from telerig.io.tables.calibration import DOTS, REJECTED, RESIDUALS
 from telerig.io.tables.table import PIXEL_COVARIANCE
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -31,42 +33,66 @@ KEPT_WEIGHT = 0.5
 """A dot counts as kept above this weight."""
 
 
-_FILES = (
-    "calibration.json", "residuals.csv", "dots.csv", "covariance.npz", "run.json",
-    "uncertainty.npz", "comparison.json",
-)  # fmt: skip
-
-
 @dataclass(frozen=True)
 class CalibrationResults:
-    """A results folder in memory; what optional files are missing is in ``absent``.
+    """The results folder of a calibration; each file is read and checked when it is asked for.
 
-    views : rig_from_target by view.
-    row_column : (N, 2) of the dots, NaN where no residual names it.
-    residuals : with ``kept`` and ``length_px``, and ``whitened_u``, ``whitened_v`` when dots.csv
-        states covariances.
-    component : place in ``joint``, the whole covariance, by name.
-    overlays : picture by (camera, view).
-    uncertainty : arrays, or empty.
+    name : of its calibration.json.
+    Reading raises InputError for what is missing, cannot be read or does not fit together.
     """
 
-    file: CalibrationFile
-    cameras: tuple[Camera, ...]
-    views: Mapping[str, Pose]
-    row_column: Array
-    residuals: pd.DataFrame
-    component: Mapping[str, int]
-    joint: Array
-    run: Mapping[str, Any]
-    overlays: Mapping[tuple[str, str], Path]
-    uncertainty: Mapping[str, Array]
-    comparison: ComparisonFile
-    absent: tuple[str, ...]
+    folder: Path
+    name: str = "calibration.json"
+
+    FILES: ClassVar[tuple[str, ...]] = (
+        "calibration.json", "residuals.csv", "dots.csv", "covariance.npz", "run.json",
+        "uncertainty.npz", "comparison.json",
+    )  # fmt: skip
+
+    @classmethod
+    def at(cls, place: Path) -> Self:
+        """Return the results in a folder, or those whose calibration.json is given.
+
+        Raises InputError where nothing is there.
+        """
+        if not place.exists():
+            raise absent(place, "calibration", f"run `{CalibrationFile.MAKE}` first")
+        return cls(place) if place.is_dir() else cls(place.parent, place.name)
+
+    @property
+    def path(self) -> Path:
+        """Return the path of calibration.json."""
+        return self.folder / self.name
+
+    @cached_property
+    def file(self) -> CalibrationFile:
+        """calibration.json."""
+        return CalibrationFile.read(self.path)
 
     @property
     def content(self) -> Mapping[str, Any]:
         """calibration.json as it stands."""
         return self.file.content()
+
+    @cached_property
+    def rig(self) -> tuple[Camera, ...]:
+        """The cameras, which look through their refractive windows into the water."""
+        return self.file.rig_cameras(windows=True)
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras as they saw the target: without windows if it was in air."""
+        return self.file.rig_cameras(windows=self.file.medium == "water")
+
+    @property
+    def camera_names(self) -> list[str]:
+        """Return the names of the cameras, in the rig's order."""
+        return [*self.file.cameras]
+
+    @cached_property
+    def views(self) -> Mapping[str, Pose]:
+        """rig_from_target by view."""
+        return {name: pose.pose() for name, pose in self.file.views.items()}
 
     @property
     def dot_ids(self) -> Ints:
@@ -83,93 +109,146 @@ class CalibrationResults:
         """Return ``statistics`` of calibration.json."""
         return self.file.statistics
 
-    @property
+    @cached_property
+    def joint(self) -> tuple[tuple[str, ...], Array]:
+        """Names and covariance (P, P) of all P parameters, from covariance.npz; empty without it.
+
+        It has to contain the covariance of the rig that calibration.json states.
+        """
+        place = self.folder / "covariance.npz"
+        names, joint = read_joint_covariance(place)
+        rig = None if self.file.covariance is None else self.file.covariance.matrix
+        if names and rig is not None:
+            block = joint[: len(rig), : len(rig)]
+            if block.shape != rig.shape or not np.allclose(block, rig, rtol=1e-9, atol=0):
+                raise InputError(
+                    "this covariance belongs to another calibration than the calibration.json "
+                    "beside it",
+                    where=str(place),
+                    todo="copy both files together, or delete covariance.npz",
+                )
+        return names, joint
+
+    @cached_property
     def target_covariance(self) -> Array | None:
         """(3, N, N) of the dots' coordinates x, y, z, in mm²; None where it is not known."""
+        names, joint = self.joint
+        place = {name: i for i, name in enumerate(names)}
         index = np.array(
-            [[self.component.get(f"dot {dot}.{axis}_mm", -1) for dot in self.dot_ids]
-             for axis in "xyz"]
-        )  # fmt: skip
+            [[place.get(f"dot {dot}.{axis}_mm", -1) for dot in self.dot_ids] for axis in "xyz"]
+        )
         if index.size == 0 or index.min() < 0:
             return None
-        return np.array([self.joint[np.ix_(of, of)] for of in index])
+        return np.array([joint[np.ix_(of, of)] for of in index])
+
+    def has(self, name: str) -> bool:
+        """Return whether the folder has a file."""
+        return (self.folder / name).is_file()
+
+    def table(self, name: str) -> pd.DataFrame:
+        """Return "dots.csv" or "residuals.csv" as it stands. Raises InputError if it is not there,
+        or if calibration.json has been replaced since it was read."""
+        place = self.folder / name
+        if not place.is_file():
+            raise InputError("does not exist", where=str(place), todo=CalibrationFile.AGAIN)
+        with reading(self.folder, (self.name, name)):
+            if CalibrationFile.read(self.path).statistics != self.statistics:
+                raise InputError(
+                    "this calibration has been replaced since it was loaded",
+                    where=str(self.path),
+                    todo="load it again",
+                )
+            return (DOTS if name == "dots.csv" else RESIDUALS).read(place)
+
+    @cached_property
+    def residuals(self) -> pd.DataFrame:
+        """residuals.csv with ``kept`` and ``length_px``, and ``whitened_u``, ``whitened_v`` when
+        dots.csv states covariances."""
+        place = self.folder / "residuals.csv"
+        if not place.is_file():
+            imported = self.file.verdict.status == Status.IMPORTED
+            raise InputError(
+                "was imported, so it has no dots and residuals of which a report could be made"
+                if imported
+                else "the residuals are missing, a report cannot be made without them",
+                where=str(self.path if imported else place),
+                todo="use it as it is, or calibrate (`telerig calibrate`) for a report"
+                if imported
+                else CalibrationFile.AGAIN,
+            )
+        table = read_table(place, RESIDUALS.of(), extra=True)
+        for column, known in (("camera", self.camera_names), ("view", list(self.views))):
+            strange = ~table[column].isin(known).to_numpy()
+            name = table[column][strange].iloc[0] if strange.any() else ""
+            what = f"calibration.json has no {column} {name!r}"
+            todo = "the files are of two calibrations; " + CalibrationFile.AGAIN
+            rows_of(table, place).refuse(strange, column, what, todo)
+        table = table.reset_index(drop=True)
+        table["kept"] = table["weight"] > KEPT_WEIGHT
+        table["length_px"] = np.hypot(table["du_px"], table["dv_px"])
+        floor = self.statistics.get("noise_floor_px") or 0.0
+        return _with_whitened(table, self.folder / "dots.csv", float(floor))
+
+    @cached_property
+    def row_column(self) -> Array:
+        """(N, 2) of the dots, NaN where no residual names it."""
+        known = self.residuals.drop_duplicates("dot").set_index("dot")[["row", "column"]]
+        return known.reindex(self.dot_ids).to_numpy(float)
+
+    @cached_property
+    def rejected(self) -> pd.DataFrame:
+        """rejected.csv; without rows where it is not there."""
+        return REJECTED.read(self.folder / "rejected.csv", optional=True)
+
+    @cached_property
+    def run(self) -> Mapping[str, Any]:
+        """run.json."""
+        return RunFile.read_if_there(self.folder / "run.json").content()
+
+    @cached_property
+    def uncertainty(self) -> Mapping[str, Array]:
+        """Arrays of uncertainty.npz; empty without it."""
+        return read_uncertainty(self.folder / "uncertainty.npz")
+
+    @cached_property
+    def comparison(self) -> ComparisonFile:
+        """comparison.json."""
+        return ComparisonFile.read_if_there(self.folder / "comparison.json")
+
+    @cached_property
+    def overlays(self) -> Mapping[tuple[str, str], Path]:
+        """Picture by (camera, view)."""
+        named = {
+            (camera, view): self.folder / "overlays" / camera / f"{view}.jpg"
+            for view in self.views
+            for camera in self.camera_names
+        }
+        return {key: file for key, file in named.items() if file.is_file()}
 
     @property
-    def camera_names(self) -> list[str]:
-        """Return the names of the cameras, in the rig's order."""
-        return [camera.name for camera in self.cameras]
+    def absent(self) -> tuple[str, ...]:
+        """What optional files are missing, in words."""
+        there = {
+            "dots.csv with covariances (residuals are shown in px only)":
+                "whitened_u" in self.residuals,
+            "covariance.npz (no standard deviations of the target's shape)": bool(self.joint[0]),
+            "run.json (no versions, no options)": bool(self.run),
+            "overlays/ (no pictures of the dots that were found)": bool(self.overlays),
+        }  # fmt: skip
+        return tuple(text for text, present in there.items() if not present)
 
 
 def read_calibration_results(folder: Path) -> CalibrationResults:
-    """Read a calibration's results folder: calibration.json, residuals.csv, and what else is there.
+    """Read a calibration's results folder for a page or the viewer.
 
-    Raises InputError for what is missing, cannot be read or does not fit together.
+    calibration.json and residuals.csv are needed; what else is there is used. Raises InputError for
+    what is missing, cannot be read or does not fit together.
     """
-    with reading(folder, _FILES):
-        return _read_calibration_results(folder)
-
-
-def _read_calibration_results(folder: Path) -> CalibrationResults:
-    file = CalibrationFile.read(folder / "calibration.json")
-    cameras = file.rig_cameras(windows=file.medium == "water")
-    views = {name: pose.pose() for name, pose in file.views.items()}
-    residuals = _residuals(folder, cameras, views, file)
-    names, joint = read_joint_covariance(folder / "covariance.npz")
-    component = {name: i for i, name in enumerate(names)}
-    run = RunFile.read_if_there(folder / "run.json")
-    comparison = ComparisonFile.read_if_there(folder / "comparison.json")
-    overlays = _overlays(folder / "overlays", cameras, views)
-    words = {
-        "dots.csv with covariances (residuals are shown in px only)": "whitened_u" in residuals,
-        "covariance.npz (no standard deviations of the target's shape)": bool(joint.size),
-        "run.json (no versions, no options)": bool(run.content()),
-        "overlays/ (no pictures of the dots that were found)": bool(overlays),
-    }
-    absent = tuple(text for text, present in words.items() if not present)
-    return CalibrationResults(
-        file,
-        cameras,
-        views,
-        _row_column(residuals, file.target.dots),
-        residuals,
-        component,
-        joint,
-        run.content(),
-        overlays,
-        read_uncertainty(folder / "uncertainty.npz"),
-        comparison,
-        absent,
-    )
-
-
-def _residuals(
-    folder: Path, cameras: tuple[Camera, ...], views: Mapping[str, Pose], file: CalibrationFile
-) -> pd.DataFrame:
-    place = folder / "residuals.csv"
-    if not place.is_file() and file.verdict.status == Status.IMPORTED:
-        raise InputError(
-            "was imported, so it has no dots and residuals of which a report could be made",
-            where=str(folder / "calibration.json"),
-            todo="use it as it is, or calibrate (`telerig calibrate`) for a report",
-        )
-    if not place.is_file():
-        raise InputError(
-            "the residuals are missing, a report cannot be made without them",
-            where=str(place),
-            todo=CalibrationFile.AGAIN,
-        )
-    table = read_table(place, RESIDUALS.of(), extra=True)
-    for column, known in (("camera", [c.name for c in cameras]), ("view", list(views))):
-        strange = ~table[column].isin(known).to_numpy()
-        name = table[column][strange].iloc[0] if strange.any() else ""
-        what = f"calibration.json has no {column} {name!r}"
-        todo = "the files are of two calibrations; " + CalibrationFile.AGAIN
-        rows_of(table, place).refuse(strange, column, what, todo)
-    table = table.reset_index(drop=True)
-    table["kept"] = table["weight"] > KEPT_WEIGHT
-    table["length_px"] = np.hypot(table["du_px"], table["dv_px"])
-    floor = file.statistics.get("noise_floor_px") or 0.0
-    return _with_whitened(table, folder / "dots.csv", float(floor))
+    results = CalibrationResults(folder)
+    with reading(folder, CalibrationResults.FILES):
+        _ = results.cameras, results.views, results.row_column, results.joint, results.run
+        _ = results.uncertainty, results.comparison
+    return results
 
 
 def _with_whitened(table: pd.DataFrame, file: Path, floor_px: float) -> pd.DataFrame:
@@ -189,15 +268,3 @@ def _with_whitened(table: pd.DataFrame, file: Path, floor_px: float) -> pd.DataF
     du, dv = merged["du_px"].to_numpy(), merged["dv_px"].to_numpy()
     across = np.sqrt(vv - uv**2 / uu)
     return table.assign(whitened_u=du / np.sqrt(uu), whitened_v=(dv - uv / uu * du) / across)
-
-
-def _overlays(
-    folder: Path, cameras: tuple[Camera, ...], views: Mapping[str, Pose]
-) -> dict[tuple[str, str], Path]:
-    found = {(c.name, view): folder / c.name / f"{view}.jpg" for view in views for c in cameras}
-    return {key: file for key, file in found.items() if file.is_file()}
-
-
-def _row_column(residuals: pd.DataFrame, dot_ids: Ints) -> Array:
-    known = residuals.drop_duplicates("dot").set_index("dot")[["row", "column"]]
-    return known.reindex(dot_ids).to_numpy(float)

@@ -21,7 +21,7 @@ from telerig.io.report.plot.outline import common_plane, rig_outline
 from telerig.io.report.plot.rig import tilt_angles_rad
 from telerig.io.report.plot.target import target_shape
 from telerig.io.report.run import report as run
-from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Diagnostics, Target
+from telerig.io.results.calibration import CalibrationFile, Diagnostics, Target
 from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.results.tracking import TrackingFile
 from telerig.rig.camera import Camera
@@ -41,13 +41,21 @@ def _results() -> CalibrationResults:
     seen = [(view, camera) for view in views for camera in ("left", "right")]
     root = 1e-3 * np.random.default_rng(4).standard_normal((45, 45))
     target = Target(dots=np.arange(15), points_mm=points)
-    file = CalibrationFile.model_construct(target=target)
-    return CalibrationResults(
+    file = CalibrationFile.model_construct(
+        target=target, cameras={"left": None, "right": None}, diagnostics=Diagnostics()
+    )
+    return _with(
         file=file, cameras=(left, right), views=views,
         row_column=lattice, residuals=pd.DataFrame(seen, columns=["view", "camera"]),
-        component={f"dot {i // 3}.{'xyz'[i % 3]}_mm": i for i in range(45)}, joint=root @ root.T,
-        run={}, overlays={}, uncertainty={}, comparison=ComparisonFile(), absent=(),
+        joint=(tuple(f"dot {i}.{axis}_mm" for i in range(15) for axis in "xyz"), root @ root.T),
     )  # fmt: skip
+
+
+def _with(**read: Any) -> CalibrationResults:
+    """A folder of which these parts count as read."""
+    results = CalibrationResults(Path("nowhere"))
+    vars(results).update(read)
+    return results
 
 
 def test_tilt_is_the_angle_between_axis_and_normal() -> None:
@@ -75,9 +83,8 @@ def test_uncertainty_is_drawn_in_the_plane_of_both_axes(
         "measurement_mm2": np.broadcast_to(np.eye(3), (27, 3, 3)),
     }  # fmt: skip
     found = _results()
-    file = found.file.model_copy(update={"diagnostics": Diagnostics()})
     cameras = (found.cameras[0], second)
-    found = replace(found, file=file, cameras=cameras, uncertainty=uncertainty)
+    found = _with(file=found.file, cameras=cameras, uncertainty=uncertainty)
     (figure,) = calibration._maps(found)
     assert f"1.00 to {largest}.00 µm" in figure.caption
     axes = figure.draw()
@@ -92,7 +99,7 @@ def test_target_shape_finds_a_bump_and_its_deviation() -> None:
     residual = np.eye(15) - design @ np.linalg.pinv(design)
     np.testing.assert_allclose(shape.off_um[:, 2], 50 * residual[:, 7], atol=1e-9)
     np.testing.assert_allclose(shape.off_um[:, :2], 0, atol=1e-9)
-    expected = 1e3 * np.sqrt(np.diag(residual @ results.joint[2::3, 2::3] @ residual.T))
+    expected = 1e3 * np.sqrt(np.diag(residual @ results.joint[1][2::3, 2::3] @ residual.T))
     np.testing.assert_allclose(shape.sd_um[:, 2], expected)
 
 
@@ -120,7 +127,7 @@ def test_the_second_camera_is_drawn_where_it_stands(
     pose = Pose.from_rotvec(np.radians(rotvec_deg), [0.0, 0.0, 0.0])
     found = _results()
     second = replace(found.cameras[1], camera_from_rig=pose)
-    results = replace(found, cameras=(found.cameras[0], second))
+    results = _with(**vars(found) | {"cameras": (found.cameras[0], second)})
     plane = common_plane(results.cameras)
     np.testing.assert_allclose(plane, [across, (0, 0, 1)], atol=1e-6)
     first, other = (c.body_mm.reshape(8, 3).mean(0) @ plane.T for c in _outline(results))
@@ -131,7 +138,7 @@ def test_the_second_camera_is_drawn_where_it_stands(
 def test_outline_of_a_perspective_camera_stays_in_front_of_its_centre() -> None:
     results = _results()
     near = results.cameras[0].with_parameters(kappa_per_mm=1 / 30.0)
-    outline = _outline(replace(results, cameras=(near,)))[0]
+    outline = _outline(_with(**vars(results) | {"cameras": (near,)}))[0]
     width_mm = np.linalg.norm(outline.field_mm[:, 1] - outline.field_mm[:, 0], axis=1)
     depth_mm = outline.axis_mm[:, 2] + 30.0
     assert depth_mm.min() > 0

@@ -30,7 +30,7 @@ from calibration_scene import Scene, make_scene
 from covariance import aligned
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.lens.choice import model_start
+from telerig.estimator.calibration.lens_choice import model_start
 from telerig.estimator.calibration.self_calibration import choose_model
 from telerig.estimator.calibration.solver.problem import (
     Problem,

@@ -229,15 +229,13 @@ def _with_stage(dataset: Dataset, calibration: Calibration, stage: Progress | No
 
     It stays as it is if there is no such folder or if the calibration was rejected.
     """
-    from telerig.estimator.calibration.stage_axis import stage_axis_from
+    from telerig.estimator.calibration.stage_axis import FOLDER, stage_axis_from
 
-    if calibration.verdict["status"] == "REJECTED":
+    if not (dataset.path / FOLDER).is_dir() or calibration.verdict["status"] == "REJECTED":
         return calibration
     if stage is not None:
         stage("stage axis", 0, 0)
     found = stage_axis_from(dataset, calibration)
-    if found is None:
-        return calibration
     return _with_findings(replace(calibration, stage=found.as_dict()), found.findings)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
-from telerig.estimator.calibration.lens.choice import Choice, Step
+from telerig.estimator.calibration.lens_choice import Choice, Step
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state

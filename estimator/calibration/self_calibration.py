@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.lens.choice import (
+from telerig.estimator.calibration.lens_choice import (
     Choice,
     choose,
     considered_covariance,
@@ -21,8 +21,8 @@ from telerig.estimator.calibration.lens.choice import (
 )
 from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality import checks
+from telerig.estimator.calibration.quality.comparison import split_half_check
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
-from telerig.estimator.calibration.quality.split_half import split_half_check
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import (
     Fit,

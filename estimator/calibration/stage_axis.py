@@ -98,16 +98,14 @@ class StageAxis:
         }
 
 
-def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | None:
-    """Measure the stage's axis from the folder `stage_axis/` of a dataset; None if there is none.
+def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis:
+    """Measure the stage's axis from the folder `stage_axis/` of a dataset.
 
     If rig.toml states another direction of travel, ``findings`` of the result say so. Raises
     InputError if the folder has no positions.csv, or both or neither of images and dots.csv, and
     the errors of `stage_axis_of`.
     """
     folder = dataset.path / FOLDER
-    if not folder.is_dir():
-        return None
     positions = _positions(folder)
     described, read = dataset.rig.stage, list[Finding]()
     found = stage_axis_of(

@@ -61,6 +61,9 @@ the dots' spread."""
 TIE_DEG = 10.0
 """A nominal rotation does not decide between two rotations to which its distance differs by less:
 it is measured by eye."""
+TURN_TIE_DEG = 3.0
+"""Images do not decide between two turns of a target without marks that explain the rotation
+between two cameras to within so much: the rotations of single images are good to about a degree."""
 FAR_BETTER = 0.02
 """If the images of one camera belong to other views, the mean square of the epipolar constraint
 falls at least to this share with the right offset: to 1e-6 to 2e-4 in simulated views, where the

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from telerig.estimator.dots.grid.agreement import PossibleNumbers, decided_by_pa
 from telerig.estimator.dots.grid.numbering import (
     OUTSIDE,
     Numbering,
-    check_handedness,
     is_likely,
     number_dots,
 )
@@ -27,7 +26,7 @@ from telerig.estimator.dots.locate import REJECTED, DotMeasurement, measure_dots
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
 from telerig.io.results.findings import Code, Finding
-from telerig.rig.target import Target
+from telerig.rig.target import Target, check_handedness
 
 MEASURED = [
     *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"),
@@ -237,23 +236,13 @@ def detect_dataset(
     count = _workers(dataset, len(tasks)) if workers is None else workers
     found: list[ImageDots] = []
     work = partial(_detect_task, dataset, overlays)
-    if count > 1:
-        _load_before_forking(dataset, overlays, tasks[0])
-    for done, image in enumerate(ordered_map(work, tasks, count, meanwhile), 1):
+    # what the first image loads here, each worker process would otherwise load again
+    rest = ordered_map(work, tasks[1:], count, meanwhile)
+    for done, image in enumerate(chain(map(work, tasks[:1]), rest), 1):
         found.append(image)
         if progress is not None:
             progress(done, len(tasks))
-    together = detected_together(dataset, found)
-    return together
-
-
-def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
-    """Import the modules that each worker process would otherwise import at its first image."""
-    dataset.image(*task)
-    if overlays:
-        import cv2  # noqa: F401
-
-        import telerig.io.report.overlays  # noqa: F401
+    return detected_together(dataset, found)
 
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:

@@ -65,8 +65,7 @@ def _stage_axis(file: Path) -> Any:
 
     folder = file.parents[1]
     calibration = telerig.load_calibration(folder / "results" / "calibration")
-    found = stage_axis_from(telerig.load_dataset(folder), calibration)
-    return None if found is None else found.axis_rig
+    return stage_axis_from(telerig.load_dataset(folder), calibration).axis_rig
 
 
 def _run(file: Path) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.lens.search import possible
+from telerig.estimator.calibration.lens_choice import possible
 from telerig.rig.lens_parameters import (
     GROUPS,
     INDEX,

@@ -35,10 +35,10 @@ from telerig.estimator.calibration.thresholds import (
     STRONG_PERSPECTIVE,
     UNPAIRED,
 )
-from telerig.estimator.dots.grid.numbering import check_handedness
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
+from telerig.rig.target import check_handedness
 
 
 @dataclass(frozen=True)

@@ -252,7 +252,7 @@ def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
     """Return the cost of the mirror image of a solution.
 
     Without a plate, refractive windows and a known relief of the target the mirror image is a
-    minimum as well, so nothing has to be solved.
+    minimum as well, so it is only evaluated.
 
     state, cost : the solution. Raises CalibrationError if the mirror image fits far better, because
     the refraction in the plate then contradicts the nominal rotation.
@@ -260,8 +260,10 @@ def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
     if len(problem.cameras) == 1:
         return cost
     broken = np.any(problem.plate_shift) or np.ptp(problem.nominal_mm[:, 2]) > 0
-    steps = 20 if broken or any(c.wall is not None for c in problem.cameras) else 0
-    other = solve(problem, mirrored_state(state), max_iterations=steps).cost
+    mirror = mirrored_state(state)
+    if not broken and all(c.wall is None for c in problem.cameras):
+        return System(problem).gaussian(mirror).cost
+    other = solve(problem, mirror, max_iterations=20).cost
     if np.any(problem.plate_shift) and other < 0.5 * cost - 10:
         raise CalibrationError(
             "the nominal rotation puts the second camera on one side, the refraction in the "

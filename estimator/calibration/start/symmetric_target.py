@@ -17,11 +17,10 @@ from telerig.estimator.calibration.solver.robust_least_squares import robust_sol
 from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.known_target import angle_between
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
+from telerig.estimator.calibration.thresholds import TURN_TIE_DEG
 from telerig.factors.calibration import State, whitened_residuals
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.pose import rotation_from_rotvec
-
-TIE_DEG = 15.0
 
 
 def number_consistently(
@@ -137,7 +136,7 @@ def _numbered_alike_in_pair(
     best = min(hypotheses, key=lambda h: h[0])[1]
     angles = angle_between(options, best).min(0).T
     ranked = np.sort(angles, 1)
-    close = np.flatnonzero(ranked[:, 1] - ranked[:, 0] < np.radians(TIE_DEG) / 5)
+    close = np.flatnonzero(ranked[:, 1] - ranked[:, 0] < np.radians(TURN_TIE_DEG))
     if len(close):
         raise CalibrationError(
             "the target has no orientation marks and looks the same after a turn, and in view "

@@ -13,7 +13,6 @@ points by `match_points`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -501,46 +500,6 @@ def _check_columns(dots: pd.DataFrame) -> None:
             where=f"row {rows}",
             todo="leave these rows out",
         )
-
-
-def check_handedness(handedness_by_image: Mapping[tuple[str, str], int], two_sided: bool) -> None:
-    """Raise DetectionError if only some of the images show the target mirrored.
-
-    handedness_by_image : for each (view, camera) +1, -1 for a mirrored image, 0 for unknown.
-    two_sided : whether the plate may be seen from both sides; nothing is raised then.
-    """
-    signs = {image: hand for image, hand in handedness_by_image.items() if hand}
-    if two_sided or len(set(signs.values())) < 2:
-        return
-    first = next(iter(signs.values()))
-    usual = first if sum(hand == first for hand in signs.values()) * 2 >= len(signs) else -first
-    odd = [image for image, hand in signs.items() if hand != usual]
-    todo = (
-        "if a camera or an export flips the image, undo this; if the plate is transparent and "
-        "seen from behind, set two_sided = true, plate_thickness_mm and plate_index in rig.toml "
-        "[target]"
-    )
-    whole = _mirrored_camera(signs, odd)
-    if whole:
-        raise DetectionError(
-            f"every image of camera '{whole[0]}' is mirrored against camera '{whole[1]}'",
-            todo=todo,
-        )
-    names = ", ".join(f"camera '{camera}' view '{view}'" for view, camera in odd)
-    plural = "s" if len(odd) > 1 else ""
-    raise DetectionError(f"mirrored image{plural} ({len(odd)} of {len(signs)}): {names}", todo=todo)
-
-
-def _mirrored_camera(
-    signs: Mapping[tuple[str, str], int], odd: list[tuple[str, str]]
-) -> tuple[str, str] | None:
-    """Return (mirrored, other) if the odd images are all images of one camera, and only those."""
-    odd_cameras = {camera for _, camera in odd}
-    others = [camera for _, camera in signs if camera not in odd_cameras]
-    every = sum(camera in odd_cameras for _, camera in signs) == len(odd)
-    if len(odd_cameras) == 1 and others and every and len(odd) > 1:
-        return odd_cameras.pop(), others[0]
-    return None
 
 
 def _is_ambiguous(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.lens.choice import (
+from telerig.estimator.calibration.lens_choice import (
     Choice,
     Step,
     considered_covariance,

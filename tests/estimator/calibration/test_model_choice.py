@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.lens import choice as model_choice
-from telerig.estimator.calibration.lens.choice import model_start
-from telerig.estimator.calibration.lens.search import (
+from telerig.estimator.calibration import lens_choice as model_choice
+from telerig.estimator.calibration.lens_choice import (
     Lens,
     QuadraticCost,
     additions,
+    model_start,
     possible,
     search,
     steps_to,

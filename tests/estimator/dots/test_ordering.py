@@ -15,11 +15,10 @@ from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.grid.numbering import (
     OUTSIDE,
     Numbering,
-    check_handedness,
     is_likely,
     number_dots,
 )
-from telerig.rig.target import Target
+from telerig.rig.target import Target, check_handedness
 
 Array = NDArray[np.float64]
 DIRT = -(10**9)

@@ -6,6 +6,7 @@ The noise model is variance = alpha + beta * grey level.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -49,20 +50,16 @@ class NoiseModel:
     black: float = -np.inf
     white: float = np.inf
 
-    def is_clipped(self, grey: Array, model: Array) -> Bools:
-        """Return which pixels are clipped, or expected within 2 standard deviations of clipping.
-
-        grey, model : measured and expected grey levels, of equal shape.
-        """
-        reach = 2.0 * np.sqrt(self.variance(model))
-        low = np.minimum(grey, model - reach) <= self.black
-        return np.asarray(low | (np.maximum(grey, model + reach) >= self.white))
-
     def variance(self, level: Array) -> Array:
         """Return the variance (grey levels squared) at the given grey levels, in the same shape."""
+        level = np.asarray(level, dtype=np.float64)
+        return np.maximum(self.alpha + self.beta * level, self.least_variance)
+
+    @cached_property
+    def least_variance(self) -> float:
+        """The least variance of a grey level, in grey levels squared."""
         ends = [self.alpha + self.beta * e for e in (self.lowest, self.highest) if np.isfinite(e)]
-        floor = max(self.step**2 / 12.0, min(ends, default=0.0), 1e-300)
-        return np.maximum(self.alpha + self.beta * np.asarray(level, dtype=np.float64), floor)
+        return float(max(self.step**2 / 12.0, min(ends, default=0.0), 1e-300))
 
     def sigma_at(self, level: float) -> float:
         """Return the standard deviation (in grey levels) at one grey level."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
+from telerig.estimator.dots.fit.kernels import coverages, ellipse_distances
 
 PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 
@@ -46,23 +47,13 @@ def extent_px(shape_px: Array) -> Array:
 
 
 def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Array:
-    """Return the distances (px) of pixels from ellipses, to first order; positive outside.
+    """Return the distances (P,) in px of pixels from an ellipse, to first order; positive outside.
 
-    shape_px : (..., 3) shape numbers. du_px, dv_px : (..., P) offsets from the centre.
+    shape_px : (3,) shape numbers. du_px, dv_px : (P,) offsets from the centre.
     """
-    m11, m12, m22 = _columns(shape_px)
-    determinant = m11 * m22 - m12 * m12
-    x, y = (m22 * du_px - m12 * dv_px) / determinant, (m11 * dv_px - m12 * du_px) / determinant
-    radius = np.sqrt(x * x + y * y) + 1e-12
-    across, along = m22 * x - m12 * y, m11 * y - m12 * x
-    slope = np.sqrt(across * across + along * along) / (determinant * radius) + 1e-12
-    distance: Array = np.maximum((radius - 1.0) / slope, -0.5 * (m11 + m22))
-    return distance
-
-
-def _columns(shape_px: Array) -> tuple[Array, Array, Array]:
-    """Return three (..., 1) shape numbers that broadcast with (..., P) pixels."""
-    return shape_px[..., :1], shape_px[..., 1:2], shape_px[..., 2:]
+    out = np.empty(len(du_px))
+    ellipse_distances(shape_px, du_px, dv_px, out)
+    return out
 
 
 def coverage_on_grid(
@@ -82,8 +73,6 @@ def coverage_on_grid(
     P its integral, the convolution over the ellipse's area is an integral round its contour of a
     smooth periodic function: the trapezoid rule converges exponentially, here to about 1e-6.
     """
-    from telerig.estimator.dots.fit.kernels import coverages
-
     centre, shape = np.asarray(centre_px, dtype=np.float64), np.asarray(shape_px, dtype=np.float64)
     sigma = np.asarray(sigma_px, dtype=np.float64)[..., None]
     theta = np.concatenate([centre, shape, sigma], -1)

@@ -308,8 +308,7 @@ def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
 
 def _unevenness(outline: NDArray[np.int32], centre: Array, shape: Array) -> float:
     """Return how far an outline (N, 2) is from the ellipse of its blob, in standard deviations."""
-    offset = outline - centre
-    distance = approximate_distance_px(shape, offset[:, 0], offset[:, 1]) + 0.5
+    distance = approximate_distance_px(shape, *(outline.T - centre[:, None])) + 0.5
     excess = float(np.sqrt(np.mean(distance**2))) - OUTLINE_PX
     return max(excess, 0.0) / float(OUTLINE_SD[0] + OUTLINE_SD[1] * semi_axes(shape)[1])
 

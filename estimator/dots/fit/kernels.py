@@ -90,6 +90,20 @@ def coverages(first: Array, theta: Array, value: Array, gradient: Array) -> None
 
 
 @compiled
+def ellipse_distances(shape: Array, x: Array, y: Array, out: Array) -> None:
+    """Fill in the distances (P,) of pixels from an ellipse; see `approximate_distance_px`."""
+    m11, m12, m22 = shape[0], shape[1], shape[2]
+    determinant, deepest = m11 * m22 - m12 * m12, -0.5 * (m11 + m22)
+    for p in range(len(out)):
+        a = (m22 * x[p] - m12 * y[p]) / determinant
+        b = (m11 * y[p] - m12 * x[p]) / determinant
+        radius = sqrt(a * a + b * b) + 1e-12
+        across, along = m22 * a - m12 * b, m11 * b - m12 * a
+        slope = sqrt(across * across + along * along) / (determinant * radius) + 1e-12
+        out[p] = max((radius - 1.0) / slope, deepest)
+
+
+@compiled
 def predict(
     at: Ints, first: Array, radius: float, parameters: Array, value: Array, gradient: Array,
     grey: Array, jacobian: Array,
@@ -198,6 +212,52 @@ def damped_step(information: Array, pull: Array, damping: float, step: Array) ->
         step[i] = total / root[i, i]
     for i in range(12):
         step[i] /= scale[i]
+
+
+@compiled
+def covariance_of(information: Array, which: Ints, out: Array) -> None:
+    """Fill in the covariance (k, k) of some of the 12 parameters, the k ones in ``which``."""
+    pull, step = np.empty(12), np.empty(12)
+    for k in range(len(which)):
+        for i in range(12):
+            pull[i] = 1.0 if i == which[k] else 0.0
+        damped_step(information, pull, 0.0, step)
+        for j in range(len(which)):
+            out[j, k] = step[which[j]]
+
+
+@compiled
+def residual_sums(
+    line: Array, clip: Array, model: Array, residual: Array, weight: Array, distance: Array,
+    covered: Array, reach: float, inside: float, sums: Array,
+) -> None:  # fmt: skip
+    """Add up what the residuals of a fit show.
+
+    line : (3,) alpha, beta and floor of the noise. clip : (2,) grey levels of clipping.
+    model, residual, weight, distance, covered : (P,) of each pixel: predicted grey level, residual,
+    inverse variance, distance from the edge, and how much of it the dot covers.
+    reach : an edge's pixels are nearer than this. inside : least ``covered`` of an inner pixel.
+    sums : (6,), filled: number of the pixels used, which are neither outliers nor clipped, and
+    their chi-square; number of those at the edge and the sum of their squares; number of the inner
+    ones and their chi-square.
+    """
+    for k in range(6):
+        sums[k] = 0.0
+    for p in range(len(model)):
+        near = 2.0 * sqrt(max(line[0] + line[1] * model[p], line[2]))
+        grey = model[p] + residual[p]
+        clipped = min(grey, model[p] - near) <= clip[0] or max(grey, model[p] + near) >= clip[1]
+        if weight[p] <= 0.0 or clipped:
+            continue
+        square = residual[p] ** 2
+        sums[0] += 1.0
+        sums[1] += weight[p] * square
+        if abs(distance[p]) < reach:
+            sums[2] += 1.0
+            sums[3] += square
+        if covered[p] > inside:
+            sums[4] += 1.0
+            sums[5] += weight[p] * square
 
 
 @compiled

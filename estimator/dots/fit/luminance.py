@@ -14,15 +14,22 @@ its derivatives with respect to theta are neglected. The loops over pixels are i
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtri
 
 from telerig.arrays import Array, Bools
 from telerig.estimator.dots.fit.blurred_ellipse import approximate_distance_px, semi_axes
-from telerig.estimator.dots.fit.kernels import descend, normal_equations, predict
+from telerig.estimator.dots.fit.kernels import (
+    covariance_of,
+    descend,
+    normal_equations,
+    predict,
+    residual_sums,
+)
 from telerig.estimator.images.noise import NoiseModel
 from telerig.statistics import NORMAL_FROM_MEDIAN
 
@@ -62,6 +69,12 @@ class Prior:
     sigma_per_px: float = 3e-4
     edge_px: float = 1.0
     edge_spread_px: float = np.inf
+
+    @property
+    def numbers(self) -> Array:
+        """The fields (5,)."""
+        gradient = self.u_per_px, self.v_per_px, self.sigma_per_px
+        return np.array([*gradient, self.edge_px, self.edge_spread_px], np.float64)
 
 
 @dataclass(frozen=True)
@@ -148,7 +161,7 @@ class DotFit:
         beyond = 1.0 - self._by_chance / self.chi2_dof
         return self.edge_residual * float(np.sqrt(beyond)) if beyond > 0.0 else 0.0
 
-    @property
+    @cached_property
     def _by_chance(self) -> float:
         """The largest chi2_dof that counts as noise."""
         return float(chdtri(self.dof, SIGNIFICANT)) / self.dof
@@ -162,17 +175,17 @@ class DotFit:
             chi2_dof=self.chi2_dof / factor,
         )
 
-    @property
+    @cached_property
     def contrast(self) -> float:
         """Contrast [grey] at the dot's centre (negative for a dark dot)."""
         return float(self.levels[3:] @ self._position)
 
-    @property
+    @cached_property
     def background(self) -> float:
         """Background [grey] extrapolated to the dot's centre."""
         return float(self.levels[:3] @ self._position)
 
-    @property
+    @cached_property
     def _position(self) -> Array:
         x, y = (self.centre_px - self.origin_px) / self.radius_px
         return np.array([1.0, x, y])
@@ -182,6 +195,7 @@ _FEW_PIXELS = 1e-9
 """Weight of a prior of 0 for each grey level, relative to one pixel, so that too few pixels still
 have a solution."""
 _INSIDE = 0.9
+_CENTRE_AND_CONTRAST = np.array([0, 1, 9])
 _OUTLIER_SIGMA = 5.0
 _MAX_OUTLIER_SHARE = 0.15
 
@@ -199,7 +213,7 @@ class _Fit:
         self.noise = noise
         self.origin = np.round(start.centre_px) if before is None else before.origin_px
         self.radius = float(semi_axes(start.shape_px)[0] if before is None else before.radius_px)
-        self.prior = np.array(astuple(prior), np.float64)
+        self.prior = prior.numbers
         self.at = np.argwhere(window.mask)
         self.first = np.array([(window.first_u, window.first_v)]) - self.origin
         self.y, self.x = (self.at + self.first[0, ::-1]).T
@@ -264,14 +278,16 @@ class _Fit:
         information, pull = np.empty((12, 12)), np.empty(12)
         normal_equations(self.prior, self.radius, self.parameters, self.residual, self.weight,
                          self.jacobian, information, pull)  # fmt: skip
-        covariance = _inverse(information)
-        used = (self.weight > 0.0) & ~self.noise.is_clipped(self.grey, self.model)
-        squared, theta = self.residual**2, self.parameters[:6]
+        covariance = np.empty((3, 3))
+        covariance_of(information, _CENTRE_AND_CONTRAST, covariance)
+        theta, noise, sums = self.parameters[:6], self.noise, np.empty(6)
         distance = approximate_distance_px(theta[2:5], self.x - theta[0], self.y - theta[1])
-        edge = squared[(np.abs(distance) < 2.0 * theta[5]) & used]
-        inside = used & (self.jacobian[9] > _INSIDE)
-        count = int(np.count_nonzero(used))
-        chi2 = float(np.sum((self.weight * squared)[used]))
+        residual_sums(
+            np.array([noise.alpha, noise.beta, noise.least_variance]),
+            np.array([noise.black, noise.white]), self.model, self.residual, self.weight, distance,
+            self.jacobian[9], 2.0 * theta[5], _INSIDE, sums,
+        )  # fmt: skip
+        count, chi2, edge, edge_squares, inner, inner_chi2 = sums.tolist()
         contrast = max(abs(self.parameters[9]), 1e-12)
         return DotFit(
             theta[:2] + self.origin,
@@ -281,25 +297,15 @@ class _Fit:
             self.origin,
             self.radius,
             covariance[:2, :2],
-            float(np.sqrt(max(covariance[9, 9], 0.0))),
+            float(np.sqrt(max(covariance[2, 2], 0.0))),
             chi2 / max(count - PARAMETERS, 1),
-            len(used),
-            len(used) - count,
-            float(np.sqrt(edge.mean()) / contrast) if edge.size else np.inf,
-            float((self.weight * squared)[inside].mean()) if inside.any() else 1.0,
-            int(np.count_nonzero(inside)),
+            len(self.grey),
+            len(self.grey) - int(count),
+            float(np.sqrt(edge_squares / edge) / contrast) if edge else np.inf,
+            inner_chi2 / inner if inner else 1.0,
+            int(inner),
             converged,
         )
-
-
-def _inverse(information: Array) -> Array:
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    both = np.outer(scale, scale)
-    try:
-        inverse = np.linalg.inv(information / both)
-    except np.linalg.LinAlgError:
-        inverse = np.linalg.pinv(information / both, hermitian=True)
-    return np.asarray(inverse / both)
 
 
 def fit_dot(

@@ -7,6 +7,7 @@ dots: the illumination, and the blur that all dots have in common.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 
 import cv2
 import numpy as np
@@ -54,14 +55,16 @@ def dot_window(
     """
     a, b = semi_axes(start.shape_px)
     reach = 4.0 * start.sigma_px + 2.0
-    outer = float(np.clip(1.3 * np.sqrt(a * b), reach, max(reach, _MAX_MARGIN_PX)))
+    outer = min(max(1.3 * sqrt(a * b), reach), max(reach, _MAX_MARGIN_PX))
     half = extent_px(start.shape_px) + outer
     low = np.maximum(np.floor(start.centre_px - half).astype(int), 0)
     high = np.minimum(np.ceil(start.centre_px + half).astype(int) + 1, grey.shape[::-1])
     crop = np.s_[low[1] : high[1], low[0] : high[0]]
     du = np.arange(low[0], high[0]) - start.centre_px[0]
     dv = np.arange(low[1], high[1]) - start.centre_px[1]
-    distance = approximate_distance_px(start.shape_px, du[None, :], dv[:, None])
+    distance = approximate_distance_px(
+        start.shape_px, np.tile(du, len(dv)), np.repeat(dv, len(du))
+    ).reshape(len(dv), len(du))
     mask: Bools = (distance < outer) & (distance > -max(8.0, reach))
     clear = CLEAR_SIGMA * start.sigma_px
     around = (low, high, int(np.ceil(max(clear, outer))) + 1)

@@ -8,18 +8,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from telerig.io.tables import calibration, run, smoothing
+from telerig.io.tables.declared import TABLES
 from telerig.io.tables.table import CAMERA, Table
 
 PAGE = Path(__file__).parent / "files.md"
 BEGIN, END = "<!-- made by docs/tables.py -->\n", "<!-- end of tables -->\n"
-TABLES = (
-    calibration.DOTS, calibration.RESIDUALS, calibration.REJECTED, calibration.POSITIONS,
-    run.FRAMES, run.STAGE, run.ACCELEROMETER, run.REFERENCES, run.CORRECTIONS,
-    run.DETECTIONS, run.TRACKS, run.EVENTS,
-    smoothing.TRAJECTORIES, smoothing.SHAKE, smoothing.BUBBLES, smoothing.SUMMARY,
-    smoothing.BATCH_BUBBLES,
-)  # fmt: skip
 
 
 def markdown(table: Table) -> str:

@@ -268,6 +268,7 @@ def summary_of(
     frames : of a run of which the solution is the piece in the middle; None for a whole run's.
     sensors : estimates of sensors that are not in this piece, from `sensors_of` of others.
     """
+    from telerig.io.results.cameras import CameraRecord, wall_records
     from telerig.io.results.smoothing import SmoothingFile
 
     graph, whole = solution.graph, frames is None
@@ -276,6 +277,8 @@ def summary_of(
     return {
         "schema": SmoothingFile.SCHEMA,
         "cameras": names,
+        "rig": {n: CameraRecord.of_camera(c).content() for n, c in zip(names, problem.cameras)},
+        "walls": wall_records(problem.cameras),
         "frames": len(problem.t_s) if whole else frames,
         "bubbles": len(evidence.means),
         "model": asdict(model),

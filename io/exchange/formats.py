@@ -132,8 +132,8 @@ def export_results(
 
     source : a dataset, one of its results folders, or a calibration.json.
     run : name of the run; None takes the only one with results.
-    calibration : calibration.json to use in place of the cameras that the run was tracked with, or
-        of the dataset's calibration where the run's folder does not state them.
+    calibration : calibration.json to use in place of the cameras that the run was smoothed or
+        tracked with, or of the dataset's calibration where the run's folder does not state them.
     out : file or folder to write; None writes into the folder results/export of the dataset.
     accept : ("stale",) also exports results whose inputs have changed.
     volume : as for `export_cameras`.

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from telerig.io.results.cameras import CameraRecord, rig_cameras
 from telerig.io.results.record import Name, Part, Record, Vector3
 from telerig.io.results.tracking import RigChange
 from telerig.io.tables.smoothing import AXES
+from telerig.rig.camera import Camera
 
 
 class Verdict(StrEnum):
@@ -35,6 +37,10 @@ RESOLVED_ETA, PARTIAL_ETA = 0.95, 0.75
 """Smallest eta of an axis that is RESOLVED whatever its q, and of one that is PARTIAL. At most 22 %
 of the shake's RMS is then left in the paths, and at most half of it.
 """
+
+
+ZIGZAG_HZ = (3.0, 12.0)
+"""Frequencies (Hz) of a path's spectrum that count as its zigzag, in `Use`."""
 
 
 class Flag(StrEnum):
@@ -238,6 +244,8 @@ class SmoothingFile(Record):
     words, remedy : the verdict as a sentence, and what to do about it.
     vertical, remedies : the axis nearest to the vertical, and the remedy as codes; "" and () in
         older files.
+    rig, walls : the calibrated cameras and refractive windows that the run was smoothed with, by
+        name; empty in older files.
     frames, bubbles : how many were smoothed.
     modes : the vibrations of the rig.
     log_evidence : logarithm of the model's probability density for the data; None if not computed.
@@ -285,6 +293,8 @@ class SmoothingFile(Record):
     modes: tuple[Mode, ...] = ()
     schema_: int = Field(1, alias="schema")
     cameras: tuple[Name, ...] = ()
+    rig: dict[Name, CameraRecord] = Field(default_factory=dict)
+    walls: dict[str, dict[str, Any]] = Field(default_factory=dict)
     frames: int | None = None
     bubbles: int | None = None
     model: dict[str, Any] = Field(default_factory=dict)
@@ -316,3 +326,12 @@ class SmoothingFile(Record):
     seconds: dict[str, float] = Field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     accepted: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _parameters_are_known(self) -> Self:
+        self.rig_cameras()
+        return self
+
+    def rig_cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras that the run was smoothed with; none for an older file."""
+        return rig_cameras(self.rig, self.walls)

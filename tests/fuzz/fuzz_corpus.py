@@ -23,6 +23,8 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.io.files.csv_table import write_table
 from telerig.io.recording.simulated.devices import practice_devices
 from telerig.io.simulation.presets import run_preset
+from telerig.io.tables.calibration import REJECTED
+from telerig.io.tables.run import CORRECTIONS
 
 SIZE_PX = (48, 32)
 _SENSOR_ROWS = 60
@@ -59,6 +61,12 @@ def _dataset(folder: Path, rng: np.random.Generator) -> None:
     record = {"command": "track", "telerig": "1", "seconds": {"all": 1.0}, "options": {},
               "inputs_sha256": {"runs/S2/frames.csv": "0" * 64}}  # fmt: skip
     (results / "S2" / "run.json").write_text(json.dumps(record))
+    rejected = pd.DataFrame(columns=REJECTED.names())
+    rejected.loc[0] = ["view00", "left", 10.0, 12.0, 3.0, 2.0, 0.1, "no neighbours"]
+    write_table(rejected, results / "calibration" / "rejected.csv")
+    corrections = pd.DataFrame(columns=CORRECTIONS.names())
+    corrections.loc[0] = ["drop", "0", "", "", "a reflection"]
+    write_table(corrections, folder / "runs" / "S2" / "corrections.csv")
     (folder / "runs" / "S2" / "run.toml").write_text("frame_rate_hz = 500.0\nstart_s = 0.0\n")
     _stage_axis(folder, calibration)
     shutil.copytree(results / "S2", folder.parent / "kept")
@@ -246,3 +254,7 @@ def _batch(folder: Path) -> None:
         for kind, run in (("calibrate", ""), ("track", "rise"), ("smooth", "rise"))
     ]  # fmt: skip
     (folder / "batch.json").write_text(json.dumps({"jobs": jobs}))
+    bubbles = pd.read_csv(folder.parent / "set" / "results" / "S2" / "bubble_summary.csv")
+    bubbles.insert(0, "run", "rise")
+    bubbles.insert(0, "dataset", "/data/tank")
+    write_table(bubbles, folder / "bubbles.csv")

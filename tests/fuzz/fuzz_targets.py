@@ -1,11 +1,13 @@
-"""List every file that telerig reads, with a function that reads it through public names.
+"""Every file that telerig reads, with a function that reads it through public names.
+
+Tables are taken from their declarations (`targets_of`), other files from the list.
 
 A function returns what was read; every number in it must be finite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +55,12 @@ def _dots(file: Path) -> Any:
     return telerig.load_dataset(file.parents[1]).dots()
 
 
+def _corrections(file: Path) -> Any:
+    from telerig.estimator.tracking.corrections import read_corrections
+
+    read_corrections(file.parent, numbered=True)
+
+
 def _truth(file: Path) -> Any:
     import telerig
 
@@ -95,21 +103,12 @@ def _image(file: Path) -> Any:
 
 
 def _frames(file: Path) -> Any:
-    """All frames are tried before the first error is raised."""
-    from telerig.errors import InputError
     from telerig.io.images.frames import open_frames
 
     source = open_frames(file.parent, file.stem)
     assert source is not None
-    found, errors = [], []
-    for position in range(min(len(source), _MOST_FRAMES)):
-        try:
-            found.append(source.read(position))
-        except InputError as error:
-            errors.append(error)
-    for error in errors:
-        raise error
-    return found
+    places = range(min(len(source), _MOST_FRAMES))
+    return _by_all([lambda _, place=place: source.read(place) for place in places])(file)
 
 
 def _calibration(file: Path) -> Any:
@@ -141,7 +140,8 @@ def _calibration_folder(file: Path) -> Any:
     from telerig.io.results.folders.calibration import read_calibration_results
 
     found = read_calibration_results(file.parent)
-    return [found.points_mm, found.joint[1], found.residuals[["u_px", "v_px", "du_px", "dv_px"]]]
+    sure = found.residuals[["u_px", "v_px", "du_px", "dv_px"]]
+    return [found.points_mm, found.joint[1], sure, len(found.rejected)]
 
 
 def _tracks(file: Path) -> Any:
@@ -242,18 +242,60 @@ _CALIBRATED = "set/results/calibration"
 _IMAGES = ("grey8.tif", "grey16.tif", "packed.tif", "tiles.tif", "big.tif", "float.tif", "grey.png",
            "grey16.png", "grey.bmp", "grey.jpg")  # fmt: skip
 
+_TABLES: dict[str, tuple[Callable[[Path], Any], ...]] = {
+    "set/calibration": (_dots,),
+    "set/stage_axis": (_stage_axis,),
+    _RUN: (_run, _corrections),
+    _CALIBRATED: (_calibration_folder,),
+    _TRACKED: (_tracks, _track_report, _smoothing_report),
+    "batch": (_batch,),
+}
+"""What reads the tables of a folder."""
+
+
+def targets_of(corpus: Path) -> dict[str, Target]:
+    """Return all targets whose file is in the corpus; every declared table is one where it lies.
+
+    Raises AssertionError where the corpus lacks a declared table.
+    """
+    from telerig.io.tables.declared import TABLES
+
+    lying: dict[str, list[str]] = {}
+    for folder in _TABLES:
+        for file in (corpus / folder).glob("*.csv"):
+            lying.setdefault(file.name, []).append(f"{folder}/{file.name}")
+    names = {Path(name.split()[0]).name for table in TABLES for name in table.file.split(", ")}
+    assert not names - set(lying), f"the corpus lacks {names - set(lying)}"
+    tables = {
+        file: Target(file, "csv", _by_all(_TABLES[str(Path(file).parent)]), 1.5)
+        for file in sorted(file for name in names for file in lying[name])
+    }
+    return {n: t for n, t in (TARGETS | tables).items() if (corpus / t.file).is_file()}
+
+
+def _by_all(readers: Sequence[Callable[[Path], Any]]) -> Callable[[Path], Any]:
+    """Return a reader that tries all readers before the first error is raised."""
+
+    def read(file: Path) -> Any:
+        from telerig.errors import TelerigError
+
+        found, errors = [], []
+        for reader in readers:
+            try:
+                found.append(reader(file))
+            except TelerigError as error:
+                errors.append(error)
+        for error in errors:
+            raise error
+        return found
+
+    return read
+
+
 TARGETS = {
     "rig": Target("set/rig.toml", "toml", _rig_toml, 3),
-    "dots": Target("set/calibration/dots.csv", "csv", _dots, 2),
     "truth": Target("set/truth/truth.json", "json", _truth),
-    "stage positions": Target("set/stage_axis/positions.csv", "csv", _stage_axis, 0.5),
-    "stage dots": Target("set/stage_axis/dots.csv", "csv", _stage_axis, 0.5),
     "run.toml": Target(f"{_RUN}/run.toml", "toml", _run_toml),
-    "frames": Target(f"{_RUN}/frames.csv", "csv", _run),
-    "stage": Target(f"{_RUN}/stage.csv", "csv", _run),
-    "accelerometer": Target(f"{_RUN}/accelerometer.csv", "csv", _run),
-    "detections": Target(f"{_RUN}/detections.csv", "csv", _run, 2),
-    "references": Target(f"{_RUN}/references.csv", "csv", _run),
     **{name: Target(f"images/{name}", "binary", _image) for name in _IMAGES},
     "pages": Target("film/pages.tif", "binary", _frames, 2),
     "stack": Target("film/stack.tif", "binary", _frames, 2),
@@ -269,20 +311,10 @@ TARGETS = {
     "to OpenCV": Target(f"{_CALIBRATED}/calibration.json", "json", _cameras_to("opencv"), 0.5),
     "covariance": Target(f"{_CALIBRATED}/covariance.npz", "binary", _calibration, 2),
     "calibration report": Target(f"{_CALIBRATED}/calibration.json", "json", _calibration_folder),
-    "measured dots": Target(f"{_CALIBRATED}/dots.csv", "csv", _calibration_folder),
-    "residuals": Target(f"{_CALIBRATED}/residuals.csv", "csv", _calibration_folder),
     "comparison": Target(f"{_CALIBRATED}/comparison.json", "json", _calibration_folder),
     "tracking": Target(f"{_TRACKED}/tracking.json", "json", _track_report, 2),
     "run.json": Target(f"{_TRACKED}/run.json", "json", _track_report),
-    "tracks": Target(f"{_TRACKED}/tracks.csv", "csv", _tracks, 2),
-    "tracks report": Target(f"{_TRACKED}/tracks.csv", "csv", _track_report),
-    "found bubbles": Target(f"{_TRACKED}/detections.csv", "csv", _tracks),
-    "bubbles report": Target(f"{_TRACKED}/detections.csv", "csv", _track_report),
-    "events": Target(f"{_TRACKED}/events.csv", "csv", _tracks),
-    "events report": Target(f"{_TRACKED}/events.csv", "csv", _track_report),
     "smoothing": Target(f"{_TRACKED}/smoothing.json", "json", _smoothing_report, 2),
-    "trajectories": Target(f"{_TRACKED}/trajectories.csv", "csv", _smoothing_report),
-    "shake": Target(f"{_TRACKED}/shake.csv", "csv", _smoothing_report),
     "manifest": Target("kept/manifest.json", "json", _tracks, 2),
     "manifest report": Target("kept/manifest.json", "json", _smoothing_report),
     "to HDF5": Target(f"{_TRACKED}/trajectories.csv", "csv", _run_to("hdf5"), 0.5),

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from fuzz_targets import EXPORTED, TARGETS, Target
+from fuzz_targets import EXPORTED, Target, targets_of
 from mutators import mutated
 
 from telerig.errors import InputError, TelerigError
@@ -42,11 +42,11 @@ class Fault(AssertionError):
     """A case broke a rule other than that only telerig's errors are raised."""
 
 
-def chosen(case: int) -> str:
+def chosen(case: int, targets: dict[str, Target]) -> str:
     """Return the name of a case's target."""
     rng = np.random.default_rng([case, 8])
-    names = list(TARGETS)
-    shares = np.array([TARGETS[name].share for name in names])
+    names = list(targets)
+    shares = np.array([targets[name].share for name in names])
     return names[rng.choice(len(names), p=shares / shares.sum())]
 
 
@@ -144,17 +144,14 @@ def main(corpus: Path, work: Path, begin: int, end: int, only: str = "") -> None
     os.dup2(2, 1)
     folder = work / "case"
     shutil.copytree(corpus, folder)
-    for target in TARGETS.values():  # loads libraries, and shows that the corpus is sound
-        file = folder / target.file
-        if file.is_file():
-            result, words = outcome(target, file, work)
-            assert result == "read", (target.file, words)
+    targets = targets_of(corpus)
+    for target in targets.values():  # loads libraries, and shows that the corpus is sound
+        result, words = outcome(target, folder / target.file, work)
+        assert result == "read", (target.file, words)
     for case in range(begin, end):
-        name = only.split(",")[case % (only.count(",") + 1)] or chosen(case)
-        target = TARGETS[name]
+        name = only.split(",")[case % (only.count(",") + 1)] or chosen(case, targets)
+        target = targets[name]
         file = folder / target.file
-        if not file.is_file():
-            continue
         answers.write(json.dumps({"case": case, "target": name}) + "\n")
         sound = (corpus / target.file).read_bytes()
         content = mutated(

@@ -15,14 +15,13 @@ from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.draws import DRAWS, Draws
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance, offset_sigma
-from telerig.io.results.smoothing import Grade, Quantity, Use
+from telerig.io.results.smoothing import ZIGZAG_HZ, Grade, Quantity, Use
 from telerig.io.tables.smoothing import AXES
 
 GOOD, LIMITED = 10.0, 3.0
 """Signal over standard deviation from which a quantity is called good, or limited."""
 _MOST_BUBBLES, _LEAST_FRAMES = 5, 20
 _CLEAR_POWER = 9.0
-_ZIGZAG_HZ = (3.0, 12.0)
 _LEAST_PERIODS = 3.0
 _LEAST_SHARE = 0.3
 
@@ -187,11 +186,11 @@ def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
 
 def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Return frequency (Hz) and amplitude (mm) of the zigzag with their sd, or None."""
-    if path.span_s * _ZIGZAG_HZ[0] < _LEAST_PERIODS:
+    if path.span_s * ZIGZAG_HZ[0] < _LEAST_PERIODS:
         return None
     place, error = path.place[:, axis], path.errors[:, axis]
     frequency, power = path.spectrum(place)
-    band = (frequency >= _ZIGZAG_HZ[0]) & (frequency <= _ZIGZAG_HZ[1])
+    band = (frequency >= ZIGZAG_HZ[0]) & (frequency <= ZIGZAG_HZ[1])
     if not band.any() or power[band].sum() < _LEAST_SHARE * power.sum():
         return None
     measure = _swing(frequency, band)

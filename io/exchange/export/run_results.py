@@ -46,7 +46,8 @@ class RunResults:
     source : the name of the file from which ``points`` was read.
     accepted : why the results are stale, if they were read although they are.
     folder : the results folder from which they were read; None for a run in memory.
-    cameras : those that the run was tracked with; empty where the folder does not state them.
+    cameras : those that the run was smoothed or tracked with; empty where the folder does not state
+        them.
     """
 
     name: str
@@ -85,6 +86,9 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
     tracked, lab = TrackResults(place), SmoothingResults(place)
     smoothed = source == "trajectories.csv"
     points = lab.trajectories if smoothed else tracked.tracks
+    cameras = lab.file.rig_cameras() if smoothed else ()
+    if not cameras and tracked.has("tracking.json"):
+        cameras = tracked.file.rig_cameras()
     if not len(points):
         raise InputError("has no rows below its header", where=str(place / source))
     return RunResults(
@@ -96,7 +100,7 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
         source=source,
         accepted=accepted,
         folder=place,
-        cameras=tracked.file.rig_cameras() if tracked.has("tracking.json") else (),
+        cameras=cameras,
     )
 
 

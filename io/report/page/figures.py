@@ -45,7 +45,7 @@ class Figure:
         raises InputError is left out.
     caption : what to look for.
     space : the axes are 3-D. grid : lines behind the data. inline : the page holds the elements of
-        the SVG, which its scripts reach.
+        the SVG, which its scripts reach; not of a figure of many points, which is an image.
     """
 
     title: str
@@ -90,10 +90,10 @@ def drawn(figure: Figure) -> Picture | None:
             _add_legend(sheet, axes)
         for text in sheet.findobj(Text):
             text.set_text(no_formula(text.get_text()))
-        source = png(sheet, _DPI, _SHADES) if _points(axes) > _MANY else svg(sheet)
-    if figure.inline:
-        return Picture(figure.title, source, figure.caption, svg_text(source))
-    return Picture(figure.title, source, figure.caption)
+        many = _points(axes) > _MANY
+        source = png(sheet, _DPI, _SHADES) if many else svg(sheet)
+    text = svg_text(source) if figure.inline and not many else ""
+    return Picture(figure.title, source, figure.caption, text)
 
 
 def _sheet(figure: Figure) -> tuple[Any, Any]:

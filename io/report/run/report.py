@@ -214,8 +214,9 @@ def _uses(results: SmoothingResults) -> list[Block]:
         "Median of the longest bubbles, in rig axes. Good: the value is at least ten times its "
         "standard deviation; limited: three times. A velocity in a frame and a path are given by "
         "their RMS, the path about a straight line and up to the frequency at which its power "
-        "falls below nine times that of its errors, a zigzag by its spectrum, which is as wide as "
-        "the record is short. Nothing in the run confirms the sign, unit and "
+        "falls below nine times that of its errors, a zigzag by the spectrum of the path, which is "
+        "as wide as the record is short; the strongest oscillation of each bubble stands under "
+        "Bubbles. Nothing in the run confirms the sign, unit and "
         "scale of what a value rests on."
     )
     if not rows:

@@ -201,9 +201,11 @@ def read_track_results(folder: Path) -> TrackResults:
     results = TrackResults(folder)
     with reading(folder, TrackResults.FILES):
         file = folder / "tracks.csv"
-        lacking = [n for n in _needed(results.cameras) if n not in results.tracks]
-        if lacking:
-            what = f"has no column {lacking[0]}, which a page needs"
+        needed = [one.name for one in TRACKS.of(results.cameras) if one.required]
+        lacking = [name for name in needed if name not in results.tracks]
+        if lacking or not results.cameras:
+            named = repr(lacking[0]) if lacking else "of a camera's pixels, like 'left_u_px'"
+            what = f"has no column {named}, which a page needs"
             raise InputError(what, where=f"{file} row 1", todo=TrackingFile.AGAIN)
         for table, place in (
             (results.tracks, file),
@@ -220,11 +222,6 @@ def read_track_results(folder: Path) -> TrackResults:
                 )
         _ = results.rig, results.events, results.references, results.run, results.up
     return results
-
-
-def _needed(cameras: tuple[str, ...]) -> list[str]:
-    """Return the columns of tracks.csv without which there is no page."""
-    return [one.name for one in TRACKS.of(cameras or ("CAMERA",)) if one.required]
 
 
 def unit_vector(vector: ArrayLike) -> Array:

@@ -229,10 +229,16 @@ def test_only_the_results_of_runs_are_taken_for_runs(folder: Path, tmp_path: Pat
         run_folder(elsewhere, None)
 
 
-def test_cameras_are_those_that_the_run_was_tracked_with(folder: Path) -> None:
+@pytest.mark.parametrize("smoothed", [False, True])
+def test_cameras_are_those_of_the_results_folder(folder: Path, smoothed: bool) -> None:
+    """Smoothed with --out elsewhere, a folder has smoothing.json alone."""
     own = Camera.create("left", (512, 500), 11.0)
-    said = {"kind": "telerig tracks", "cameras": {"left": CameraRecord.of_camera(own).content()}}
-    (folder / "tracking.json").write_text(json.dumps(said))
+    rig = {"left": CameraRecord.of_camera(own).content()}
+    if smoothed:
+        (folder / "smoothing.json").write_text(json.dumps({"rig": rig}))
+    else:
+        said = {"kind": "telerig tracks", "cameras": rig}
+        (folder / "tracking.json").write_text(json.dumps(said))
     beside = folder.parent / "calibration"
     beside.mkdir()
     (beside / "calibration.json").write_text("{")

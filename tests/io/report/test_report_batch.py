@@ -81,6 +81,19 @@ def test_bubbles_of_all_runs_are_drawn_by_run(tmp_path: Path) -> None:
     assert "6 bubbles of 2 runs" in section
 
 
+def test_figures_of_thousands_of_bubbles_are_images(tmp_path: Path) -> None:
+    folder = _write(tmp_path / "out", [_job("smooth", "rise", verdict="RESOLVED")])
+    rows = pd.DataFrame(index=range(4100), columns=BATCH_BUBBLES.names(), dtype=float)
+    rows = rows.assign(
+        dataset="/data/tank", run="rise", particle=np.arange(4100), first_frame=0, last_frame=9,
+        frames=10, d_eq_mm=np.linspace(1.5, 4.0, 4100), sd_eq_mm=0.02, slip_mm_s=240.0,
+        s_slip_mm_s=2.0,
+    )  # fmt: skip
+    write_table(rows, folder / "bubbles.csv")
+    text = write_batch_report(folder).read_text(encoding="utf-8")
+    assert "data:image/png" in text and "4100 bubbles of 1 run" in text
+
+
 def test_the_headline_names_what_failed_and_short_names_tell_datasets_apart(tmp_path: Path) -> None:
     places = ["/a/x/tank", "/b/x/tank", "/b/pool"]
     assert short_names(places) == dict(zip(places, ("a/x/tank", "b/x/tank", "pool")))

@@ -249,6 +249,15 @@ def test_pages_and_load_tracks_read_by_the_same_rules(folder: Path) -> None:
             read(folder)
 
 
+def test_tracks_without_columns_of_cameras_have_no_page(folder: Path) -> None:
+    table = pd.read_csv(folder / "tracks.csv")
+    bare = table[[name for name in table if not name.startswith(("left_", "right_"))]]
+    bare.to_csv(folder / "tracks.csv", index=False)
+    _edit(folder, frames_without_bubbles={})
+    with pytest.raises(InputError, match="of a camera's pixels, like 'left_u_px'"):
+        read_track_results(folder)
+
+
 def test_quick_and_strict_reading_agree(folder: Path) -> None:
     quick = read_track_results(folder)
     for name in ("tracks", "detections"):

@@ -10,6 +10,7 @@ from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.solver.problem import DOTS_FREE, checked_outlier_sd
 from telerig.estimator.calibration.thresholds import OUTLIER_SD
 from telerig.io.results.findings import Code, Finding
+from telerig.io.tables.table import EDGE_COVARIANCE, PIXEL_COVARIANCE
 from telerig.progress import Progress, showing_progress
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import AUTO, Model, checked_model, models_by_camera
@@ -245,7 +246,7 @@ def _with_findings(calibration: Calibration, more: Sequence[Finding]) -> Calibra
 
 def _with_measured(calibration: Calibration, table: pd.DataFrame) -> Calibration:
     """Put the covariance and chi-square of the image fit beside the dots."""
-    columns = ["suu_px2", "suv_px2", "svv_px2", "chi2_dof"]
+    columns = [*PIXEL_COVARIANCE, *EDGE_COVARIANCE, "chi2_dof"]
     measured = table.reindex(columns=["view", "camera", "dot", *columns]).copy()
     measured["view"] = measured["view"].astype(str)
     dots = calibration.dots.merge(measured, on=["view", "camera", "dot"], how="left")

@@ -26,11 +26,12 @@ from telerig.estimator.dots.locate import REJECTED, DotMeasurement, measure_dots
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
 from telerig.io.results.findings import Code, Finding
+from telerig.io.tables.table import EDGE_COVARIANCE, PIXEL_COVARIANCE
 from telerig.rig.target import Target, check_handedness
 
 MEASURED = [
-    *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"),
-    *("a_px", "b_px", "angle_rad", "chi2_dof"),
+    *("u_px", "v_px", *PIXEL_COVARIANCE),
+    *("a_px", "b_px", "angle_rad", "chi2_dof", *EDGE_COVARIANCE),
 ]
 
 
@@ -53,7 +54,8 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     """Find the target's dots in an image (rows, columns) of grey levels and number them.
 
     Returns a table with a row for each dot and the columns dot (number), row, column, u_px, v_px,
-    suu_px2, suv_px2, svv_px2, a_px, b_px, angle_rad, chi2_dof; see `locate_dots`. For a symmetric
+    suu_px2, suv_px2, svv_px2, a_px, b_px, angle_rad, chi2_dof, edge_suu_px2, edge_suv_px2,
+    edge_svv_px2; see `locate_dots`. For a symmetric
     target without marks it holds one of several equal numberings.
     Raises DetectionError if the target is not found or its numbers are ambiguous, and InputError if
     ``image`` is no grey image.

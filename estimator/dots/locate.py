@@ -17,7 +17,11 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Float32
 from telerig.errors import InputError
-from telerig.estimator.dots.fit.blurred_ellipse import PIXEL_VARIANCE_PX2, axes_from_shape
+from telerig.estimator.dots.fit.blurred_ellipse import (
+    PIXEL_VARIANCE_PX2,
+    axes_from_shape,
+    matrix_from_shape,
+)
 from telerig.estimator.dots.fit.candidates import (
     Candidate,
     Candidates,
@@ -31,6 +35,7 @@ from telerig.estimator.dots.fit.candidates import (
     reason_against_fit,
 )
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dot
+from telerig.estimator.dots.fit.rim import centre_shift
 from telerig.estimator.dots.fit.surroundings import (
     close_neighbours,
     dot_window,
@@ -48,10 +53,13 @@ from telerig.estimator.images.noise import (
     with_inner_level,
 )
 from telerig.io.machine.parallel import keep_freed_memory
+from telerig.io.tables.table import EDGE_COVARIANCE, PIXEL_COVARIANCE
 
 COLUMNS = [
-    *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2", "a_px", "b_px", "angle_rad", "chi2_dof"),
+    *("u_px", "v_px", *PIXEL_COVARIANCE),
+    *("a_px", "b_px", "angle_rad", "chi2_dof"),
     *("inner_level", "outer_level", "blur_px", "ring", "noise"),
+    *EDGE_COVARIANCE,
 ]
 REJECTED = ["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"]
 
@@ -97,7 +105,9 @@ def locate_dots(
     semi-axes; ``angle_rad`` angle of the major axis from +u towards +v; ``chi2_dof`` chi-square per
     degree of freedom of the fit; ``inner_level``, ``outer_level`` grey levels of the dot and of the
     background; ``blur_px`` standard deviation of the optical blur; ``ring`` whether it is a mark
-    with a hole; ``noise`` standard deviation of a grey level.
+    with a hole; ``noise`` standard deviation of a grey level; ``edge_suu_px2``, ``edge_suv_px2``,
+    ``edge_svv_px2`` the part of the covariance that comes from rough edges of the dots
+    (`fit.rim`): it is the same in all images of a dot.
     Raises InputError for anything but a 2-D array of finite numbers.
     """
     return measure_dots(image, polarity=polarity, min_diameter_px=min_diameter_px).dots
@@ -168,13 +178,14 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     )
     fits, noise = [fit.under_noise(factor) for fit in fits], noise.scaled(factor)
     look = look.with_fits(fits)
+    rough = _roughness(fits)
     accepted: list[tuple[Any, ...]] = []
     for blob, fit in zip(blobs, fits):
         reason = reason_against_fit(blob, fit, grey.shape, found.polarity, look)
         if reason:
             rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
         else:
-            accepted.append(_row(blob, fit, noise))
+            accepted.append(_row(blob, fit, noise, rough))
     return DotMeasurement(
         pd.DataFrame(accepted, columns=COLUMNS),
         pd.DataFrame(rejected, columns=REJECTED),
@@ -184,13 +195,25 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     )
 
 
-def _row(blob: Candidate, fit: DotFit, noise: NoiseModel) -> tuple[Any, ...]:
+def _row(blob: Candidate, fit: DotFit, noise: NoiseModel, rough: float) -> tuple[Any, ...]:
     """Return the values of the columns `COLUMNS` of an accepted dot."""
     blur = float(np.sqrt(max(fit.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0)))
-    (suu, suv), (_, svv) = fit.inflated_covariance_px2
+    axes = rough * matrix_from_shape(fit.shape_px)
+    edge = axes @ axes
+    (suu, suv), (_, svv) = fit.inflated_covariance_px2 + edge
     place = (*fit.centre_px, suu, suv, svv, *axes_from_shape(fit.shape_px), fit.chi2_dof)
     levels = (fit.background + fit.contrast, fit.background)
-    return (*place, *levels, blur, is_ring(blob), noise.sigma_at(fit.background))
+    own = edge[[0, 0, 1], [0, 1, 1]]
+    return (*place, *levels, blur, is_ring(blob), noise.sigma_at(fit.background), *own)
+
+
+def _roughness(fits: list[DotFit]) -> float:
+    """Return `centre_shift` of fitted dots."""
+    seen = [fit for fit in fits if fit.converged and np.all(np.isfinite(fit.edge_variance))]
+    if not seen:
+        return 0.0
+    names = ("edge", "edge_variance", "centre_px", "shape_px", "sigma_px")
+    return centre_shift(*(np.array([getattr(fit, name) for fit in seen]) for name in names))
 
 
 def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel:
@@ -237,7 +260,7 @@ class _Scene:
                 window = self._window(i, fits, neighbours[i])
                 if np.count_nonzero(window.mask) < _FEWEST_PIXELS:
                     continue
-                fit = fit_dot(window, _start(fits[i]), noise, priors[i])
+                fit = fit_dot(window, _start(fits[i]), noise, priors[i], edges=True)
                 if neighbours[i] and _has_moved(fits[i], fit):
                     moved |= {i, *neighbours[i]}
                 fits[i] = fit

@@ -22,7 +22,7 @@ from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.io.tables.calibration import DOTS
 from telerig.io.tables.run import ACCELEROMETER, DETECTIONS, FRAMES, REFERENCES, STAGE
-from telerig.io.tables.table import OF_PIXELS, PIXEL, PIXEL_COVARIANCE
+from telerig.io.tables.table import EDGE_COVARIANCE, OF_PIXELS, PIXEL, PIXEL_COVARIANCE
 from telerig.rig.target import Target
 
 AnySource = TypeVar("AnySource", bound=str)
@@ -64,8 +64,9 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
 
     Returns one row per dot with the columns `DOTS_COLUMNS`: view and camera (text), dot (its number
     on `rig.target`), row, column, the centre u_px, v_px, its covariance suu_px2, suv_px2, svv_px2;
-    and chi2_dof if the file has it. The covariance is computed by `fill_covariance`, from
-    `DEFAULT_SIGMA_PX` where the file states none; ``attrs["sigma_known"]`` is True when it does.
+    and chi2_dof and the edge's part of the covariance (`EDGE_COVARIANCE`) if the file has them. The
+    covariance is computed by `fill_covariance`, from `DEFAULT_SIGMA_PX` where the file states none;
+    ``attrs["sigma_known"]`` is True when it does.
     On an unbounded target the numbers are computed from row and column, which the file must have.
     Raises InputError, with row and column, for impossible values and a dot twice in one image.
     """
@@ -84,7 +85,7 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
         table["dot"] = rig.target.id_from_row_column(table["row"], table["column"])
     _check_repeats(table, rig.target, file)
     known = fill_covariance(table, file, DEFAULT_SIGMA_PX, of="the dot's centre")
-    columns = DOTS_COLUMNS + [name for name in ("chi2_dof",) if name in table]
+    columns = DOTS_COLUMNS + [name for name in ("chi2_dof", *EDGE_COVARIANCE) if name in table]
     dots = table[columns].reset_index(drop=True)
     dots.attrs["sigma_known"] = known
     return dots

@@ -7,6 +7,7 @@ from dataclasses import replace
 from telerig.io.files.csv_table import Column
 from telerig.io.tables.table import (
     CAMERA_NAME,
+    EDGE_COVARIANCE,
     OF_PIXELS,
     PIXEL,
     VIEW,
@@ -31,6 +32,8 @@ DOTS = Table(
         VIEW, CAMERA_NAME, _DOT, *(replace(one, required=False) for one in _PLACE),
         *sure(PIXEL, "px", "centre of the dot's image, as measured"), *OF_PIXELS,
         *may("chi2_dof", "", "chi-square per degree of freedom of the luminance fit"),
+        *may(EDGE_COVARIANCE, "px2", "part of the covariance from rough edges of the dots: it is "
+             " the same in all images of a dot, so it counts as an error of its place"),
     ),
 )  # fmt: skip
 

@@ -24,6 +24,7 @@ from telerig.estimator.calibration.thresholds import (
     OUTLIER_SD,
 )
 from telerig.factors.calibration import Observations, State, pixels
+from telerig.io.tables.table import EDGE_COVARIANCE
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX, LENS_PARAMETERS, parameters_of
 from telerig.rig.pose import Pose
@@ -262,7 +263,9 @@ def cameras_from_state(problem: Problem, state: State) -> tuple[Camera, ...]:
 def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Target) -> Problem:
     """Return a `Problem` with every measured dot, in which only the scales of the cameras are free.
 
-    dots : table with the columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2. Raises
+    dots : table with the columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2. What a
+    rough edge adds to the covariance (edge_suu_px2, ...) is the same in all images of a dot: it is
+    an error of the dot's place in the plane, as one of the print. Raises
     InputError for values or covariances that are impossible, unknown cameras or dots, and repeated
     rows; CalibrationError for no dots, and for a scale that is never seen or contradicts the
     nominal positions.
@@ -285,6 +288,13 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
     covariance[:, 1, 1] = table["svv_px2"]
     covariance[:, 0, 1] = covariance[:, 1, 0] = table["suv_px2"]
     sigma = [target.print_sigma_mm, target.print_sigma_mm, target.flatness_sigma_mm]
+    if set(EDGE_COVARIANCE) <= set(table):
+        parts = table[list(EDGE_COVARIANCE)].fillna(0.0).to_numpy(float)
+        edge = parts[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        covariance -= edge
+        scale = np.array([c["scale_px_per_mm"] for c in cameras])[camera[order]]
+        edge_mm = np.sqrt(np.linalg.eigvalsh(edge)[:, 1]) / scale
+        sigma[:2] = 2 * [float(np.hypot(target.print_sigma_mm, np.median(edge_mm)))]
     return Problem(
         cameras=tuple(cameras),
         target=target,

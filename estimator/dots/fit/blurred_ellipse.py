@@ -38,6 +38,12 @@ def axes_from_shape(shape_px: ArrayLike) -> Array:
     return np.stack([*semi_axes(shape), angle], axis=-1)
 
 
+def matrix_from_shape(shape_px: ArrayLike) -> Array:
+    """Return the symmetric matrices M (..., 2, 2) in px of shape numbers (..., 3)."""
+    shape = np.asarray(shape_px, dtype=np.float64)
+    return shape[..., [0, 1, 1, 2]].reshape(*shape.shape[:-1], 2, 2)
+
+
 def extent_px(shape_px: Array) -> Array:
     """Return half the width and half the height (..., 2) in px of ellipses' bounding boxes.
 

@@ -318,6 +318,9 @@ REFUSED = 1e-4
 OUTLINE_PX, OUTLINE_SD = 0.3, (0.02, 0.004)
 """RMS distance of a dot's outline from the ellipse of its blob, as pixels are drawn; and standard
 deviation of its excess, in px and per semi-minor axis."""
+ROUGH_SPREAD = 0.3
+"""Standard deviation of the excess where most outlines are uneven, as a share of its median: the
+RMS of the six harmonics or so of a rough edge that an outline shows."""
 LOG_SPREAD = 0.25
 """Least standard deviation of log radius and log contrast of the dots of one image: marks are up to
 twice as large as dots, and light falls off towards the corners."""
@@ -335,25 +338,34 @@ _HOLE_SHARE = 0.02
 """Least share of a ring's area that is hole; specks of dust are smaller."""
 
 
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][min(np.searchsorted(total, 0.5 * total[-1]), len(values) - 1)])
+
+
 @dataclass(frozen=True)
 class Look:
-    """How the dots of an image look: medians of log radius (px), log contrast and misfit, and the
-    spread of the contrast. The radius is that of the blobs weighted by area, so that specks do not
-    count."""
+    """How the dots of an image look: medians of log radius (px), unevenness, log contrast and
+    misfit, and the spreads of the latter three. Radius and unevenness are those of the blobs
+    weighted by area, so that specks do not count."""
 
     log_radius: float
+    unevenness: float = 0.0
     misfit: float = MODEL_RESIDUAL
+    misfit_spread: float = LOG_MISFIT
     log_contrast: float = 0.0
     contrast_spread: float = LOG_SPREAD
 
     @classmethod
     def of_blobs(cls, found: Candidates) -> Look:
         """Return the look of the blobs that may be dots."""
-        areas = np.sort([blob.area_px2 for blob in found.promising])
+        areas = np.array([blob.area_px2 for blob in found.promising])
         if areas.size == 0:
             return cls(-np.inf)
-        middle = np.searchsorted(np.cumsum(areas), 0.5 * np.sum(areas))
-        return cls(0.5 * float(np.log(areas[min(middle, areas.size - 1)] / np.pi)))
+        uneven = np.array([blob.unevenness for blob in found.promising])
+        area = _weighted_median(areas, areas)
+        return cls(0.5 * float(np.log(area / np.pi)), _weighted_median(uneven, areas))
 
     def with_fits(self, fits: Sequence[DotFit]) -> Look:
         """Return the look with the contrasts and misfits of fitted dots."""
@@ -363,7 +375,12 @@ class Look:
         middle = float(np.median(logs))
         spread = max(LOG_SPREAD, float(robust_sd(logs - middle)))
         misfits = [fit.misfit for fit in fits] + MODEL_RESIDUAL_DOTS * [MODEL_RESIDUAL]
-        return Look(self.log_radius, float(np.median(misfits)), middle, spread)
+        misfit = float(np.median(misfits))
+        scatter = max(
+            LOG_MISFIT,
+            float(robust_sd(np.log((np.array(misfits) + LEAST_MISFIT) / (misfit + LEAST_MISFIT)))),
+        )
+        return Look(self.log_radius, self.unevenness, misfit, scatter, middle, spread)
 
 
 def is_unlike(deviations: ArrayLike) -> Bools:
@@ -433,7 +450,7 @@ def reason_against_fit(
         **_of_blob(blob, look),
         Reason.MISPLACED: max(way, float(np.abs(np.log(axes / own)).max())) / LOG_FITTED,
         Reason.FAINT: max(float(-faint), 0.0) / look.contrast_spread,
-        Reason.MISFIT: max(float(misfit), 0.0) / LOG_MISFIT,
+        Reason.MISFIT: max(float(misfit), 0.0) / look.misfit_spread,
     })  # fmt: skip
 
 
@@ -441,6 +458,7 @@ def _of_blob(blob: Candidate, look: Look) -> dict[Reason, float]:
     """Return how many standard deviations a blob's outline and size are from those of a dot."""
     smaller = look.log_radius - 0.5 * np.log(blob.area_px2 / np.pi)
     return {
-        Reason.NOT_ELLIPSE: blob.unevenness,
+        Reason.NOT_ELLIPSE: max(blob.unevenness - look.unevenness, 0.0)
+        / max(1.0, ROUGH_SPREAD * look.unevenness),
         Reason.MUCH_SMALLER: max(float(smaller), 0.0) / LOG_SPREAD,
     }

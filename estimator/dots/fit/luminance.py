@@ -30,6 +30,7 @@ from telerig.estimator.dots.fit.kernels import (
     predict,
     residual_sums,
 )
+from telerig.estimator.dots.fit.rim import NO_EDGE, edge_harmonics
 from telerig.estimator.images.noise import NoiseModel
 from telerig.statistics import NORMAL_FROM_MEDIAN
 
@@ -124,6 +125,8 @@ class DotFit:
     dropped : how many of these were left out as outliers or as clipped.
     edge_residual : RMS residual near the edge, divided by C.
     inner_chi2 : mean squared whitened residual of the inner_pixels pixels that the dot covers.
+    edge, edge_variance : harmonics of the edge in the residuals, see `rim.edge_harmonics`;
+        `NO_EDGE` if they were not asked for.
     """
 
     centre_px: Array
@@ -141,6 +144,8 @@ class DotFit:
     inner_chi2: float
     inner_pixels: int
     converged: bool
+    edge: Array
+    edge_variance: Array
 
     @property
     def dof(self) -> int:
@@ -171,6 +176,7 @@ class DotFit:
         return replace(
             self,
             covariance_px2=self.covariance_px2 * factor,
+            edge_variance=self.edge_variance * factor,
             contrast_sigma=self.contrast_sigma * np.sqrt(factor),
             chi2_dof=self.chi2_dof / factor,
         )
@@ -273,8 +279,8 @@ class _Fit:
         limit = _OUTLIER_SIGMA * max(1.0, NORMAL_FROM_MEDIAN * middle, 0.51 * high)
         return np.asarray(whitened > limit)
 
-    def result(self, converged: bool) -> DotFit:
-        """Return the fit with its covariance."""
+    def result(self, converged: bool, edges: bool) -> DotFit:
+        """Return the fit with its covariance and, if ``edges``, the harmonics of its edge."""
         information, pull = np.empty((12, 12)), np.empty(12)
         normal_equations(self.prior, self.radius, self.parameters, self.residual, self.weight,
                          self.jacobian, information, pull)  # fmt: skip
@@ -289,6 +295,10 @@ class _Fit:
         )  # fmt: skip
         count, chi2, edge, edge_squares, inner, inner_chi2 = sums.tolist()
         contrast = max(abs(self.parameters[9]), 1e-12)
+        offset = np.stack([self.x - theta[0], self.y - theta[1]])
+        # Pixels left out as outliers count here: they are where an edge is farthest off.
+        rows = self.jacobian, 1.0 / self.noise.variance(self.model), self.residual
+        rim = edge_harmonics(*rows, information, theta[2:5], offset) if edges else NO_EDGE
         return DotFit(
             theta[:2] + self.origin,
             theta[2:5],
@@ -305,6 +315,7 @@ class _Fit:
             inner_chi2 / inner if inner else 1.0,
             int(inner),
             converged,
+            *rim,
         )
 
 
@@ -317,6 +328,7 @@ def fit_dot(
     iterations: int = 25,
     tolerance: float = 0.02,
     outlier_rounds: int = 3,
+    edges: bool = False,
 ) -> DotFit:
     """Fit the luminance model of a dot to the pixels of its window.
 
@@ -326,6 +338,7 @@ def fit_dot(
     iterations : largest number of steps.
     tolerance : the fit has converged if one more step would lower chi-square by less than this.
     outlier_rounds : how many times outliers are searched.
+    edges : whether to compute the harmonics of the edge.
     """
     fit = _Fit(window, start, noise, prior)
-    return fit.result(fit.minimise(iterations, tolerance, outlier_rounds))
+    return fit.result(fit.minimise(iterations, tolerance, outlier_rounds), edges)

@@ -483,3 +483,17 @@ def test_a_camera_that_cannot_see_a_dot_stops_the_start_alone(rng: Any) -> None:
         lm.solve(problem, state)
     assert np.isfinite(whitened_error(state, problem.subset(problem.camera == 0).observations(),
                                       problem.rho_mm)).all()  # fmt: skip
+
+
+def test_what_rough_edges_do_counts_as_an_error_of_the_dots_places(scene: Any) -> None:
+    made = scene("paper", 3, views=3)
+    plain = problem_from_dots(made.dots, made.cameras, made.target)
+    dots = made.dots.assign(edge_suu_px2=0.04, edge_suv_px2=0.01, edge_svv_px2=0.04)
+    dots["suu_px2"], dots["svv_px2"] = dots["suu_px2"] + 0.04, dots["svv_px2"] + 0.04
+    dots["suv_px2"] = dots["suv_px2"] + 0.01
+    rough = problem_from_dots(dots, made.cameras, made.target)
+    np.testing.assert_allclose(rough.covariance_px2, plain.covariance_px2, rtol=1e-9)
+    scale = np.median([camera["scale_px_per_mm"] for camera in made.cameras])
+    expected = np.hypot(made.target.print_sigma_mm, np.sqrt(0.05) / scale)
+    np.testing.assert_allclose(rough.dot_sigma_mm[:, :2], expected, rtol=0.05)
+    np.testing.assert_array_equal(rough.dot_sigma_mm[:, 2], plain.dot_sigma_mm[:, 2])

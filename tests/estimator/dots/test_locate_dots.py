@@ -188,7 +188,8 @@ def test_floats_without_noise_are_measured_like_integers() -> None:
 def test_columns_and_conventions() -> None:
     truth = scene(9.0, tilt_deg=50.0)
     table = locate_dots(renderer.picture(renderer.render(truth), 1.0, 8, np.random.default_rng(4)))
-    assert table.columns.tolist() == [*COLUMNS.split(), "blur_px", "ring", "noise"]
+    assert table.columns.tolist()[:-3] == [*COLUMNS.split(), "blur_px", "ring", "noise"]
+    assert table.columns.tolist()[-3:] == ["edge_suu_px2", "edge_suv_px2", "edge_svv_px2"]
     assert (table.a_px >= table.b_px).all()
     assert not table.ring.any()
     # The disc was tilted about the axis at 0.6 rad, so that is where its long axis lies.

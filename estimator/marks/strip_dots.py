@@ -115,7 +115,8 @@ def learn_look(
 def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
     """Return the dots of one frame that look like the strip's and are whole in the image."""
     dots = _dots_like(image, look)
-    sigma = np.sqrt((dots["suu_px2"] + dots["svv_px2"]) / 2)
+    edge = dots["edge_suu_px2"] + dots["edge_svv_px2"]  # the same in all frames
+    sigma = np.sqrt((dots["suu_px2"] + dots["svv_px2"] - edge) / 2)
     uv_px = dots[["u_px", "v_px"]].to_numpy(float)
     return DotSightings(uv_px, np.hypot(sigma.to_numpy(float), _SYSTEMATIC_PX))
 

@@ -18,10 +18,10 @@ import numpy as np
 import pandas as pd
 
 import telerig
+from guard_parts.contradictions import contradictions
 from guard_parts.inputs import digest
 from guard_parts.metrics import Metric, count, cpu_ratio, size, word
 from guard_parts.product import run_preset
-from telerig.io.report.page.contradictions import contradictions
 
 SCENARIO, FRAMES = "S2", 200
 PEER = "import matplotlib.pyplot, numpy, pandas, scipy.optimize, scipy.signal"

@@ -306,7 +306,7 @@ def check_run_name(run: Path) -> None:
 
 
 def check_options(calibration: Path | None, options: CalibrationOptions) -> None:
-    """Raise InputError for a calibration that does not exist, and for options of no calibration."""
+    """Raise InputError for a calibration that does not exist, and for unknown lens models."""
     from telerig.errors import CalibrationError
     from telerig.estimator.calibration.calibrate import check_options as check
 

@@ -489,7 +489,7 @@ def load_smoothing(folder: str | Path) -> Smoothing:
         model = TypeAdapter(ShakeModel).validate_python(content.get("model", {}))
     except ValidationError as error:
         raise InputError(
-            f"garbles 'model': {error.errors()[0]['msg']}",
+            f"has a fault at 'model': {error.errors()[0]['msg']}",
             where=str(place / "smoothing.json"),
             todo=SmoothingFile.AGAIN,
         ) from error

@@ -192,7 +192,7 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
         raise InputError(
             f"has {', '.join(given)} without {missing}",
             where=f"{file} row 1",
-            todo="give all three columns, or sigma_px alone",
+            todo=f"give all three, {', '.join(PIXEL_COVARIANCE)}, or sigma_px alone",
         )
     if given:
         uu, uv, vv = (table[name].to_numpy() for name in PIXEL_COVARIANCE)

@@ -130,4 +130,4 @@ def rig_cameras(
             for name, c in records.items()
         )  # fmt: skip
     except (KeyError, TypeError, TelerigError) as error:
-        raise ValueError(f"lacks or garbles {error}"[:200]) from error
+        raise ValueError(f"lacks or misstates {error}"[:200]) from error

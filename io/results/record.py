@@ -168,7 +168,7 @@ def _fault(error: ValidationError) -> str:
     faults = error.errors(include_url=False, include_input=False, include_context=False)
     key, *others = (".".join(str(part)[:60] for part in f["loc"][:6]) for f in faults)
     reason = faults[0]["msg"].removeprefix("Value error, ")
-    words = f"garbles {key!r}: {reason}" if key else reason
+    words = f"has a fault at {key!r}: {reason}" if key else reason
     more = f" (and {counted_list([*map(repr, others)], 'more fault')})" if others else ""
     return words[:_LONGEST_MESSAGE] + more
 

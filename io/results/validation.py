@@ -183,7 +183,7 @@ def table_rows(file: ValidationFile) -> list[tuple[str, ...]]:
 
 
 def table_words(file: ValidationFile) -> list[str]:
-    """Return the table as lines of a terminal."""
+    """Return the table of a validation as lines of text, their columns aligned with spaces."""
     rows = [HEAD, *table_rows(file)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(HEAD))]
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths)).rstrip() for row in rows]

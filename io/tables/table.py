@@ -57,7 +57,7 @@ class Table:
         return [column.name for column in self.of(cameras)]
 
     def column(self, name: str) -> Column | None:
-        """Return the declaration of a column, of whatever camera; None for one that is unknown."""
+        """Return the declaration of the column of this name, of any camera, or None."""
         for one in self.columns:
             pattern = re.escape(one.name).replace(re.escape(CAMERA), ".+")
             if one.name == name or (CAMERA in one.name and re.fullmatch(pattern, name)):

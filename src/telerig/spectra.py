@@ -42,7 +42,7 @@ def motion_spectrum(t_s: Array, readings_m_s2: Array) -> Spectrum | None:
 
 
 def segment(frames: int) -> int:
-    """Return the frames per segment of Welch's estimate: about five, half overlapping."""
+    """Return the frames per segment of Welch's estimate, for about five half overlapping ones."""
     return min(frames, _LONGEST_SEGMENT, max(64, frames // 3))
 
 

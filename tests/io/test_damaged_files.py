@@ -66,10 +66,10 @@ def test_every_fault_of_a_file_is_named(tmp_path: Path) -> None:
     assert {"jobs.0.dataset", "jobs.0.kind", "jobs.1"} <= set(faults)
 
 
-def test_a_batch_whose_job_garbles_its_host_is_refused(tmp_path: Path) -> None:
+def test_a_batch_whose_job_has_a_faulty_host_is_refused(tmp_path: Path) -> None:
     job = dict.fromkeys(("dataset", "run", "kind", "status", "words"), "") | {"host": ["a"]}
     (tmp_path / "batch.json").write_text(json.dumps({"jobs": [job]}), encoding="utf-8")
-    with pytest.raises(InputError, match=r"garbles 'jobs\.0\.host'"):
+    with pytest.raises(InputError, match=r"has a fault at 'jobs\.0\.host'"):
         write_batch_report(tmp_path)
 
 

@@ -90,7 +90,11 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
     if not cameras and tracked.has("tracking.json"):
         cameras = tracked.file.rig_cameras()
     if not len(points):
-        raise InputError("has no rows below its header", where=str(place / source))
+        raise InputError(
+            "has no rows below its header: no bubble was followed",
+            where=str(place / source),
+            todo="track the run again (`telerig track`), or export another run (--run)",
+        )
     return RunResults(
         name=place.name,
         frame=LAB if smoothed else RIG,

@@ -287,7 +287,9 @@ def layout_from(options: dict[str, Any]) -> Layout:
             numbers = tuple(float(w) for w in str(values["scale_m_s2"]).split(","))
         except ValueError as error:
             raise InputError(
-                f"--scale {values['scale_m_s2']} is no number", todo="write 98.1 or 98,97.5,99"
+                f"--scale {values['scale_m_s2']} is no number",
+                todo="give the acceleration in m/s^2 for a reading of 1: one number "
+                "(--scale 98.1), or one for each axis (--scale 98,97.5,99)",
             ) from error
         values["scale_m_s2"] = numbers[0] if len(numbers) == 1 else numbers
     return Layout(**values)

@@ -44,7 +44,10 @@ def read_opencv_cameras(
     Raises InputError when something is missing, and for distortion beyond k1 k2 p1 p2 k3 s1..s4.
     """
     if not unit_mm > 0:
-        raise InputError(f"unit_mm is {unit_mm}", todo="give the length of OpenCV's unit in mm")
+        raise InputError(
+            f"unit_mm is {unit_mm}, which is no positive length",
+            todo="give the length in mm of the unit of T: --unit-mm 1000 if T is in metres",
+        )
     files = [Path(p) for p in paths]
     contents = [_content(file) for file in files]
     joint = {name: value for content in contents for name, value in content.items()}

@@ -297,7 +297,7 @@ def view_rows(results: CalibrationResults, page_folder: Path) -> list[Row]:
 
 
 def share_of(part: int, whole: int) -> str:
-    """Return "PART of WHOLE", or "-" of nothing."""
+    """Return "PART of WHOLE" in figures, like "178 of 180"; "-" if the whole is 0."""
     return f"{part} of {whole}" if whole else "-"
 
 

@@ -157,7 +157,10 @@ def draw_views(
     shades: Mapping[str, tuple[float, float]],
     frame: ViewFrame,
 ) -> Picture:
-    """Return (h, w, 3) RGB, even sides: the views side by side, a strip of words above."""
+    """Return one picture of the film, (h, w, 3) RGB: the views side by side below a line of words.
+
+    h and w are even, as video codecs need.
+    """
     parts = []
     for camera, found in zip(sizes_px, frame.found):
         image = images(camera, frame.frame)

@@ -162,8 +162,12 @@ class CalibrationResults:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """residuals.csv with ``kept`` and ``length_px``, and ``whitened_u``, ``whitened_v`` when
-        dots.csv states covariances."""
+        """residuals.csv with further columns.
+
+        ``kept`` (bool) says whether the dot counts, ``length_px`` is the length of the residual.
+        Where dots.csv states covariances, ``whitened_u`` and ``whitened_v`` are the residual in
+        units of its standard deviation.
+        """
         place = self.folder / "residuals.csv"
         if not place.is_file():
             imported = self.file.verdict.status == Status.IMPORTED

@@ -86,7 +86,7 @@ class SmoothingResults:
 
     @cached_property
     def trajectories(self) -> pd.DataFrame:
-        """The same by bubble and frame; columns that a run without bubbles leaves out are there."""
+        """trajectories.csv sorted by bubble and frame; without bubbles it has all columns, too."""
         empty = {name: np.zeros(0) for name in STATE if not len(self.rows)}
         table = self.rows.assign(**empty)
         table = table.sort_values(["particle", "frame"], kind="stable", ignore_index=True)

@@ -68,7 +68,7 @@ def test_a_garbled_stage_is_refused(data: Path, tmp_path: Path) -> None:
     content = json.loads(source.read_text(encoding="utf-8"))
     content["stage"]["axis"] = [0.0, 1.0]
     (tmp_path / "calibration.json").write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(InputError, match=r"garbles .stage\.axis.: has shape"):
+    with pytest.raises(InputError, match=r"has a fault at .stage\.axis.: has shape"):
         telerig.load_calibration(tmp_path)
 
 

@@ -132,11 +132,17 @@ def test_a_page_without_failures_says_the_verdicts(
         (None, "no batch here"),
         ("{", "Expecting"),
         ("[]", "not an object"),
-        ('{"jobs": 3}', "garbles 'jobs'"),
-        ('{"jobs": [3]}', "garbles 'jobs.0'"),
-        ('{"jobs": [{"dataset": "a"}]}', "garbles 'jobs.0.kind': Field required"),
-        (json.dumps({"jobs": [_job("track", "a") | {"dataset": 3}]}), "garbles 'jobs.0.dataset'"),
-        (json.dumps({"jobs": [_job("track", "a") | {"figures": [3]}]}), "garbles 'jobs.0.figures'"),
+        ('{"jobs": 3}', "has a fault at 'jobs'"),
+        ('{"jobs": [3]}', "has a fault at 'jobs.0'"),
+        ('{"jobs": [{"dataset": "a"}]}', "has a fault at 'jobs.0.kind': Field required"),
+        (
+            json.dumps({"jobs": [_job("track", "a") | {"dataset": 3}]}),
+            "has a fault at 'jobs.0.dataset'",
+        ),
+        (
+            json.dumps({"jobs": [_job("track", "a") | {"figures": [3]}]}),
+            "has a fault at 'jobs.0.figures'",
+        ),
     ],
 )
 def test_a_batch_that_cannot_be_read_is_named(

@@ -176,7 +176,7 @@ def test_files_that_do_not_fit_together_are_refused(folder: Path) -> None:
         InputError, match=r"row 181, column camera: calibration.json has no camera 'middle'"
     ):
         read_calibration_results(folder)
-    with pytest.raises(InputError, match="garbles 'views'"):
+    with pytest.raises(InputError, match="has a fault at 'views'"):
         content = json.loads((folder / "calibration.json").read_text())
         del content["views"]
         (folder / "calibration.json").write_text(json.dumps(content))

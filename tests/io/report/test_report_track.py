@@ -209,7 +209,11 @@ def test_hostile_names_stay_text(folder: Path) -> None:
         ("tracking.json", "{", "JSON"),
         ("tracking.json", '{"kind": "telerig calibration"}', "is not a tracks file"),
         ("tracking.json", '{"kind": "telerig tracks", "schema": 9}', "newer"),
-        ("tracking.json", '{"kind": "telerig tracks", "schema": 1, "pairs": 3}', "garbles 'pairs'"),
+        (
+            "tracking.json",
+            '{"kind": "telerig tracks", "schema": 1, "pairs": 3}',
+            "has a fault at 'pairs'",
+        ),
         ("tracks.csv", None, "does not exist"),
         ("tracks.csv", "frame,particle\n1,2\n", "missing columns: t_s, x_mm"),
         ("detections.csv", "frame,camera,u_px,v_px\n1,left,2,3\n", "particle"),
@@ -285,7 +289,7 @@ def test_up_from_the_file_turns_heights_round(folder: Path) -> None:
     down = read_track_results(folder).height_mm
     np.testing.assert_allclose(read_track_results(_edit(folder, up=[0, 2, 0])).height_mm, -down)
     assert report.up_name(read_track_results(folder).up) == "y"
-    with pytest.raises(InputError, match="garbles 'up'"):
+    with pytest.raises(InputError, match="has a fault at 'up'"):
         read_track_results(_edit(folder, up=[1, 2]))
 
 

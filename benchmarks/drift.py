@@ -240,7 +240,7 @@ def main() -> None:
     biases: dict[str, Array] = {}
     graph: dict[str, Callable[[], ShakeModel]] = {
         "rise": true_model,
-        "still": lambda: true_model().without_shake(),
+        "still": lambda: replace(true_model(), modes=()),
     }
     for name in [n for n in graph if n in chosen and options.graph]:
         score, biases[name] = in_graph(known[name], graph[name](), seeds(options.graph))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from shake_cases import (
@@ -90,7 +92,7 @@ def true_model(
         encoder_sigma_mm=ENCODER_MM,
         name="true",
     )
-    return model.without_shake() if information == "oracle" else model
+    return replace(model, modes=()) if information == "oracle" else model
 
 
 def problem(scenario: Scenario, information: str, runs: Runs, run: int = 0) -> SmoothingProblem:

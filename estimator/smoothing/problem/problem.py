@@ -122,10 +122,6 @@ class ShakeModel:
         cutoffs = {m.force_hz for m in self.modes if m.force_hz is not None}
         return cutoffs.pop() if len(cutoffs) == 1 else None
 
-    def without_shake(self) -> ShakeModel:
-        """Return this model without any shake: the cameras are at rest on the carriage."""
-        return replace(self, modes=(), broad_bands=())
-
 
 @dataclass(frozen=True)
 class Observations:

@@ -98,7 +98,7 @@ def test_times_without_any_bubble_are_bridged(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_rig_that_does_not_shake_has_a_crowd_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, *_ = run(np.random.default_rng(3), bubbles=4, seconds=0.2)
-    joint, found = _both(problem, true_model().without_shake(), monkeypatch)
+    joint, found = _both(problem, replace(true_model(), modes=()), monkeypatch)
     _compare(joint, found, 1e-4)
 
 

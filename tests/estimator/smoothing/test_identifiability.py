@@ -102,7 +102,7 @@ def test_shake_far_below_the_noise_is_called_so() -> None:
 
 def test_a_model_without_shake_has_nothing_to_share() -> None:
     problem, _, _ = run(np.random.default_rng(4), shake_mm=0.0)
-    solution = solve(problem, true_model().without_shake(), QUIET)
+    solution = solve(problem, replace(true_model(), modes=()), QUIET)
     assert shake_share(solution, shake_of(solution)) == [None, None, None]
     y = verdict_of(solution)["y"]
     assert y.q == pytest.approx(1, abs=1e-6)
@@ -117,7 +117,7 @@ def test_q_is_the_ratio_to_the_same_run_without_shake(known: str) -> None:
         free, root = (("scale_px_per_mm",), ("scale_px_per_mm",)), 1e-3 * np.eye(8)
         problem = replace(problem, calibration=CalibrationShare(root, free, root @ root.T))
     solution = solve(problem, true_model(), QUIET)
-    still = solve(problem, true_model().without_shake(), QUIET)
+    still = solve(problem, replace(true_model(), modes=()), QUIET)
     assert solution.covariances is not None and still.covariances is not None
     row = solution.graph.bubble.position[1]
     each = [np.einsum("d,nde,e->n", row, s.covariances.bubbles, row) for s in (solution, still)]  # type: ignore[union-attr]

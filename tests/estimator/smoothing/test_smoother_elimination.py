@@ -44,7 +44,7 @@ def linearised(information: str, *, shake: bool = True) -> tuple[GraphLayout, li
     else:
         given = cut(given)
     if not shake:
-        model = model.without_shake()
+        model = replace(model, modes=())
     graph = graph_layout(given, model, np.zeros(0))
     weights = np.ones(len(given.observations)), np.ones(len(given.references))
     return graph, all_factors(graph, first_guess(graph), weights)

@@ -127,7 +127,7 @@ def test_tracks_one_after_the_other_and_pauses() -> None:
         assert one["verdict"] == "as expected"
         assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.12)
     apart = tracks(replace(problem, bubbles=problem.bubbles[:2]), [(0, 99), (500, 599)])
-    still = solved(apart, TRUE.without_shake())
+    still = solved(apart, replace(TRUE, modes=()))
     assert still.graph.shake.size == 0
     assert list(whiteness(still)) == ["left", "right"]
 

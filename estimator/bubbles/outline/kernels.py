@@ -488,7 +488,7 @@ def _unlike(at: Array, free: int, prior: Array, ellipse: Array) -> float:
 
 
 @compiled
-def _solve(total: Array, covariance: Array, step: Array) -> bool:
+def solve(total: Array, covariance: Array, step: Array) -> bool:
     """Solve normal equations of n parameters (lower triangle, right-hand side as last row).
 
     Writes the inverse into ``covariance`` (n, n) and the solution into the first n of ``step``;
@@ -744,7 +744,7 @@ def fitted(
             _derivatives(table, taken, bent, away, at, rows)
             products(rows, total)
             _add_prior(total, prior[b], outline, at)
-            if not (_solve(total, covariance, step) and _largest(step[:free]) < np.inf):
+            if not (solve(total, covariance, step) and _largest(step[:free]) < np.inf):
                 break
             # so short that the linearisation stays valid
             far = _largest(step[:ELLIPSE])
@@ -855,7 +855,7 @@ def fitted_arcs(points: Array, sizes: Ints, ellipses: Array, rms: Array) -> None
             total[ELLIPSE, 3] += gap
             for i in range(ELLIPSE):
                 total[i, i] += 1e-6
-            if not _solve(total, covariance, step):
+            if not solve(total, covariance, step):
                 break
             reach = _largest(step[:ELLIPSE])
             if not reach < np.inf:

@@ -100,27 +100,27 @@ def evidence(
     """Return the pairings of K predicted bubbles with M measurements that lie inside the gate.
 
     points_mm, covariance_mm2, d_eq_mm : (M, 3), (M, 3, 3), (M,) measured; NaN for unknown sizes.
-    allowed, certain : (K, M) which pairings may be made, and which are made at any distance.
+    allowed : (K, M) which pairings may be made.
+    certain : (M,) measurements that are paired at any distance.
     shift_mm, unsure_mm2 : (3,), (3, 3) the shift that all bubbles share, for the gate alone.
     size_sd : relative standard deviation of the diameters.
     """
-    between = points_mm[None] - predicted.points_mm[:, None]
-    own = predicted.covariance_mm2 + unsure_mm2
-    widest = np.trace(own, axis1=1, axis2=2)
-    variances, axes = np.linalg.eigh(covariance_mm2)
-    along = np.einsum("kmi,mij->kmj", between - shift_mm, axes)
-    least = (along**2 / (widest[:, None, None] + variances)).sum(-1)  # of the squared distance
-    row, column = np.nonzero(allowed & ((least <= _GATE2) | certain))
-    innovation, total = between[row, column], own[row] + covariance_mm2[column]
-    left = innovation - shift_mm
-    distance2 = (left * np.linalg.solve(total, left[..., None])[..., 0]).sum(-1)
-    near = (distance2 <= _GATE2) | np.broadcast_to(certain, least.shape)[row, column]
-    row, column, innovation = row[near], column[near], innovation[near]
-    covariance = predicted.covariance_mm2[row] + covariance_mm2[column]
-    constant = -1.5 * _LOG_2PI - np.log(np.linalg.det(covariance)) / 2
+    from telerig.estimator.bubbles.pairing import kernels
+
+    many = len(points_mm)
+    arrays = (
+        predicted.points_mm + shift_mm, predicted.covariance_mm2,
+        np.broadcast_to(unsure_mm2, (3, 3)), points_mm, covariance_mm2,
+    )  # fmt: skip
+    choices = np.broadcast_to(allowed, (len(predicted.ids), many)), np.broadcast_to(certain, many)
+    row, column, innovation, covariance, information, log_det = kernels.inside_gate(
+        *(np.ascontiguousarray(own, float) for own in arrays),
+        *(np.ascontiguousarray(own, bool) for own in choices),
+        _GATE2,
+    )
+    constant = -1.5 * _LOG_2PI - log_det / 2
     constant += _size_ratio(predicted.d_eq_mm[row], d_eq_mm[column], size_sd)
-    information = np.linalg.inv(covariance)
-    return Evidence(row, column, innovation, covariance, information, constant)
+    return Evidence(row, column, innovation + shift_mm, covariance, information, constant)
 
 
 def _size_ratio(expected_mm: Array, measured_mm: Array, relative_sd: float) -> Array:

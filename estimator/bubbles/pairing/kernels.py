@@ -1,5 +1,5 @@
-"""Sums over the pairs and larger groups of a frame's detections, where they are many in compiled
-loops."""
+"""Compiled loops over the pairs and larger groups of a frame's detections, and over the pairings of
+tracks with them."""
 
 from __future__ import annotations
 
@@ -186,3 +186,81 @@ def marginals(log_odds: Array, rows: Ints, counts: Ints, negligible: float) -> A
     places = np.ascontiguousarray(np.where(rows < 0, -1, rows + first), np.int64)
     _marginals(np.ascontiguousarray(log_odds), places, int(counts.sum()), negligible, out)
     return out
+
+
+@compiled
+def _lower(matrix: Array, out: Array) -> None:
+    """Write the inverse of the Cholesky factor of a matrix (3, 3) into ``out``."""
+    a = np.sqrt(matrix[0, 0])
+    b, c = matrix[1, 0] / a, matrix[2, 0] / a
+    d = np.sqrt(matrix[1, 1] - b * b)
+    e = (matrix[2, 1] - b * c) / d
+    f = np.sqrt(matrix[2, 2] - c * c - e * e)
+    out[0, 0], out[1, 1], out[2, 2] = 1 / a, 1 / d, 1 / f
+    out[1, 0] = -b / (a * d)
+    out[2, 1] = -e / (d * f)
+    out[2, 0] = -(c / a + e * out[1, 0]) / f
+
+
+@compiled
+def inside_gate(
+    expected: Array,
+    spread: Array,
+    unsure: Array,
+    points: Array,
+    noise: Array,
+    allowed: Bools,
+    certain: Bools,
+    gate2: float,
+) -> tuple[Ints, Ints, Array, Array, Array, Array]:
+    """Return the pairings of K predictions with M measurements inside the gate.
+
+    expected, spread : (K, 3), (K, 3, 3). unsure : (3, 3) is added to the covariances for the gate.
+    points, noise : (M, 3), (M, 3, 3) measured. allowed : (K, M). certain : (M,) at any distance.
+
+    Returns of E pairings the prediction and the measurement (E,), the innovation (E, 3), its
+    covariance (E, 3, 3) without ``unsure``, the inverse, and the log of the determinant (E,).
+    """
+    tracks, many = allowed.shape
+    inside, count = np.zeros((tracks, many), np.bool_), 0
+    total, lower, left = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
+    for k in range(tracks):
+        for m in range(many):
+            if not allowed[k, m]:
+                continue
+            for i in range(3):
+                left[i] = points[m, i] - expected[k, i]
+                for j in range(3):
+                    total[i, j] = spread[k, i, j] + unsure[i, j] + noise[m, i, j]
+            _lower(total, lower)
+            distance2 = 0.0
+            for i in range(3):
+                own = 0.0
+                for j in range(i + 1):
+                    own += lower[i, j] * left[j]
+                distance2 += own * own
+            inside[k, m] = certain[m] or distance2 <= gate2
+            count += inside[k, m]
+    row, column = np.empty(count, np.int64), np.empty(count, np.int64)
+    innovation, log_det = np.empty((count, 3)), np.empty(count)
+    covariance, information = np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    e = 0
+    for k in range(tracks):
+        for m in range(many):
+            if not inside[k, m]:
+                continue
+            row[e], column[e] = k, m
+            for i in range(3):
+                innovation[e, i] = points[m, i] - expected[k, i]
+                for j in range(3):
+                    covariance[e, i, j] = spread[k, i, j] + noise[m, i, j]
+            _lower(covariance[e], lower)
+            log_det[e] = -2 * np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
+            for i in range(3):
+                for j in range(3):
+                    own = 0.0
+                    for c in range(3):
+                        own += lower[c, i] * lower[c, j]
+                    information[e, i, j] = own
+            e += 1
+    return row, column, innovation, covariance, information, log_det

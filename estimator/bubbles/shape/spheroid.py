@@ -15,9 +15,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.estimator.bubbles.shape import kernels
 from telerig.estimator.bubbles.shape.shapes import Shapes, degree_variance
 from telerig.estimator.bubbles.shape.sightings import Sightings
-from telerig.estimator.bubbles.shape.views import ROUND, Views
+from telerig.estimator.bubbles.shape.views import Views
 from telerig.rig import silhouette
 
 PARAMETERS = ("log_size", "log_aspect", "lean_1", "lean_2", "triaxial_1", "triaxial_2")
@@ -68,7 +69,7 @@ class Shape:
     @property
     def moments(self) -> Array:
         """Moments (B, 3, 3) in mm^2."""
-        return _moments(self.frame, self.value)
+        return np.asarray(kernels.moments(self.frame, self.value))
 
 
 def best_shape(views: Views, shapes: Shapes, up: Array) -> Shape:
@@ -87,7 +88,7 @@ def best_shape(views: Views, shapes: Shapes, up: Array) -> Shape:
     share = np.exp(-(cost - cost[best, rows]) / 2)
     share /= share.sum(0)
     share = np.where(share < _IMPROBABLE, 0.0, share)
-    slope = views.deviation(_tangents(chosen.frame, chosen.moments))
+    _, slope = kernels.outlines(views.measure, chosen.frame, chosen.value)
     gain = chosen.covariance @ slope.mT @ weight
     noise = gain @ views.white @ gain.mT
     covariance = chosen.covariance.copy()
@@ -130,30 +131,13 @@ def fit_spheroid(
     start : pole (B, 3), log size (B,), log aspect ratio (B,).  weight : `Views.precision`.
     """
     pole, size, aspect = start
-    frame, round_ = _frame(pole), np.tile(ROUND, views.count)
-    value = np.stack([size, aspect, 0 * size, 0 * size], -1)
+    frame, value = _frame(pole), np.stack([size, aspect, 0 * size, 0 * size], -1)
     prior = np.concatenate([_LOOSE, np.full(2, triaxial**-2)])
-    covariance = np.zeros((len(pole), 6, 6))
-    live = np.arange(len(pole))
-    for _ in range(_STEPS):
-        some = replace(views, measure=views.measure[live])
-        moments = _moments(frame[live], value[live])
-        slope = some.deviation(_tangents(frame[live], moments))
-        weighted = slope.mT @ weight[live]
-        covariance[live] = np.linalg.inv(weighted @ slope + np.diag(prior))
-        right = (weighted @ (round_ - some.deviation(moments))[..., None])[..., 0]
-        right[:, 1] -= prior[1] * value[live, 1]
-        right[:, 4:] -= prior[4:] * value[live, 2:]
-        step = np.clip((covariance[live] @ right[..., None])[..., 0], -0.5, 0.5)
-        value[live] += step[:, [0, 1, 4, 5]]
-        lean = np.concatenate([step[:, 2:4], np.ones((len(step), 1))], -1)
-        leaned = (frame[live] @ lean[..., None])[..., 0]
-        leaned /= np.linalg.norm(leaned, axis=-1, keepdims=True)
-        frame[live] = _carried(frame[live], leaned)
-        live = live[np.abs(step).max(-1) > _SMALL_STEP]
-        if not len(live):
-            break
-    miss = round_ - views.deviation(_moments(frame, value))
+    covariance = kernels.fit(
+        views.measure, weight, prior, views.round, frame, value, _STEPS, _SMALL_STEP
+    )
+    g, _ = kernels.outlines(views.measure, frame, value)
+    miss = views.round - g
     cost = np.einsum("mi,mij,mj->m", miss, weight, miss) + (prior[4:] * value[:, 2:] ** 2).sum(-1)
     return Shape(
         frame, value, covariance, cost, cost, np.zeros_like(covariance), np.zeros((len(cost), 2))
@@ -213,9 +197,8 @@ def unusual(fit: Shape, up: Array) -> Array:
 def misfit(views: Views, fit: Shape, weight: Array) -> tuple[Array, Array]:
     """Return the chi-square (B,) of a spheroid with t = 0, and its slope (B,) by the variance
     of t."""
-    moments = _moments(fit.frame, fit.value * [1.0, 1.0, 0.0, 0.0])
-    miss = np.tile(ROUND, views.count) - views.deviation(moments)
-    slope = views.deviation(_tangents(fit.frame, moments))
+    g, slope = kernels.outlines(views.measure, fit.frame, fit.value * [1.0, 1.0, 0.0, 0.0])
+    miss = views.round - g
     body, odd = slope[..., :4], slope[..., 4:]
     normal = np.linalg.inv(body.mT @ weight @ body + np.diag(_LOOSE))
 
@@ -227,50 +210,10 @@ def misfit(views: Views, fit: Shape, weight: Array) -> tuple[Array, Array]:
     return left(miss[..., None]), left(odd)
 
 
-def _moments(frame: Array, value: Array) -> Array:
-    """Return the moments (B, 3, 3) of bodies.
-
-    frame : (B, 3, 3).  value : (B, 4) log size, log aspect ratio, t.
-    """
-    size, aspect, t1, t2 = value.T
-    t = np.hypot(t1, t2) + 1e-300
-    even, odd = np.cosh(2 * t), np.sinh(2 * t) / t
-    plane = np.exp(2 * (size + aspect / 3))
-    body = np.zeros((len(value), 3, 3))
-    body[:, 0, 0], body[:, 1, 1] = plane * (even + odd * t1), plane * (even - odd * t1)
-    body[:, 0, 1] = body[:, 1, 0] = plane * odd * t2
-    body[:, 2, 2] = np.exp(2 * (size - 2 * aspect / 3))
-    return np.asarray(frame @ body @ frame.mT)
-
-
-def _tangents(frame: Array, moments: Array) -> Array:
-    """Return derivatives (B, 6, 3, 3) of the moments by the `PARAMETERS`, for small t."""
-    e1, e2, n = (frame[:, :, i] for i in range(3))
-
-    def outer(a: Array, b: Array) -> Array:
-        product = a[:, :, None] * b[:, None, :]
-        return np.asarray(product + product.mT) / 2
-
-    shape = (outer(e1, e1) + outer(e2, e2) - 2 * outer(n, n)) / 3
-    stretches = [np.broadcast_to(np.eye(3), moments.shape), shape]
-    stretches += [outer(e1, e1) - outer(e2, e2), 2 * outer(e1, e2)]
-    changes = [s @ moments + moments @ s for s in stretches]
-    # the pole moves towards an equatorial axis, and that axis away from it
-    for axis in (e2, e1):
-        turn = axis[:, :, None] * n[:, None, :] - n[:, :, None] * axis[:, None, :]
-        changes.insert(2, turn @ moments - moments @ turn)
-    return np.stack(changes, 1)
-
-
 def _frame(pole: Array) -> Array:
     """Return right-handed frames (B, 3, 3) whose third column is the pole (B, 3)."""
     start = np.where(np.abs(pole[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
-    return _carried(np.stack([start, start, pole], -1), pole)
-
-
-def _carried(frame: Array, pole: Array) -> Array:
-    """Rotate frames by the smallest angle that makes their third column the pole."""
-    first = frame[:, :, 0] - pole * (frame[:, :, 0] * pole).sum(-1, keepdims=True)
+    first = start - pole * (start * pole).sum(-1, keepdims=True)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(pole, first), pole], -1)
 

@@ -30,7 +30,7 @@ _COVERED_SD, _UNKNOWN_SD = 0.1, 30.0
 """Standard deviation of g1 of an outline of which a part is covered or outside the image, and of
 one whose axes are unknown."""
 
-ROUND = np.array([0.5, 0.0, 0.0])
+_ROUND = np.array([0.5, 0.0, 0.0])
 """g of an outline that is the measured one."""
 _WHITE = np.diag([0.5, 1.0, 1.0])
 _CIRCLE = 5
@@ -125,6 +125,11 @@ class Views:
         """The number n of views."""
         return int(self.noise.shape[1])
 
+    @property
+    def round(self) -> Array:
+        """g (3 n,) of all outlines for a body whose outlines are the measured ones."""
+        return np.tile(_ROUND, self.count)
+
     def inside(self) -> Bools:
         """Return whether (B,) the triangulated point lies inside all outlines."""
         away = np.abs(self.sightings.uv_px - self.pixels).max((1, 2))
@@ -139,7 +144,7 @@ class Views:
         """
         basis = silhouette.SYMMETRIC.reshape(6, 9).T
         system = self.measure @ basis
-        target = np.tile(ROUND, self.count)
+        target = self.round
         left, values, right = np.linalg.svd(system)
         rank = 6 - (self.count == 2)
         unseen = left[..., rank:]
@@ -214,15 +219,6 @@ class Views:
         rows = np.arange(len(worst))
         agree = chi2[rows, worst] < chdtri(max(unseen.shape[-1] - 3, 1), _CONTRADICTION)
         return np.asarray(np.where(agree[:, None, None], add[rows, worst], add.mean(1)))
-
-    def deviation(self, moments: Array) -> Array:
-        """Return g of all outlines (B, 3 n) for bodies with moments (B, 3, 3).
-
-        For k changes of the moments (B, k, 3, 3) it returns (B, 3 n, k).
-        """
-        if moments.ndim == 3:
-            return np.asarray((self.measure @ moments.reshape(-1, 9, 1))[..., 0])
-        return np.asarray(self.measure @ moments.reshape(*moments.shape[:2], 9).mT)
 
 
 def _signed_miss(rays: Sequence[tuple[Array, Array]]) -> Array:

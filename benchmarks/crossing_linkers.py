@@ -11,7 +11,8 @@ from crossing_scenes import Scene
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from telerig.estimator.tracking.linking.filter import FrameMeasurements, TrackerSettings
+from telerig.estimator.tracking.linking.filter import TrackerSettings
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles
 from telerig.estimator.tracking.linking.tracker import Tracker
 
 Ids = list[NDArray[np.int64]]
@@ -23,7 +24,10 @@ def telerig(settings: TrackerSettings | None = None, *, encoder: bool = True) ->
         tracker = Tracker(settings=settings)
         settled = []
         for i, (t, points) in enumerate(zip(scene.t_s, scene.points_mm)):
-            measured = FrameMeasurements.create(points, scene.covariance_mm2)
+            many = len(points)
+            both, none = np.zeros((many, 2), np.int64), np.full(many, NO_PARTICLE)
+            covariance = np.broadcast_to(scene.covariance_mm2, (many, 3, 3))
+            measured = Bubbles.of(both, points, covariance, none, np.full(many, np.nan))
             read = float(scene.position_mm[i]) if encoder else None
             settled += tracker.update(i, float(t), measured, read).final
         last = tracker.finish()

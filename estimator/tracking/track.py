@@ -41,8 +41,8 @@ from telerig.estimator.tracking.detect_run import (
     make_scene,
     mask_files,
 )
-from telerig.estimator.tracking.linking.filter import NO_PARTICLE, TrackerSettings
-from telerig.estimator.tracking.linking.frames import Tables
+from telerig.estimator.tracking.linking.filter import TrackerSettings
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Tables
 from telerig.estimator.tracking.linking.frames_to_rows import Linked, RowMaker
 from telerig.estimator.tracking.linking.linked_rows import LinkedRows, Linking
 from telerig.estimator.tracking.linking.tracker import Tracker

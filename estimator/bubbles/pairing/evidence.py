@@ -108,16 +108,16 @@ def evidence(
     from telerig.estimator.bubbles.pairing import kernels
 
     many = len(points_mm)
-    arrays = (
+    floats = (
         predicted.points_mm + shift_mm, predicted.covariance_mm2,
         np.broadcast_to(unsure_mm2, (3, 3)), points_mm, covariance_mm2,
     )  # fmt: skip
-    choices = np.broadcast_to(allowed, (len(predicted.ids), many)), np.broadcast_to(certain, many)
+    expected, spread, unsure, points, noise = (np.ascontiguousarray(v, float) for v in floats)
     row, column, innovation, covariance, information, log_det = kernels.inside_gate(
-        *(np.ascontiguousarray(own, float) for own in arrays),
-        *(np.ascontiguousarray(own, bool) for own in choices),
-        _GATE2,
-    )
+        expected, spread, unsure, points, noise,
+        np.ascontiguousarray(np.broadcast_to(allowed, (len(predicted.ids), many)), bool),
+        np.ascontiguousarray(np.broadcast_to(certain, many), bool), _GATE2,
+    )  # fmt: skip
     constant = -1.5 * _LOG_2PI - log_det / 2
     constant += _size_ratio(predicted.d_eq_mm[row], d_eq_mm[column], size_sd)
     return Evidence(row, column, innovation + shift_mm, covariance, information, constant)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -79,10 +79,8 @@ class Bodies(Rows):
             nan(3, 3), nan(6, 6), nan(), nan(3), nan(2), nan(), np.zeros(count, bool), nan(),
         )  # fmt: skip
 
-    @staticmethod
-    def sized(d_eq_mm: Array, cameras: int) -> Bodies:
-        """Return bodies of which only the diameters (B,) are known."""
-        return replace(Bodies.none(len(d_eq_mm), cameras), d_eq_mm=d_eq_mm)
+    def __len__(self) -> int:
+        return len(self.used)
 
     @property
     def sd_eq_mm(self) -> Array:

@@ -37,15 +37,14 @@ from telerig.estimator.bubbles.pairing.evidence import (
     gate2,
 )
 from telerig.estimator.tracking.linking.filter import (
-    NO_PARTICLE,
     POSITION,
     STATES,
     Common,
-    FrameMeasurements,
     Scan,
     States,
     TrackerSettings,
 )
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles
 from telerig.estimator.tracking.linking.ranked_ways import alternatives
 
 _SHIFT_ROUNDS = 5
@@ -69,7 +68,7 @@ def expected(states: States) -> Prediction:
 
 def gated_pairs(
     predicted: Prediction,
-    measured: FrameMeasurements,
+    measured: Bubbles,
     allowed: Bools,
     common: Common,
     settings: TrackerSettings,
@@ -81,7 +80,7 @@ def gated_pairs(
         data are certain.
     misses : (K,) number of frames for which each track has not been seen; None for 0.
     """
-    given = measured.particle != NO_PARTICLE
+    given = measured.given != NO_PARTICLE
     pairs = evidence(
         predicted, measured.points_mm, measured.covariance_mm2, measured.d_eq_mm, allowed=allowed,
         certain=given, shift_mm=common.shift_mm, unsure_mm2=common.covariance_mm2,
@@ -325,7 +324,7 @@ class _Pairings:
         """best : (K,) which states are those of the best hypotheses."""
         measured, confirmed = scan.measured, states.track > NO_PARTICLE
         ids = np.where(states.given, states.track, NO_PARTICLE)
-        allowed = ids[:, None] == measured.particle
+        allowed = ids[:, None] == measured.given
         allowed &= confirmed[:, None] | ~measured.alone
         misses = scan.frame - states.seen_frame - 1
         pairs = gated_pairs(expected(states), measured, allowed, common, scan.settings, misses)
@@ -489,7 +488,7 @@ def advance(states: States, conflicts: Sequence[Conflict], scan: Scan, common: C
     good = ~rival & (near.scores(now.shift_mm) > 0)
     columns[near.row[good]] = near.column[good]
     near = near.take(rival)
-    free = ~measured.alone & (measured.particle == NO_PARTICLE)
+    free = ~measured.alone & (measured.given == NO_PARTICLE)
     free[columns[columns >= 0]] = False
     later, commons = list[Conflict](), list[list[Common]]()
     for members, edges in _components(owner[near.row], near.column, len(conflicts)):

@@ -23,15 +23,12 @@ from telerig.estimator.bubbles.pairing.evidence import Prediction, gate2
 from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.tracking.linking.association import clear_assignment, gated_pairs
 from telerig.estimator.tracking.linking.filter import (
-    NO_PARTICLE,
     POSITION,
     Common,
-    FrameMeasurements,
-    Motion,
     TrackerSettings,
     birth_covariance,
 )
-from telerig.estimator.tracking.linking.frames import Bubbles, Frame, Seen
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles, Frame, Motion, Seen
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import UNKNOWN_MM, stacked_jacobian
 
@@ -207,10 +204,7 @@ def _nearest(
     spread = np.linalg.eigvalsh(across @ each.covariance_mm2 @ across.mT)[:, -1]
     sharp = spread <= (_VAGUE * each.d_eq_mm) ** 2
     allowed = sharp[:, None] & (there.rows[:, of_camera] >= 0).T
-    measured = FrameMeasurements.create(
-        there.points_mm, there.covariance_mm2, d_eq_mm=there.d_eq_mm
-    )
-    pairs = gated_pairs(each, measured, allowed, Common(), settings)
+    pairs = gated_pairs(each, there, allowed, Common(), settings)
     chosen, clear = clear_assignment(pairs, len(sharp), np.zeros(3), settings)
     return np.append(free, -1)[np.where(clear, chosen, -1)].reshape(-1, many)
 
@@ -303,12 +297,13 @@ def _place(frame: Frame, own: Ints, smoothed: Prediction, cameras: Sequence[Came
     bubbles.confidence[own[good]], bubbles.ambiguous[own[good]] = _CONFIDENCE, False
     unknown = frame.seen.unknown_px2[bubbles.rows[own]] * seen
     placed = replace(
-        Bodies.sized(size_mm, len(cameras)), points_mm=smoothed.points_mm,
+        Bodies.none(*shape), d_eq_mm=size_mm, points_mm=smoothed.points_mm,
         covariance_mm2=smoothed.covariance_mm2, silhouette_points_mm=smoothed.points_mm,
         shift_covariance_px2=unknown[..., None, None] * np.eye(2),
         used=np.full(len(own), "silhouettes"),
     )  # fmt: skip
-    bubbles.bodies.put(own[good], placed.take(good))
+    bubbles.body[own[good]] = len(frame.bodies) + np.arange(good.sum())
+    frame.bodies = Bodies.concat([frame.bodies, placed.take(good)])
 
 
 def _outline_over(seen: Seen, uv_px: Array, radius_px: Array) -> Array:

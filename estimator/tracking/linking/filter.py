@@ -1,4 +1,4 @@
-"""Holds the tracker's settings, its records of a frame, and the Kalman filter of one bubble with
+"""Holds the tracker's settings, its results of a frame, and the Kalman filter of one bubble with
 its motion model.
 
 The state of a bubble has 12 components in the rig frame: position (mm), velocity (mm/s),
@@ -20,14 +20,11 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Bools, Ints, Rows
-from telerig.errors import InputError
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles, Motion
 from telerig.factors.bubble_motion import lateral_motion, rise_motion
 from telerig.factors.state_space import exact_step
-
-NO_PARTICLE = -1
 
 
 @dataclass(frozen=True)
@@ -99,73 +96,6 @@ class TrackerSettings:
 
 
 @dataclass(frozen=True)
-class FrameMeasurements:
-    """Hold the M bubbles of one frame, each of which one camera sees or several do.
-
-    points_mm : (M, 3) positions in the rig frame.
-    covariance_mm2 : (M, 3, 3) covariances of the positions; of what one camera alone sees the depth
-        is unknown (`on_rays`).
-    d_eq_mm : (M,) equivalent diameters, NaN where unknown.
-    confidence : (M,) confidence in (0, 1] that the detections are those of one bubble.
-    particle : (M,) ids given with the data, -1 where no id is given.
-    alone : (M,) whether one camera alone sees the bubble.
-    """
-
-    points_mm: Array
-    covariance_mm2: Array
-    d_eq_mm: Array
-    confidence: Array
-    particle: Ints
-    alone: Bools
-
-    @staticmethod
-    def create(
-        points_mm: ArrayLike,
-        covariance_mm2: ArrayLike,
-        *,
-        d_eq_mm: ArrayLike | None = None,
-        confidence: ArrayLike | None = None,
-        particle: ArrayLike | None = None,
-        alone: ArrayLike | None = None,
-    ) -> FrameMeasurements:
-        """Return the measurements of a frame after checking them.
-
-        points_mm : (M, 3).
-        covariance_mm2 : (M, 3, 3), or one (3, 3) for all points.
-        d_eq_mm, confidence, particle, alone : (M,); None if all diameters are unknown, for 1
-            everywhere, if no ids are given, and if several cameras see every bubble.
-
-        Raises InputError for shapes that do not fit, for points or covariances that are not finite,
-        and for an id that occurs twice.
-        """
-        points = np.asarray(points_mm, float).reshape(-1, 3)
-        m = len(points)
-        covariance = np.broadcast_to(np.asarray(covariance_mm2, float), (m, 3, 3))
-        size = np.full(m, np.nan) if d_eq_mm is None else np.asarray(d_eq_mm, float)
-        sure = np.ones(m) if confidence is None else np.asarray(confidence, float)
-        ids = np.full(m, NO_PARTICLE) if particle is None else np.asarray(particle, np.int64)
-        one = np.zeros(m, bool) if alone is None else np.asarray(alone, bool)
-        every = {"d_eq_mm": size, "confidence": sure, "particle": ids, "alone": one}
-        for name, values in every.items():
-            if values.shape != (m,):
-                raise InputError(
-                    f"{name} has shape {values.shape} for {m} points", todo="give one per point"
-                )
-        if not (np.isfinite(points).all() and np.isfinite(covariance).all()):
-            raise InputError(
-                "points or covariances are not finite",
-                todo="leave out bubbles that could not be triangulated",
-            )
-        given = ids[ids != NO_PARTICLE]
-        if len(np.unique(given)) < len(given):
-            raise InputError("a particle id occurs twice in one frame", todo="give each id once")
-        return FrameMeasurements(points, covariance, size, sure, ids, one)
-
-    def __len__(self) -> int:
-        return len(self.points_mm)
-
-
-@dataclass(frozen=True)
 class TrackEvent:
     """Describe one event in the life of tracks.
 
@@ -190,32 +120,6 @@ class FrameIds:
 
     frame: int
     particle: Ints
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Describe the motion of every bubble from the frame before to this frame.
-
-    A bubble's state x (see `motion`) becomes matrix @ x + offset, plus random noise.
-
-    matrix : (12, 12).
-    noise : (12, 12) covariance of the random part.
-    offset : (12,) effect of the stage's travel and of the shift that all bubbles share.
-    """
-
-    matrix: Array
-    noise: Array
-    offset: Array
-
-    def shifted(self, shift: Array, covariance_mm2: Array) -> Motion:
-        """Return this motion with the shift of a frame added, which all bubbles share.
-
-        shift : (12,) is added to the offset.
-        covariance_mm2 : (3, 3) covariance of the shift's position, which is added to the noise.
-        """
-        noise = self.noise.copy()
-        noise[:3, :3] += covariance_mm2
-        return Motion(self.matrix, noise, self.offset + shift)
 
 
 @dataclass(frozen=True)
@@ -367,11 +271,11 @@ _SIZE_GAIN = 0.25
 
 @dataclass(frozen=True)
 class Scan:
-    """One frame: its number, its time and its measurements."""
+    """One frame: its number, its time and the bubbles that are measured in it."""
 
     frame: int
     t_s: float
-    measured: FrameMeasurements
+    measured: Bubbles
     settings: TrackerSettings
 
 
@@ -412,7 +316,7 @@ class States(Rows):
         size = measured.d_eq_mm[columns]
         now = np.full(many, scan.frame)
         return States(
-            x, p, tracks, measured.particle[columns] != NO_PARTICLE,
+            x, p, tracks, measured.given[columns] != NO_PARTICLE,
             np.stack([size, np.full(many, np.nan), size], -1), now, now.copy(),
             np.full(many, scan.t_s), np.ones(many, np.int64),
         )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,8 +15,9 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import columns, flag_wor
 from telerig.estimator.bubbles.pairing.groups import Candidates, View
 from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
-from telerig.estimator.tracking.linking.filter import NO_PARTICLE, Motion
 from telerig.rig.camera import Camera
+
+NO_PARTICLE = -1
 
 Tables = tuple["pd.DataFrame", ...]
 """One frame's detections in each camera."""
@@ -79,7 +80,8 @@ class Bubbles(Rows):
     given : (M,) id that the user gave to the detections, -1 for none.
     points_mm, covariance_mm2 : (M, 3), (M, 3, 3) position of the outlines' centres with the
         covariance of a bubble of unknown shape.
-    bodies : the M bodies, fitted to all outlines.
+    d_eq_mm : (M,) equivalent diameters, NaN where unknown.
+    body : (M,) row among the bodies of the frame, -1 for none.
     particle : (M,) id of the track, -1 for none; it is known when the frame is final.
     """
 
@@ -90,30 +92,24 @@ class Bubbles(Rows):
     given: Ints
     points_mm: Array
     covariance_mm2: Array
-    bodies: Bodies
+    d_eq_mm: Array
+    body: Ints
     particle: Ints
 
     @staticmethod
     def of(
-        rows: Ints, points_mm: Array, covariance_mm2: Array, given: Ints, size_mm: Array
+        rows: Ints, points_mm: Array, covariance_mm2: Array, given: Ints, d_eq_mm: Array
     ) -> Bubbles:
-        """Return bubbles without tracks of which the shapes are unknown.
-
-        size_mm : (M,) diameters.
-        """
+        """Return bubbles without tracks and bodies."""
         many, cameras = rows.shape
+        none = np.full(many, NO_PARTICLE)
         return Bubbles(
             rows, np.full((many, cameras, 5), np.nan), np.ones(many), np.zeros(many, bool), given,
-            points_mm, covariance_mm2, Bodies.sized(size_mm, cameras), np.full(many, NO_PARTICLE),
+            points_mm, covariance_mm2, d_eq_mm, none, none.copy(),
         )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    @property
-    def d_eq_mm(self) -> Array:
-        """Equivalent diameters (M,), NaN where unknown."""
-        return self.bodies.d_eq_mm
 
     @property
     def alone(self) -> Bools:
@@ -124,7 +120,7 @@ class Bubbles(Rows):
 @dataclass(frozen=True)
 class Sight:
     """Hold what one frame shows: its detections, their possible groups (G), and the bodies (G) of
-    those that are likely without tracks."""
+    those that are likely without tracks, or chosen."""
 
     seen: Seen
     candidates: Candidates
@@ -132,12 +128,13 @@ class Sight:
 
     def groups(self, chosen: Ints) -> Bubbles:
         """Return some of the groups as bubbles."""
-        found, bodies = self.candidates.groups.take(chosen), self.bodies.take(chosen)
+        found = self.candidates.groups.take(chosen)
         first = np.searchsorted(self.seen.sightings.camera, np.arange(found.rows.shape[1]))
         rows = moved(found.rows, first)
         given = np.append(self.seen.given, NO_PARTICLE)[rows].max(1)
-        every = Bubbles.of(rows, found.points_mm, found.covariance_mm2, given, bodies.d_eq_mm)
-        return replace(every, bodies=bodies)
+        sizes = self.bodies.d_eq_mm[chosen]
+        every = Bubbles.of(rows, found.points_mm, found.covariance_mm2, given, sizes)
+        return replace(every, body=chosen)
 
     def rays(self, offset_px: Array) -> Bubbles:
         """Return each detection as a bubble that no other camera sees: a point of unknown depth.
@@ -154,6 +151,32 @@ class Sight:
         return Bubbles.of(rows, points, covariances, self.seen.given.copy(), sizes)
 
 
+@dataclass(frozen=True)
+class Motion:
+    """Describe the motion of every bubble from the frame before to this frame.
+
+    A bubble's state x (see `motion`) becomes matrix @ x + offset, plus random noise.
+
+    matrix : (12, 12).
+    noise : (12, 12) covariance of the random part.
+    offset : (12,) effect of the stage's travel and of the shift that all bubbles share.
+    """
+
+    matrix: Array
+    noise: Array
+    offset: Array
+
+    def shifted(self, shift: Array, covariance_mm2: Array) -> Motion:
+        """Return this motion with the shift of a frame added, which all bubbles share.
+
+        shift : (12,) is added to the offset.
+        covariance_mm2 : (3, 3) covariance of the shift's position, which is added to the noise.
+        """
+        noise = self.noise.copy()
+        noise[:3, :3] += covariance_mm2
+        return Motion(self.matrix, noise, self.offset + shift)
+
+
 @dataclass
 class Frame:
     """One frame of a run while its tracks may still change.
@@ -162,6 +185,7 @@ class Frame:
     offset_px : (C, 2) for each camera the shift of all detections, because the cameras shake.
     rays : each detection by itself, as `Sight.rays` returns them.
     bubbles : those that several cameras see, and those that one camera alone sees.
+    bodies : the bodies of some of the bubbles.
     motion : motion of all bubbles since the frame before; None for the first frame.
     """
 
@@ -172,6 +196,7 @@ class Frame:
     offset_px: Array
     rays: Bubbles
     bubbles: Bubbles
+    bodies: Bodies
     motion: Motion | None
 
     @property
@@ -196,7 +221,7 @@ class Frame:
             self.bubbles = Bubbles.concat([self.bubbles.take(~same.any(1)), one])
 
 
-def starts(frames: Sequence[Frame]) -> Ints:
-    """Return the position (F,) of each frame's first detection among those of all."""
-    many = np.array([len(frame.seen) for frame in frames], np.int64)
+def starts(parts: Iterable[Sized]) -> Ints:
+    """Return the position (F,) of the first item of each part among those of all."""
+    many = np.array([len(part) for part in parts], np.int64)
     return np.asarray(np.cumsum(many) - many)

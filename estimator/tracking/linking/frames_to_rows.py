@@ -24,14 +24,10 @@ from telerig.estimator.tracking.linking.backtracking import (
     fused,
     place_hidden,
 )
-from telerig.estimator.tracking.linking.filter import (
-    NO_PARTICLE,
-    FrameMeasurements,
-    FrameResult,
-    TrackEvent,
-)
+from telerig.estimator.tracking.linking.filter import FrameResult, TrackEvent
 from telerig.estimator.tracking.linking.frames import (
     CENTRE_PX,
+    NO_PARTICLE,
     Bubbles,
     Frame,
     Seen,
@@ -105,7 +101,7 @@ class RowMaker:
         ])  # fmt: skip
         likely = np.flatnonzero(np.concatenate([f.probability for f in found]) > _LIKELY)
         bodies = Bodies.none(*rows.shape)
-        self._fit(bodies, likely, seen, rows)
+        self._fit(bodies, likely, seen, rows[likely])
         ends = np.cumsum([0, *map(len, found)])
         return [
             Sight(seen.take(slice(*own)), one, bodies.take(slice(*groups)))
@@ -130,15 +126,13 @@ class RowMaker:
         predicted = self.tracker.predict(t_s, position_mm)
         sight = self.sights([tables])[0] if sight is None else sight
         bubbles, rays, offset_px = grouped_frame(sight, self.model, predicted)
-        late = np.flatnonzero((bubbles.bodies.used == "none") & ~bubbles.alone)
-        self._fit(bubbles.bodies, late, sight.seen, bubbles.rows)
-        measured = FrameMeasurements.create(
-            bubbles.points_mm, bubbles.covariance_mm2, d_eq_mm=bubbles.d_eq_mm,
-            confidence=bubbles.confidence, particle=bubbles.given, alone=bubbles.alone,
-        )  # fmt: skip
-        result = self.tracker.update(number, t_s, measured, position_mm)
+        own = np.flatnonzero(bubbles.body >= 0)
+        late = own[sight.bodies.used[bubbles.body[own]] == "none"]
+        self._fit(sight.bodies, bubbles.body[late], sight.seen, bubbles.rows[late])
+        bubbles.d_eq_mm[late] = sight.bodies.d_eq_mm[bubbles.body[late]]
+        result = self.tracker.update(number, t_s, bubbles, position_mm)
         self._open[number] = Frame(
-            number, t_s, tables, sight.seen, offset_px, rays, bubbles, result.motion
+            number, t_s, tables, sight.seen, offset_px, rays, bubbles, sight.bodies, result.motion
         )
         self._take_final(result)
         enough = self._waiting >= _BUBBLES_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
@@ -171,26 +165,29 @@ class RowMaker:
         return Linked(self._tracks(done), _detections(done))
 
     def _fit(self, bodies: Bodies, some: Ints, seen: Seen, rows: Ints) -> None:
-        """Fit some of M bodies to their detections. rows : (M, C) in ``seen``."""
+        """Fit some bodies to their detections. rows : (len(some), C) in ``seen``."""
         if not len(some):
             return
         gap_px = np.hypot(self.model.mean("frame_px"), self.model.mean("gap_rms_px"))
         fitted = fit_bodies(
-            seen.sightings, rows[some], self.cameras, self.up, self.shapes,
+            seen.sightings, rows, self.cameras, self.up, self.shapes,
             gap_sigma_px=float(gap_px),
         )  # fmt: skip
         bodies.put(some, fitted)
 
     def _tracks(self, frames: Sequence[Frame]) -> pd.DataFrame:
-        every = []
-        for f in frames:
-            placed = ~f.bubbles.alone | (f.bubbles.bodies.used != "none")
-            every.append(f.bubbles.take(placed & (f.particle != NO_PARTICLE)))
-        bubbles, many = Bubbles.concat(every), [*map(len, every)]
+        chosen = [
+            f.bubbles.take((~f.bubbles.alone | (f.bubbles.body >= 0)) & (f.particle != NO_PARTICLE))
+            for f in frames
+        ]
+        bubbles, many = Bubbles.concat(chosen), [*map(len, chosen)]
         seen = Seen.concat([f.seen for f in frames])
-        here = moved(bubbles.rows, np.repeat(starts(frames), many)[:, None])
-        bodies = bubbles.bodies
-        self._fit(bodies, np.flatnonzero(bodies.used == "none"), seen, here)
+        here = moved(bubbles.rows, np.repeat(starts(f.seen for f in frames), many)[:, None])
+        known = moved(bubbles.body, np.repeat(starts(f.bodies for f in frames), many))
+        none = Bodies.none(1, len(self.cameras))  # the last one, of those without a body
+        bodies = Bodies.concat([*(f.bodies for f in frames), none]).take(known)
+        late = np.flatnonzero(known < 0)
+        self._fit(bodies, late, seen, here[late])
         table: dict[str, Any] = {
             "frame": np.repeat([f.number for f in frames], many),
             "particle": bubbles.particle,

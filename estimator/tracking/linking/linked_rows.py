@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing.model import Finding, LogRatioModel, PairModel
 from telerig.estimator.bubbles.shape.shapes import Shapes
-from telerig.estimator.tracking.linking.filter import NO_PARTICLE, TrackEvent
+from telerig.estimator.tracking.linking.filter import TrackEvent
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE
 from telerig.estimator.tracking.linking.frames_to_rows import Linked
 from telerig.io.files.atomic import atomic_path, write_text_atomic
 

@@ -17,15 +17,12 @@ from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.tracking.linking.association import Conflict, advance, expected
 from telerig.estimator.tracking.linking.filter import (
-    NO_PARTICLE,
     POSITION,
     STATES,
     VELOCITY,
     Common,
     FrameIds,
-    FrameMeasurements,
     FrameResult,
-    Motion,
     Scan,
     StageMotion,
     States,
@@ -34,6 +31,7 @@ from telerig.estimator.tracking.linking.filter import (
     Transition,
     transition,
 )
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles, Motion
 
 _SPARE = 16
 """Tracks that have ended and are still remembered, beside twice as many as live."""
@@ -167,9 +165,10 @@ class Tracker:
         self.axis: tuple[float, float, float] = (unit[0], unit[1], unit[2])
         self.settings = TrackerSettings() if settings is None else settings
         self.next_id = first_id
-        nothing = FrameMeasurements.create(np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        self._nothing = Scan(0, 0.0, nothing, self.settings)
         none = np.zeros(0, np.int64)
+        places = np.zeros((0, 3)), np.zeros((0, 3, 3))
+        nothing = Bubbles.of(np.zeros((0, 2), np.int64), *places, none, np.zeros(0))
+        self._nothing = Scan(0, 0.0, nothing, self.settings)
         self.states = States.born(self._nothing, none, none, np.zeros(3), True)
         self.conflicts: list[Conflict] = []
         self.common = Common()
@@ -202,7 +201,7 @@ class Tracker:
         self,
         frame: int,
         t_s: float,
-        measured: FrameMeasurements,
+        measured: Bubbles,
         position_mm: float | None = None,
     ) -> FrameResult:
         """Take in the measurements of one frame and return what is final.
@@ -211,9 +210,14 @@ class Tracker:
         measured : the bubbles of the frame.
         position_mm : encoder position of the stage; None or NaN if there is none.
 
-        Raises InputError when frame or t_s do not increase.
+        Raises InputError when frame or t_s do not increase, and for an id that occurs twice.
         """
         self._check(frame, t_s)
+        given = measured.given[measured.given != NO_PARTICLE]
+        if len(np.unique(given)) < len(given):
+            raise InputError(
+                "a particle id occurs twice", where=f"frame {frame}", todo="give each id once"
+            )
         motion = self._predict_all(t_s, position_mm)
         self.last = (frame, t_s)
         self.frames.begin(frame, t_s, len(measured))
@@ -360,7 +364,7 @@ class Tracker:
     def _births(self, scan: Scan, free: Ints) -> None:
         """Start tracks at free measurements; those that were seen often enough are confirmed, and
         those that were missed too often are given up."""
-        given = scan.measured.particle
+        given = scan.measured.given
         known = self.states.track[self.states.given]
         named = np.flatnonzero((given != NO_PARTICLE) & ~np.isin(given, known))
         self._unconfirmed -= len(free)

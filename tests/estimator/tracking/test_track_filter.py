@@ -8,7 +8,6 @@ from tracker_runs import SIGMA_MM, UP, Array, frame_of
 
 from telerig.estimator.tracking.linking.filter import (
     DRIFT,
-    FrameMeasurements,
     TrackerSettings,
     birth_covariance,
     transition,
@@ -59,7 +58,7 @@ def test_two_bubbles_under_shake_are_the_dense_gaussian_posterior() -> None:
     r = np.diag([4e-4, 2e-4, 4e-4])
     tracker = Tracker(settings=settings)
     for i, t in enumerate(times):
-        tracker.update(i, t, FrameMeasurements.create(z[i], r, particle=[4, 9]), 0.0)
+        tracker.update(i, t, frame_of(z[i], r, particle=[4, 9]), 0.0)
     mean, covariance = _dense_posterior(settings, times, z, r)
     n = len(mean) // 2
     first, second = tracker.states.x

@@ -52,8 +52,11 @@ def rim_frames(moments_mm2: Array, jacobian: Array, axes_px: Array) -> Array:
     squares, axes = np.linalg.eigh(moments_mm2)
     root = (axes * np.sqrt(np.maximum(squares, 0.0))[..., None, :]) @ axes.mT
     frames = root[..., None, :, :] @ jacobian.mT @ np.linalg.inv(axes_px).mT
-    left, _, right = np.linalg.svd(frames, full_matrices=False)
-    return np.asarray(left @ right)
+    # polar decomposition: the root of S = W^T W (2, 2) is (S + sqrt(det S) I) / trace of the root
+    square = frames.mT @ frames
+    det = np.sqrt(np.linalg.det(square))[..., None, None]
+    trace = np.sqrt(np.trace(square, axis1=-2, axis2=-1)[..., None, None] + 2 * det)
+    return np.asarray(frames @ np.linalg.inv((square + det * np.eye(2)) / trace))
 
 
 def third_degree(directions: Array) -> Array:

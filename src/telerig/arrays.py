@@ -4,7 +4,6 @@ an array states its shape; `as_points` and `as_pixels` check what a user gives."
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any, Self, cast
 
 import numpy as np
@@ -26,14 +25,15 @@ class Rows:
 
     def take(self, rows: Any) -> Self:
         """Return some rows, in the shape of ``rows``: (B, n) indices give arrays (B, n, ...)."""
-        values = (getattr(self, f.name) for f in fields(cast(Any, self)))
-        taken = (v.take(rows) if isinstance(v, Rows) else v[rows] for v in values)
+        values = [getattr(self, name) for name in cast(Any, self).__dataclass_fields__]
+        taken = [v.take(rows) if isinstance(v, Rows) else v[rows] for v in values]
         return cast(Self, cast(Any, type(self))(*taken))
 
     @classmethod
     def concat(cls, parts: Sequence[Self]) -> Self:
         """Return the rows of several structures one after the other."""
-        columns = ([getattr(part, f.name) for part in parts] for f in fields(cast(Any, cls)))
+        names = cast(Any, cls).__dataclass_fields__
+        columns = ([getattr(part, name) for part in parts] for name in names)
         joined = (
             type(c[0]).concat(c) if isinstance(c[0], Rows) else np.concatenate(c) for c in columns
         )

@@ -86,7 +86,7 @@ def calibrate(
     """
     from telerig.estimator.calibration.calibrate import check_options
     from telerig.estimator.calibration.quality.comparison import compare_calibrations
-    from telerig.estimator.calibration.results_folder import report_beside, sources, write_results
+    from telerig.estimator.calibration.results_folder import sources, write_report, write_results
     from telerig.io.dataset.dataset import load_dataset
     from telerig.io.results.inputs import fingerprints
 
@@ -94,7 +94,7 @@ def calibrate(
     settings = chosen.keywords
     check_options(**settings)
     record = {**chosen.record(), "compare": None if compare is None else str(compare)}
-    with viewed(view, dataset.name), report_beside(report) as write_report:
+    with viewed(view, dataset.name):
         earlier = None if compare is None else _earlier(compare, dataset)
         if watch:
             data, run = _watched(dataset, chosen.source, until_um, poll or _POLL_S, settings)
@@ -113,8 +113,8 @@ def calibrate(
         change = None if earlier is None else compare_calibrations(earlier, run.calibration)
         write_results(
             data, run, folder, command="calibrate", options=record,
-            seconds={"calibrate": time.perf_counter() - begun}, change=change, report=write_report,
-            used=used, again=typed_command(),
+            seconds={"calibrate": time.perf_counter() - begun}, change=change,
+            report=write_report if report else None, used=used, again=typed_command(),
         )  # fmt: skip
         publish("results", folder=folder.resolve(), dataset=data.path)
     say(run.calibration.report())

@@ -221,8 +221,9 @@ def detect(
 
 
 def _load_libraries() -> None:
-    """Load what comes after the detection while other processes detect."""
+    """Load what the fit and the page need while other processes detect."""
     import gtsam  # noqa: F401
+    import matplotlib.figure  # noqa: F401
 
 
 def _with_stage(dataset: Dataset, calibration: Calibration, stage: Progress | None) -> Calibration:

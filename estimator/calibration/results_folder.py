@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +11,6 @@ import numpy as np
 
 from telerig.estimator.calibration.calibrate import CalibrationRun
 from telerig.io.files.atomic import plain, write_json_atomic
-from telerig.io.machine.parallel import assistant
 from telerig.io.results.calibration import ComparisonFile
 from telerig.io.results.inputs import Input, Source, fingerprints
 from telerig.io.results.manifest import replaced_results
@@ -49,28 +46,6 @@ def write_report(folder: Path) -> Path:
     from telerig.io.report.calibration.report import write_calibration_report
 
     return write_calibration_report(folder)
-
-
-@contextmanager
-def report_beside(wanted: bool) -> Iterator[Callable[[Path], object] | None]:
-    """Yield `write_report` in a second process, which loads what it needs meanwhile.
-
-    That process ends with the context. None if no report is wanted.
-    """
-    if not wanted:
-        yield None
-        return
-    import pandas  # noqa: F401 - both processes need it, and its import takes 0.2 s
-
-    with assistant(_prepare_report) as call:
-        yield partial(call, write_report)
-
-
-def _prepare_report() -> None:
-    import telerig.io.report.calibration.report  # noqa: F401
-    from telerig.io.report.page.page import prepare_page
-
-    prepare_page()
 
 
 def write_results(

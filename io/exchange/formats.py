@@ -143,7 +143,6 @@ def export_results(
     used.
     """
     from telerig.io.exchange.export.run_results import (
-        CalibratedCameras,
         cameras_of,
         read_results,
         results_root,
@@ -154,20 +153,20 @@ def export_results(
     if to not in known:
         raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
     _refuse_options_of_others(to, run=run, calibration=calibration, volume=volume)
-    rig, results = CalibratedCameras(), None
+    results = None
     if to in RUN_EXPORTS:
         results = read_results(run_folder(source, run), accept=accept)
-    if results is not None and results.cameras and calibration is None:
-        rig = CalibratedCameras(results.cameras)
-    elif to in CAMERA_EXPORTS or "cameras" in known[to].options:
-        rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
+    cameras: Sequence[Camera] = () if results is None else results.cameras
+    accepted: Sequence[str] = ()
+    of_cameras = to in CAMERA_EXPORTS
+    if (of_cameras or "cameras" in known[to].options) and (calibration or not cameras):
+        cameras, accepted = cameras_of(source, calibration, required=of_cameras, accept=accept)
     name = to if results is None else results.name
     place = out or results_root(source) / "export" / f"{name}{known[to].suffix}"
     if results is None:
-        lines = export_cameras(rig.cameras, to, place, volume=volume, remarks=rig.accepted)
+        lines = export_cameras(cameras, to, place, volume=volume, remarks=accepted)
     else:
-        lines = export_run(results, to, place, rig.cameras)
-    accepted = rig.accepted if results is None else results.accepted
+        lines, accepted = export_run(results, to, place, cameras), results.accepted
     return [*lines, *(f"accepted: {words}" for words in accepted), f"written: {place}"]
 
 

@@ -65,7 +65,7 @@ TRAJECTORIES = Table(
     "a frame between a bubble's first and last detection",
     (
         FRAME, _ID, TIME,
-        *_state("", "in the laboratory frame"),
+        *(replace(one, blank=False) for one in _state("", "in the laboratory frame")),
         *_state("s", "(standard deviation; of the position with the calibration's errors)"),
         *_state("naive_", "by triangulating and adding the encoder"),
         *_state("rts_", "by a plain smoother; blank for tracks of more than 5,000 frames, and "

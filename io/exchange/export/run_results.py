@@ -176,30 +176,20 @@ def results_root(source: Path) -> Path:
     return place.parent
 
 
-@dataclass(frozen=True)
-class CalibratedCameras:
-    """Hold calibrated cameras with their refractive windows.
-
-    accepted : why the calibration is stale, if it was read although it is.
-    """
-
-    cameras: tuple[Camera, ...] = ()
-    accepted: tuple[str, ...] = ()
-
-
 def cameras_of(
     source: Path, calibration: Path | None, *, required: bool, accept: Collection[str] = ()
-) -> CalibratedCameras:
-    """Read calibrated cameras for an export.
+) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
+    """Read calibrated cameras, with their refractive windows, for an export.
 
     source : a calibration.json, or a dataset or one of its results folders, whose calibration is
         read.
     calibration : a calibration.json to read instead; None for none.
-    required : whether InputError is raised if there is no calibration; otherwise the result holds
-        no camera then.
+    required : whether InputError is raised if there is no calibration; otherwise there is no camera
+        then.
     accept : as in `read_results`.
 
-    Raises InputError for a calibration that is stale or cannot be read.
+    Returns the cameras, and why the calibration is stale, if it was read although it is. Raises
+    InputError for a calibration that is stale or cannot be read.
     """
     if calibration is not None and not calibration.exists():
         raise absent(calibration, "calibration", "check the path")
@@ -213,14 +203,14 @@ def cameras_of(
         found = CalibrationResults.at(place)
         with reading(found.folder, [found.name]):
             accepted = refuse_stale(found.folder, [found.name], accept)
-            return CalibratedCameras(found.rig, accepted)
+            return found.rig, accepted
     if required:
         raise InputError(
             "there is no calibration",
             where=str(trials[0]),
             todo="run `telerig calibrate` first, or give a calibration with --calibration",
         )
-    return CalibratedCameras()
+    return (), ()
 
 
 def run_folder(source: Path, run: str | None) -> Path:

@@ -218,15 +218,9 @@ def glossary() -> dict[str, str]:
     }
 
 
-def prepare_page() -> None:
-    """Load what a page needs, so that rendering it takes a third of the time."""
-    keep_freed_memory()
-    prepare_drawing()
-    _environment().get_template(_TEMPLATE)
-
-
 def drawn_over_cores(drawings: Sequence[Callable[[], Any]]) -> list[Any]:
     """Call all drawings on several cores; return their results in order."""
+    keep_freed_memory()
     prepare_drawing()
     return list(ordered_map(_call, drawings, quick_workers(len(drawings))))
 

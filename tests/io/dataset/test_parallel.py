@@ -10,7 +10,7 @@ import threading
 import pytest
 
 from telerig.io.machine import parallel
-from telerig.io.machine.parallel import assistant, cores, ordered_map, quick_workers
+from telerig.io.machine.parallel import cores, ordered_map, quick_workers
 
 forks = pytest.mark.skipif(not parallel.can_fork(), reason="needs a system that can fork")
 
@@ -74,53 +74,3 @@ def test_the_cores_can_be_stated(monkeypatch, stated, known):
     here = cores()
     monkeypatch.setenv("TELERIG_CORES", stated)
     assert cores() == (known or here)
-
-
-def _die() -> None:
-    os._exit(1)
-
-
-def _die_elsewhere(process: int) -> int:
-    """Unless called in that process."""
-    if os.getpid() != process:
-        os._exit(1)
-    return process
-
-
-@forks
-def test_an_assistant_does_what_it_is_asked_in_a_process_that_has_prepared_itself(monkeypatch):
-    monkeypatch.setenv("TELERIG_CORES", "2")
-    with assistant(lambda: os.environ.update(TELERIG_TEST="ready")) as call:
-        assert call(math.factorial, 20) == math.factorial(20)
-        assert call(os.getenv, "TELERIG_TEST") == "ready" and os.getenv("TELERIG_TEST") is None
-        with pytest.raises(ValueError, match="three") as caught:
-            call(_fail_at_three, 3)
-        assert "_fail_at_three" in "".join(caught.value.__notes__), "where it happened there"
-        process = call(os.getpid)
-        call(os.kill, process, signal.SIGINT)
-        assert call(os.getpid) == process != os.getpid()
-    with pytest.raises(ProcessLookupError):
-        os.kill(process, 0)
-
-
-@forks
-def test_an_assistant_works_while_this_process_goes_on(monkeypatch):
-    monkeypatch.setenv("TELERIG_CORES", "2")
-    with assistant(int) as call:
-        first, failed = call.begin(os.getpid), call.begin(_fail_at_three, 3)
-        large = call.begin(bytes, 1 << 22)  # more than the system keeps on the way
-        assert call(os.getpid) == first() == first() != os.getpid()
-        with pytest.raises(ValueError, match="three"):
-            failed()
-        assert large() == bytes(1 << 22)
-        dies, after = call.begin(_die_elsewhere, os.getpid()), call.begin(os.getpid)
-        assert dies() == after() == os.getpid(), "done here"
-
-
-@forks
-@pytest.mark.parametrize("prepare", [_die, lambda: 1 / 0, int])
-def test_without_an_assistant_the_work_is_done_here(monkeypatch, prepare):
-    monkeypatch.setenv("TELERIG_CORES", "1" if prepare is int else "2")
-    with assistant(prepare) as call:
-        asked = call.begin(os.getpid)
-        assert call(os.getpid) == asked() == os.getpid()

@@ -16,7 +16,7 @@ from telerig.estimator.images.noise import check_grey_image
 _UNIFORM_SHARE = 0.004
 _CLIPPED_SHARE = 0.5
 _WHITE_SHARE = 0.98
-_EVERY_PX = 8
+_EVERY_PX = 16
 _LIT_SHARE, _BRIGHTEST = 0.6, 0.95
 LEAST_BRIGHTNESS = 0.25
 """Brightness relative to the background below which an image counts as dark."""

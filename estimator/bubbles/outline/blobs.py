@@ -11,22 +11,22 @@ merged.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32, Ints
-from telerig.estimator.bubbles.outline.ellipse_geometry import (
-    rough_distance,
-)
+from telerig.estimator.bubbles.outline import kernels
+from telerig.estimator.bubbles.outline.ellipse_geometry import rough_distance
 from telerig.estimator.bubbles.outline.outline_fit import ellipses_along
 from telerig.estimator.images.noise import clipped_sigma, high_pass
 
-_NOISE_SAMPLES = 40_000
-_BAND_ROWS = 16
+_NOISE_SAMPLES = 20_000
+_BAND_ROWS, _LEAST_BANDS = 16, 6
 _ENOUGH_LIT, _ENOUGH_DARK, _LEAST_NOISE = 200, 120, 1e-4
 _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
@@ -34,6 +34,9 @@ _DARKEST = 0.05
 _LIT, _DARK = 0.85, 0.3
 _LEAST_OUTLINE, _STEEP_SHARE = 5, 0.6
 _MAX_CUT_CENTRE_SHARE = 0.6
+
+Box = tuple[int, int, int, int]
+"""First column u and row v, width and height of a region."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,6 @@ class Blob:
     contour_px : (n, 2) closed outline at half depth, to about 0.1 px.
     inner : grey level inside (the background is 1).
     blur_px : standard deviation of the edge's blur.
-    box : (u, v, width, height) of the region.
     touches_border : whether it touches the image's border.
     within : whether another region surrounds it: it may be a bubble in front of a bright heart.
     """
@@ -51,7 +53,7 @@ class Blob:
     contour_px: Array
     inner: float
     blur_px: float
-    box: tuple[int, int, int, int]
+    box: Box
     touches_border: bool
     within: bool = False
 
@@ -77,7 +79,8 @@ def noise_shares(ratio: Float32, field: Bools | None = None) -> Array:
     everywhere.
     """
     found, kinds = [], []
-    for first in range(0, max(len(ratio) - _BAND_ROWS, 0) + 1, _band_step(ratio)):
+    bands = max(_NOISE_SAMPLES // (_BAND_ROWS * ratio.shape[1]), _LEAST_BANDS)
+    for first in range(0, max(len(ratio) - _BAND_ROWS, 0) + 1, max(len(ratio) // bands, 14)):
         band = ratio[first : first + _BAND_ROWS]
         bright, dark = band > _LIT, band < _DARK
         if field is not None:
@@ -98,11 +101,6 @@ def _sigma(values: Float32) -> float:
     return clipped_sigma(thin.astype(np.float64), rounds=6)
 
 
-def _band_step(ratio: Float32) -> int:
-    """Return the rows from one band to the next: all of a small image, a quarter of a large one."""
-    return _BAND_ROWS - 2 if ratio.size < 4 * _NOISE_SAMPLES else 4 * _BAND_ROWS
-
-
 def find_blobs(
     ratio: Float32, *, sigma: float, min_contrast: float, min_diameter_px: float
 ) -> tuple[list[Blob], list[Rejected]]:
@@ -115,51 +113,38 @@ def find_blobs(
     Returns the regions that may be bubbles, and those that are too small or too faint.
     """
     low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
-    shadow = ratio < np.float32(low)
-    regions, tree = cv2.findContours(shadow.view(np.uint8), cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
-    depth = np.array(_depths(tree), np.intp)
-    length = np.array([len(region) for region in regions], np.intp)
-    labels, boxes = np.zeros(ratio.shape, np.int32), [(0, 0, 0, 0)]
-    for k in np.argsort(depth, kind="stable").tolist():
-        if depth[k] % 2 == 0 and length[k] >= _LEAST_OUTLINE:
-            cv2.drawContours(labels, regions, k, (len(boxes),), cv2.FILLED)
-            boxes.append(cv2.boundingRect(regions[k]))
-    place = np.flatnonzero(shadow)
-    if not place.size:
-        return [], []
-    own, value = labels.ravel()[place], ratio.ravel()[place]
-    size = np.bincount(own, minlength=len(boxes))
-    order = np.sort(own + np.clip(value, 0.0, 0.999).astype(np.float64))
-    first = np.cumsum(size) - size
-    inner = order[np.minimum(first + (_DARKEST * size).astype(int), own.size - 1)]
-    inner -= np.arange(size.size)
-    small = np.array([max(box[2:]) for box in boxes]) < min_diameter_px
-    faint = inner > 1.0 - min_contrast
-    half = np.where(small | faint, -np.inf, 0.5 * (1.0 + inner)).astype(np.float32)
-    dark = np.zeros(ratio.shape, np.uint8)
-    dark.ravel()[place[value < half[own]]] = 1
-    _close_at_border(dark, labels)
-    outlines, tree = cv2.findContours(dark, cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
-    traced: list[_Traced] = []
-    for outline, level in zip(outlines, _depths(tree), strict=True):
-        width, height = cv2.boundingRect(outline)[2:]
-        if level % 2 or len(outline) < _LEAST_OUTLINE or max(width, height) < min_diameter_px:
+    shadow = (ratio < np.float32(low)).view(np.uint8)
+    regions, tree = cv2.findContours(shadow, cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
+    depth, blobs, rejected = _depths(tree), [], []
+    for k, region in enumerate(regions):
+        if depth[k] % 2 or len(region) < _LEAST_OUTLINE:
             continue
-        points = outline.reshape(-1, 2)
-        region = int(labels[points[0, 1], points[0, 0]])
-        traced.append(_Traced(points, float(inner[region]), boxes[region], level > 0, region))
-    without = np.arange(len(boxes)) > 0
-    without[[one.region for one in traced]] = False
-    too_small = f"smaller than {min_diameter_px:g} px"
-    rejected = []
-    for k in np.flatnonzero(without).tolist():
-        x, y, width, height = boxes[k]
-        reason = too_small
-        if faint[k] and not small[k]:
-            reason = f"contrast {1.0 - inner[k]:.2f} is below {min_contrast:g}"
-        radius = 0.5 * float(np.sqrt(width * height))
-        rejected.append(Rejected(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
-    return _refined(ratio, traced), rejected
+        box = x, y, width, height = tuple(cv2.boundingRect(region))
+        found, reason = [], f"smaller than {min_diameter_px:g} px"
+        if max(width, height) >= min_diameter_px:
+            window = slice(y, y + height), slice(x, x + width)
+            dark, part = np.zeros((height, width), np.uint8), ratio[window]
+            filled = [region, *_holes(regions, tree, k)]
+            cv2.drawContours(dark, filled, -1, (1,), cv2.FILLED, offset=(-x, -y))
+            dark &= shadow[window]
+            inner = _darkest(part[dark > 0])
+            if inner > 1.0 - min_contrast:
+                reason = f"contrast {1.0 - inner:.2f} is below {min_contrast:g}"
+            else:
+                dark &= (part < np.float32(0.5 * (1.0 + inner))).view(np.uint8)
+                _close_at_border(dark, box, ratio.shape)
+                found = _traced(ratio, dark, box, inner, depth[k] > 0, min_diameter_px)
+        if not found:
+            radius = 0.5 * float(np.sqrt(width * height))
+            rejected.append(Rejected(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
+        blobs += found
+    return blobs, rejected
+
+
+def _darkest(values: Float32) -> float:
+    """Return the level of the darkest 5 % of a region's pixels, between 0 and 1."""
+    place = int(_DARKEST * values.size)
+    return float(np.clip(np.partition(values, place)[place], 0.0, 0.999))
 
 
 def _depths(tree: NDArray[np.int32] | None) -> list[int]:
@@ -174,67 +159,55 @@ def _depths(tree: NDArray[np.int32] | None) -> list[int]:
     return depths
 
 
-class _Traced(NamedTuple):
-    """An outline of pixels (n, 2), the level inside, the box of the region it came from, whether
-    another region surrounds it, and the number of the region."""
+def _holes(
+    regions: Sequence[NDArray[Any]], tree: NDArray[np.int32], region: int
+) -> Iterator[NDArray[Any]]:
+    """Yield the outlines of a region's bright holes."""
+    hole = int(tree[0, region, 2])
+    while hole >= 0:
+        yield regions[hole]
+        hole = int(tree[0, hole, 0])
 
-    pixels: NDArray[np.int32]
-    inner: float
-    box: tuple[int, int, int, int]
-    within: bool
-    region: int
 
-
-def _close_at_border(dark: NDArray[np.uint8], labels: NDArray[np.int32]) -> None:
+def _close_at_border(dark: NDArray[np.uint8], box: Box, shape: tuple[int, ...]) -> None:
     """Join what is dark of a region along the image's edges: a bright centre cut by the edge
-    becomes a hole. Both images are changed."""
-    for edge in (np.s_[0], np.s_[:, 0], np.s_[-1], np.s_[:, -1]):
-        line, own = dark[edge], labels[edge]
+    becomes a hole.
+
+    dark : (height, width) of the region's box, which is changed; shape : of the image.
+    """
+    x, y, width, height = box
+    edges = [(y == 0, dark[0]), (x == 0, dark[:, 0])]
+    edges += [(y + height == shape[0], dark[-1]), (x + width == shape[1], dark[:, -1])]
+    for line in (line for at_edge, line in edges if at_edge):
         places = np.flatnonzero(line)
-        for low, high in zip(places[:-1].tolist(), places[1:].tolist(), strict=True):
-            if high - low == 1 or own[low] != own[high]:
-                continue
-            extent = np.ptp(places[own[places] == own[low]]) + 1
-            if high - low <= _MAX_CUT_CENTRE_SHARE * extent:
-                line[low:high], own[low:high] = 1, own[low]
+        for k in np.flatnonzero(np.diff(places) > 1).tolist():
+            if places[k + 1] - places[k] <= _MAX_CUT_CENTRE_SHARE * (np.ptp(places) + 1):
+                line[places[k] : places[k + 1]] = 1
 
 
-def _refined(ratio: Float32, traced: list[_Traced]) -> list[Blob]:
-    """Return blobs with outline points moved along the gradient to half depth."""
-    if not traced:
-        return []
-    rows, columns = ratio.shape
-    sizes = np.array([len(one.pixels) for one in traced])
-    points = np.concatenate([one.pixels for one in traced]).astype(np.intp)
-    inner = np.repeat(np.array([one.inner for one in traced], np.float32), sizes)
-    u, v = points.T
-    left, right = np.maximum(u - 1, 0), np.minimum(u + 1, columns - 1)
-    above, here, below = (
-        row * columns for row in (np.maximum(v - 1, 0), v, np.minimum(v + 1, rows - 1))
-    )
-    value = ratio.ravel().take
-    north_west, north_east = value(above + left), value(above + right)
-    south_west, south_east = value(below + left), value(below + right)
-    slope_u = 2.0 * (value(here + right) - value(here + left))
-    slope_u = (slope_u + (north_east - north_west) + (south_east - south_west)) / 8.0
-    slope_v = 2.0 * (value(below + u) - value(above + u))
-    slope_v = (slope_v + (south_west - north_west) + (south_east - north_east)) / 8.0
-    square = np.maximum(slope_u**2 + slope_v**2, (0.02 * (1.0 - inner)) ** 2)
-    shift = (0.5 * (1.0 + inner) - value(here + u)) / square
-    shift = shift * np.minimum(1.0, 1.2 / np.maximum(np.abs(shift) * np.sqrt(square), 1e-9))
-    moved = np.stack([u + shift * slope_u, v + shift * slope_v], axis=1).astype(np.float64)
-    edge = (u <= 0) | (v <= 0) | (u >= columns - 1) | (v >= rows - 1)
-    moved[edge] = np.nan
-    blobs, first = [], 0
-    for one, size in zip(traced, sizes.tolist(), strict=True):
-        part = slice(first, first + size)
-        place = int(_STEEP_SHARE * size)
-        steepest = float(np.sqrt(np.partition(square[part], place)[place]))
-        blur = (1.0 - one.inner) / (np.sqrt(2.0 * np.pi) * max(steepest, 1e-6))
+def _traced(
+    ratio: Float32, dark: NDArray[np.uint8], box: Box, inner: float, within: bool, least_px: float
+) -> list[Blob]:
+    """Return the blobs of a region, with outline points moved along the gradient to half depth.
+
+    dark : (height, width) what is darker than half depth in the region's box.
+    """
+    outlines, tree = cv2.findContours(dark, cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE, offset=box[:2])
+    blobs = []
+    for outline, level in zip(outlines, _depths(tree), strict=True):
+        if level % 2 or len(outline) < _LEAST_OUTLINE:
+            continue
+        if max(cv2.boundingRect(outline)[2:]) < least_px:
+            continue
+        pixels = outline.reshape(-1, 2)
+        points, slope = np.empty(pixels.shape), np.empty(len(pixels))
+        kernels.move_to_half_depth(ratio, pixels, inner, points, slope)
+        place = int(_STEEP_SHARE * slope.size)
+        steepest = float(np.partition(slope, place)[place])
+        blur = (1.0 - inner) / (np.sqrt(2.0 * np.pi) * max(steepest, 1e-6))
         blur = float(np.sqrt(max(blur**2 - 0.6, 0.15)))
-        at_border = bool(edge[part].any())
-        blobs.append(Blob(moved[part], one.inner, blur, one.box, at_border, one.within))
-        first += size
+        at_border = not np.all(np.isfinite(points))
+        blobs.append(Blob(points, inner, blur, box, at_border, within or level > 0))
     return blobs
 
 

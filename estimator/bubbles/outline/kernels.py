@@ -13,11 +13,14 @@ of the ellipse, it has the displacements of the centre along both axes, of a, of
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from telerig.arrays import Array, Float32, Ints
 from telerig.compiled import compiled
 from telerig.estimator.bubbles.outline import ellipse_geometry
 from telerig.statistics import NORMAL_FROM_MEDIAN
+
+Pixels = NDArray[np.int32]
 
 ELLIPSE = 5
 BLUR, OUTER, INNER, HARMONIC = 5, 6, 7, 8
@@ -44,9 +47,11 @@ _LEAST_SIGMA_PX = 0.3
 """Half of a pixel's width: no image has a sharper edge."""
 _OCTANTS, _SECTORS = 8, 16
 _HALF_OCTANT = np.tan(np.pi / 8.0)
-_UNLIKE_SHARE, _UNLIKE_FROM, _MARGIN_SIGMA = 0.015, 1.3, 0.9
-"""A ring of pixels is unlike a rim beyond this share of the contrast, outside so many blurs; what
-lies so much nearer is left out, too."""
+_UNLIKE_SHARE, _UNLIKE_FROM = 0.015, 1.3
+"""A ring of pixels is unlike a rim beyond this share of the contrast, outside so many blurs."""
+_MARGIN_WITHIN, _MARGIN_OUTSIDE = 1.5, 1.2
+"""What is nearer to the rim than such a ring by so many blurs is left out, too. Light within a
+bubble is blurred like its rim and moves a small outline before it is 1.5 % of the contrast."""
 _MOST_RINGS = 1000
 _LEAST_FREEDOM = 4.0
 """Sectors of an outline that tell the variance of their errors."""
@@ -82,6 +87,8 @@ _POINT_SIGMA_PX, _FAR_PX = 0.2, 0.6
 """Scatter of an arc's points, and the distance at which the weight of one is halved."""
 _ROUND_SHARE, _ARC_ROUNDS = 0.12, 8
 """Prior standard deviation of a - b as a share of the radius: arcs of half an ellipse are usual."""
+_LEAST_SLOPE, _FARTHEST_PX = 0.02, 1.2
+"""Least slope at a region's outline, as a share of its depth, and how far its points are moved."""
 
 _axis_distance = compiled(ellipse_geometry.axis_distance)
 
@@ -371,7 +378,8 @@ def _leave_out_unlike(
                 cut[p] = r
                 break
     for k in range(many):
-        if abs(distance[k]) > cut[part[k]] - _MARGIN_SIGMA * sigma:
+        margin = _MARGIN_OUTSIDE if distance[k] > 0.0 else _MARGIN_WITHIN
+        if abs(distance[k]) > cut[part[k]] - margin * sigma:
             weight[k] = 0.0
 
 
@@ -792,6 +800,33 @@ def fitted(
             cos, sin = np.cos(angle), np.sin(angle)
             outline[i] = at[i] * cos + at[i + 1] * sin
             outline[i + 1] = at[i + 1] * cos - at[i] * sin
+
+
+@compiled
+def move_to_half_depth(
+    ratio: Float32, pixels: Pixels, inner: float, points: Array, slope: Array
+) -> None:
+    """Move the pixels of a dark region's outline along the gradient to half of its depth.
+
+    ratio : (rows, columns) grey levels divided by the background; inner : level of the region.
+    pixels : (n, 2) outline. points : (n, 2) receives the places (px), NaN on the image's border;
+        slope : (n,) the gradient's size by Sobel's filter (1/px), at least 2 % of the depth.
+    """
+    rows, columns = ratio.shape
+    for k in range(slope.size):
+        u, v = pixels[k, 0], pixels[k, 1]
+        left, right = max(u - 1, 0), min(u + 1, columns - 1)
+        above, below = max(v - 1, 0), min(v + 1, rows - 1)
+        falling = ratio[below, right] - ratio[above, left]
+        rising = ratio[above, right] - ratio[below, left]
+        across = (2.0 * (ratio[v, right] - ratio[v, left]) + falling + rising) / 8.0
+        down = (2.0 * (ratio[below, u] - ratio[above, u]) + falling - rising) / 8.0
+        slope[k] = max(np.sqrt(across * across + down * down), _LEAST_SLOPE * (1.0 - inner))
+        shift = (0.5 * (1.0 + inner) - ratio[v, u]) / slope[k]
+        shift = min(max(shift, -_FARTHEST_PX), _FARTHEST_PX) / slope[k]
+        points[k, 0], points[k, 1] = u + shift * across, v + shift * down
+        if not (0 < u < columns - 1 and 0 < v < rows - 1):
+            points[k, 0] = points[k, 1] = np.nan
 
 
 @compiled

@@ -17,6 +17,7 @@ from telerig.estimator.bubbles.detect import (
     outline_points,
 )
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS, HARMONIC_COLUMNS
+from telerig.io.simulation.images.bubbles import Look, Silhouette, transmission
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from bubble_outline_renderer import Drawn, centre_bound_px, draw
@@ -113,6 +114,36 @@ def test_harmonics_of_a_deformed_outline_come_back() -> None:
     centroid = np.array([np.sum(dark * u), np.sum(dark * v)]) / np.sum(dark)
     assert outline_centroid(table)[0] == pytest.approx(centroid, abs=0.02)
     assert row["area_px2"] == pytest.approx(np.sum(dark), rel=0.003)
+
+
+@pytest.mark.parametrize(("radius", "allowed"), [(9.0, 0.018), (13.0, 0.0125)])
+def test_light_within_a_small_blurred_bubble_hardly_moves_it(radius: float, allowed: float) -> None:
+    # A ring of light at 0.69 radii, brighter below: 2 to 3 blurs from the rim.
+    angle = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+    off = []
+    for seed in range(6):
+        place = np.random.default_rng(seed).uniform(28.0, 32.0, 2)
+        outline = place + radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+        seen = transmission((60, 60), [Silhouette(outline, Look(ring=0.08), 1.6)])
+        image = digitised(seen, noise=0.01, seed=seed)
+        table = detect_bubbles(image, background=level(image.shape))
+        off.append(outline_centroid(table)[0] - place)
+    assert np.max(np.abs(np.mean(off, axis=0))) < allowed
+
+
+def test_a_thing_at_the_rim_that_bends_an_outline_is_part_of_its_error() -> None:
+    shape, white = (160, 320), 3000.0
+    places = [(40.3 + 80 * i, 39.8 + 80 * j) for i in range(4) for j in range(2)]
+    image = draw([Drawn((*place, 20, 20, 0.0)) for place in places], shape, blur_px=1.2)
+    speck = Drawn((places[0][0] + 20, places[0][1], 4, 4, 0.0))
+    image *= 0.5 + 0.5 * draw([speck], shape, blur_px=1.2)
+    found = detect_bubbles(digitised(image, noise=0.01, white=white), background=level(shape))
+    off = found[["u_px", "v_px"]].to_numpy() - places[0]
+    k = int(np.argmin(np.hypot(*off.T)))
+    covariance = found.loc[k, ["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
+    square = off[k] @ np.linalg.solve(covariance.reshape(2, 2), off[k])
+    assert np.hypot(*off[k]) > 0.05  # it is bent
+    assert square < 2.0  # and says so; it is 11 without the variance of what bends it
 
 
 def test_outline_points_lie_on_the_half_level() -> None:

@@ -21,6 +21,12 @@ ORDINARY = 0.01
 degrees."""
 
 
+def has_ordinary_lens(statistics: Mapping[str, Any]) -> bool:
+    """Return whether a lens is an ordinary one by `statistics` of `calibration.json`."""
+    of: Mapping[str, Mapping[str, float]] = statistics.get("telecentricity") or {}
+    return any(lens["perspective"] > ORDINARY for lens in of.values())
+
+
 def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
     """Return sentences on how far each camera is telecentric.
 

@@ -32,7 +32,7 @@ from telerig.io.report.plot.axes import camera_colour
 from telerig.io.report.plot.outline import common_plane
 from telerig.io.report.plot.rig import sd_in_plane
 from telerig.io.report.plot.target import target_shape
-from telerig.io.results.calibration_words import telecentricity_words
+from telerig.io.results.calibration_words import has_ordinary_lens, telecentricity_words
 from telerig.io.results.findings import ASK_FOR_VIEWS, TRUST, Status
 from telerig.io.results.folders.calibration import CalibrationResults, read_calibration_results
 from telerig.io.results.manifest import reading
@@ -299,6 +299,10 @@ def _cameras(results: CalibrationResults) -> list[Block]:
     pose, stage = tables.pose_rows(results), tables.stage_rows(results)
     names = results.camera_names
     observable = (
+        "Where on its optical axis a camera's origin lies is a choice, for which scale and κ are "
+        "stated; the centre of perspective is at the distance 1 / κ from it. The standard "
+        "deviations of shifts along the axes are those of this gauge."
+        if has_ordinary_lens(results.statistics) else
         "Only the three rotations and the distance between the axes are observable; the other two "
         "shifts are held by the gauge, so that their standard deviations are those of the gauge."
         if len(names) < 3 else

@@ -92,11 +92,15 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
         free = any(name in camera.free for camera in cameras)
         rows.append(Row((f"{LENS_PARAMETERS[name].label} ({name})", *cells), faint=not free))
     largest = [_largest_distortion(camera) for camera in results.cameras]
-    perspective = [f"{number(1e6 * c['kappa_per_mm'])} ppm" for c in results.cameras]
+    changes = results.statistics.get("telecentricity") or {}
+    perspective = [
+        f"{with_sd(1e6 * lens['change_per_mm'], 1e6 * lens['sd_per_mm'])} ppm"
+        for lens in changes.values()
+    ]
     return [
         *rows,
         Row(("largest distortion in the image", *largest)),
-        Row(("scale lost per mm of depth", *perspective)),
+        *([Row(("change of the scale per mm of depth", *perspective))] if perspective else []),
         Row(("field of view, mm", *(_field(camera) for camera in results.cameras))),
     ]
 

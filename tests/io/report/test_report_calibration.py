@@ -113,6 +113,16 @@ def test_a_scale_that_may_not_change_is_not_said_to(
     assert words.startswith(said)
 
 
+def test_the_page_of_ordinary_lenses_says_one_thing(folder: Path) -> None:
+    lens = {"change_per_mm": 9.39e-3, "sd_per_mm": 4.4e-7, "depth_mm": 80.0, "perspective": 0.6}
+    _edit(folder, statistics={"telecentricity": {"left": lens, "right": lens}})
+    text = Page(write_calibration_report(folder)).text
+    assert "the scale changes by 0.94 and 0.94 % per mm" in text
+    assert "9390.00 ±\u00a00.44 ppm" in text
+    assert "centre of perspective is at the distance" in text
+    assert "Only the three rotations" not in text
+
+
 def test_one_camera_and_nothing_optional(tmp_path: Path) -> None:
     folder = write_calibration_folder(tmp_path / "mono", cameras=1)
     _edit(folder, model={}, twin={}, covariance=None, statistics={"rms_px": None})

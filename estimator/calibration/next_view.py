@@ -20,18 +20,19 @@ from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
-from telerig.estimator.calibration.thresholds import ENOUGH_SHARE, RECOMMENDED_VIEWS
+from telerig.estimator.calibration.thresholds import (
+    ENOUGH_SHARE,
+    PARALLEL_DEG,
+    RECOMMENDED_VIEWS,
+)
 from telerig.factors.calibration import Observations, State, pixels, whitened_residuals
 from telerig.io.results.calibration import NextPose
 from telerig.rig.triangulation import aligned_shift, working_volume
+from telerig.short_text import number
 
 ALIKE_SHARE = 0.9
 """Among candidates with at least this share of the best gain, the one that fills most of the empty
 parts of the images is taken."""
-_NOTABLE_SHARE = 0.5
-_SHOWN = 3
-_WHOLE_UM = 100.0
-_MANY_DOTS = 150
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class NextView:
     def verdict(self) -> str:
         """Return a sentence on how much one more view would reduce the errors."""
         if not self.poses:
-            good = rounded_um(self.before_um)
+            good = number(self.before_um, 2)
             return (
                 f"{self.views} views; the calibration's share of the errors of points is {good} "
                 "µm; no further pose was found in which two cameras see the target"
@@ -79,15 +80,15 @@ class NextView:
         worth = ": these views are enough" if self.enough() else ""
         return (
             f"{self.views} views; one more would reduce the calibration's share of the errors of "
-            f"points from {rounded_um(self.before_um, self.after_um)} to "
-            f"{rounded_um(self.after_um, self.before_um)} µm{self._floor()}{worth}"
+            f"points from {number(self.before_um, 3)} to "
+            f"{number(self.after_um, 3)} µm{self._floor()}{worth}"
         )
 
     def _floor(self) -> str:
-        if self.size_um < _NOTABLE_SHARE * self.before_um:
+        if 2 * self.size_um**2 < self.before_um**2:
             return ""
         return (
-            f" ({rounded_um(self.size_um)} µm remain with any number of views, because the "
+            f" ({number(self.size_um, 2)} µm remain with any number of views, because the "
             "target's size is not known better)"
         )
 
@@ -122,24 +123,25 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
     """
     if len(problem.cameras) < 2 or not np.isfinite(joint.rig_block()[1]).all():
         return None
-    few, many = spread_dots(problem), spread_dots(problem, _MANY_DOTS)
-    gain = ViewGain.of(problem, state, joint, np.union1d(few, many))
+    some = spread_dots(problem)
+    gain = ViewGain.of(problem, state, joint, some)
     kept = problem.kept
     images = np.unique(np.stack([problem.view[kept], problem.camera[kept]], 1), axis=0)
     views = int((np.bincount(images[:, 0]) > 1).sum())
     found = candidates(problem, state)
     if not len(found):
         return NextView(views, gain.before_um, (), gain.size_um)
-    gained_um = gain.before_um - gain.after_um(found, few)
-    chosen = found.some(_preferred(problem, state, found, gained_um, few))
+    after_um = gain.after_um(found, some)
+    best = _preferred(problem, state, found, gain.before_um - after_um, some)
+    chosen = found.some(best)
     poses = tuple(
         NextPose(
             words=hold_words(problem, state, chosen.some(slice(i, i + 1))),
             reasons=reason_words(problem, state, chosen.some(slice(i, i + 1))),
-            after_um=float(after_um),
+            after_um=float(after_um[k]),
             rig_from_target=chosen.rig_from_target[i],
         )
-        for i, after_um in enumerate(gain.after_um(chosen, many))
+        for i, k in enumerate(best)
     )
     marks = problem.dot_ids[problem.target.is_mark(problem.dot_ids)]
     return NextView(views, gain.before_um, poses, gain.size_um, tuple(int(m) for m in marks))
@@ -159,17 +161,7 @@ def _preferred(
     fills = np.array([new_cells(problem, v, uv).sum() for v, uv in zip(*seen)])
     ranked = np.r_[alike[np.argsort(-fills, kind="stable")], order[len(alike) :]]
     _, first = np.unique(found.tilt[ranked], return_index=True)
-    return np.asarray(ranked[np.sort(first)[:_SHOWN]])
-
-
-def rounded_um(value: float, other: float = np.nan) -> str:
-    """Return ``value`` as text, with so many digits that it differs from ``other`` as text."""
-    if value >= _WHOLE_UM:
-        return f"{value:.0f}"
-    digits = 2
-    while digits < 4 and f"{value:.{digits}g}" == f"{other:.{digits}g}":
-        digits += 1
-    return f"{value:.{digits}g}"
+    return np.asarray(ranked[np.sort(first)[:3]])
 
 
 TILT_LIMIT_DEG = 62.0
@@ -177,7 +169,6 @@ TILT_LIMIT_DEG = 62.0
 ellipse to be found safely."""
 TURNS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
 """Angles by which candidates turn the plate's normal away from the middle between two cameras."""
-DIRECTIONS = 8
 ROLLS_DEG = (0.0, 45.0, 90.0, 135.0)
 PLACES = np.array([(0.0, 0.0, 0.0), *product((-1.0, 1.0), repeat=3)])
 """Places of the target's middle: the middle of the volume and the corners of a cube round it."""
@@ -189,7 +180,6 @@ SEEN_SHARE = 0.9
 cameras."""
 CELLS = 6
 """An image is divided into this many parts along u and along v, to see where no dot has been."""
-FEW_DOTS = 25
 _EDGE_ON = 0.1
 
 
@@ -295,7 +285,7 @@ def _normals(problem: Problem, state: State) -> tuple[Array, Array, Bools, Ints]
             limit = np.cos(min(max(np.radians(TILT_LIMIT_DEG), half + 0.15), 1.3))
             alike, along, across = bases(axes[list(pair)], side)
             for turn in np.radians(TURNS_DEG):
-                for way in 2 * np.pi * np.arange(DIRECTIONS if turn else 1) / DIRECTIONS:
+                for way in 2 * np.pi * np.arange(len(_WAYS) if turn else 1) / len(_WAYS):
                     aside = np.cos(way) * along + np.sin(way) * across
                     normal = np.cos(turn) * alike + np.sin(turn) * aside
                     if min(normal @ a, normal @ b) < limit:
@@ -383,7 +373,7 @@ def dots_seen(problem: Problem, state: State, poses: Candidates, dots: Ints) -> 
     return inside & poses.sees[..., None], uv
 
 
-def spread_dots(problem: Problem, count: int = FEW_DOTS) -> Ints:
+def spread_dots(problem: Problem, count: int = 25) -> Ints:
     """Return the indices of up to ``count`` dots, evenly spread over the list of all dots."""
     whole = len(problem.dot_ids)
     return np.unique(np.linspace(0, whole - 1, min(count, whole)).round().astype(np.int64))
@@ -529,10 +519,6 @@ def _noise_px(problem: Problem, camera: int) -> float:
 
 _WAYS = ("to the right", "to the lower right", "down", "to the lower left",
          "to the left", "to the upper left", "up", "to the upper right")  # fmt: skip
-_NEARLY_DEG = 3.0
-_NEARLY_MM = 0.5
-_MORE_TILT_DEG = 4.0
-_CORNER_CELLS = 2
 
 
 def hold_words(problem: Problem, state: State, one: Candidates) -> str:
@@ -549,19 +535,19 @@ def hold_words(problem: Problem, state: State, one: Candidates) -> str:
     middle = -facing[0] * alike
     to_first = -axes[0] - (-axes[0] @ middle) * middle
     to_first = to_first / max(np.linalg.norm(to_first), 1e-9)
-    if np.linalg.norm(np.cross(axes[0], axes[1])) < 0.1:
+    if np.linalg.norm(np.cross(axes[0], axes[1])) < _EDGE_ON:
         to_first = along
     turn = np.degrees(np.arctan2(looks @ to_first, looks @ middle))
     upright = abs(across[1]) >= abs(across[0])
     across = across * np.sign(-across[1] if upright else across[0])
     lean = np.degrees(np.arcsin(np.clip(looks @ across, -1, 1)))
     parts = [_start_words(problem, facing, (first, second))]
-    if abs(turn) >= _NEARLY_DEG:
+    if abs(turn) >= PARALLEL_DEG:
         way = "towards" if facing[0] == facing[1] else "squarer to"
         parts.append(
             f"turn it {abs(turn):.0f} degrees {way} camera {first if turn > 0 else second}"
         )
-    if abs(lean) >= _NEARLY_DEG:
+    if abs(lean) >= PARALLEL_DEG:
         edge = "top" if upright else "right edge"
         parts.append(f"tilt its {edge} {abs(lean):.0f} degrees {'back' if lean > 0 else 'forward'}")
     parts.append(_roll_words(problem, rig_from_target))
@@ -602,7 +588,7 @@ def _place_words(problem: Problem, state: State, rig_from_target: Array) -> str:
         for value, ways in (
             (y, ("above", "below")), (x, ("left of", "right of")), (z, ("nearer than", "beyond")),
         )
-        if abs(value) >= _NEARLY_MM
+        if round(value)
     ]  # fmt: skip
     if not parts:
         return "its middle in the middle of the field"
@@ -621,7 +607,7 @@ def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, 
     for c, camera in enumerate(problem.cameras):
         most, tilt = (float(np.degrees(np.arccos(np.clip(v, 0, 1)))) for v in
                       (cosine[c].min(), then[c]))  # fmt: skip
-        if one.sees[0, c] and tilt > most + _MORE_TILT_DEG:
+        if one.sees[0, c] and tilt > most + PARALLEL_DEG:
             out.append(
                 f"a tilt of {tilt:.0f} degrees to camera {camera.name}, so far {most:.0f} at most"
             )
@@ -632,7 +618,7 @@ def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, 
 
 def _where(cells: Array) -> str:
     """Return words on the empty parts (columns, rows) that are filled."""
-    near, far = slice(0, _CORNER_CELLS), slice(-_CORNER_CELLS, None)
+    near, far = slice(0, CELLS // 3), slice(-(CELLS // 3), None)
     names = [
         f"{upper} {left}"
         for v, upper in ((near, "upper"), (far, "lower"))

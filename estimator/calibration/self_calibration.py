@@ -32,6 +32,7 @@ from telerig.estimator.calibration.result_from_fit import (
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.problem import (
+    HELD_MM,
     Problem,
     checked_outlier_sd,
     eccentricity_px,
@@ -274,16 +275,15 @@ def hold_dots(problem: Problem, dots_free: str) -> Problem:
 
     dots_free : as for `self_calibrate`. Raises CalibrationError for another value.
     """
-    held = 1e-6
     sigma = problem.dot_sigma_mm.copy()
     if dots_free not in ("3d", "plane", "nominal"):
         raise CalibrationError(
             f"dots_free is {dots_free!r}", todo="give one of: 3d, plane or nominal"
         )
     if dots_free in ("plane", "nominal"):
-        sigma[:, 2] = held
+        sigma[:, 2] = HELD_MM
     if dots_free == "nominal":
-        sigma[:] = held
+        sigma[:] = HELD_MM
     return replace(problem, dot_sigma_mm=sigma)
 
 

@@ -395,8 +395,6 @@ def _summary(stops: Stops, axis: Array, travel_per_reading: float, joint: Array)
     )
 
 
-_STEPS = 60
-_REWEIGHTED = 25
 _SUSPECT = 3.5
 
 
@@ -470,27 +468,33 @@ class StageEquations:
 
 
 def fit(
-    stops: Stops, travel: Travel, sigma_mm: tuple[float, float]
+    stops: Stops,
+    travel: Travel,
+    sigma_mm: tuple[float, float],
+    *,
+    steps: int = 60,
+    reweighted: int = 25,
 ) -> tuple[Travel, Weights, StageEquations]:
     """Fit the travel to the dots by robust Gauss-Newton steps from a start.
 
     sigma_mm : standard deviations of the carriage's position along and across the axis. A dot or an
     encoder reading that is farther than 3.5 standard deviations from the fit loses weight
     (`travel_weights`).
+    steps : largest number of steps. reweighted : after so many the weights stay.
     Returns the fitted travel, the weights and the equations there. Raises CalibrationError if the
     fit does not converge.
     """
     weights = Weights(np.ones(len(stops.problem.view)), np.ones(len(stops.reading_mm)))
     system = linearised(stops, travel, sigma_mm, weights)
     limit = np.inf
-    for turn in range(_STEPS):
+    for turn in range(steps):
         step = system.given_cameras().step()[0][:9]
         travel = travel.moved(step)
         scores = _scores(system, travel, sigma_mm[0])
         highest = float(np.sqrt(max(s.max() for s in scores)))
         limit = next_limit(limit, highest, _SUSPECT)
         fresh = weights
-        if turn < _REWEIGHTED:
+        if turn < reweighted:
             fresh = Weights(*(travel_weights(score, limit) for score in scores))
         moved = np.ptp(fresh.dots - weights.dots) + np.ptp(fresh.views - weights.views)
         weights = fresh

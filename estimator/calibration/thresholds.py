@@ -6,11 +6,9 @@ What becomes a finding has its limit in `telerig.io.results.findings`. Settings 
 
 from __future__ import annotations
 
+from telerig.estimator.dots.thresholds import OUTLIER_SD as OUTLIER_SD
 from telerig.io.results.findings import Code
 
-OUTLIER_SD = 4.5
-"""A dot farther than this many standard deviations from its prediction is left out, with Gaussian
-noise 4e-5 of all correct dots."""
 LEAST_OUTLIER_SD = 3.0
 """The smallest limit that is accepted. It leaves out one correct dot in 90; with a lower limit too
 much ordinary noise would be taken for outliers."""

@@ -18,7 +18,7 @@ from telerig.estimator.calibration.calibrate import (
     run_calibration,
     solve_dots,
 )
-from telerig.estimator.calibration.next_view import first_views, rounded_um
+from telerig.estimator.calibration.next_view import first_views
 from telerig.estimator.calibration.thresholds import ENOUGH_SHARE, RECOMMENDED_VIEWS
 from telerig.estimator.dots.dataset_dots import (
     NO_DOTS,
@@ -31,14 +31,13 @@ from telerig.estimator.dots.locate import REJECTED
 from telerig.io.dataset.dataset import Dataset, NoViewsError, View, load_dataset
 from telerig.live import due, folder_for_viewer, publish
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
+from telerig.short_text import number
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
 
 Tell = Callable[[str], None]
 Stamp = tuple[int, int]
-_FEWEST = 2
-_NAMED = 5
 
 
 class Stop(Protocol):
@@ -203,8 +202,8 @@ def _needed(dataset: Dataset) -> int:
     return min(2, len(dataset.rig.cameras))
 
 
-def _missing(views: list[str], camera: str) -> str:
-    some = ", ".join(views[:_NAMED]) + (", ..." if len(views) > _NAMED else "")
+def _missing(views: list[str], camera: str, most: int = 5) -> str:
+    some = ", ".join(views[:most]) + (", ..." if len(views) > most else "")
     what = f"view {some} has" if len(views) == 1 else f"{len(views)} views ({some}) have"
     return (
         f"{what} no image of camera {camera}; the images of a view have the same name in every "
@@ -270,7 +269,7 @@ def _solved(
 ) -> bool:
     """Solve and report the state of the calibration; whether the views are enough."""
     count = len(folder.complete())
-    if count < _FEWEST:
+    if count < 2:
         tell(_too_few(dataset, count))
         return False
     try:
@@ -327,7 +326,7 @@ def standing(
         residual = calibration.statistics["rms_px"]
         return f"{words}: residual {residual:.3g} px. Next: {_generic(dataset, count)}", False
     sd = advice["before_um"]
-    words += f": standard deviation of points in space {rounded_um(sd)} µm"
+    words += f": standard deviation of points in space {number(sd, 2)} µm"
     if count < RECOMMENDED_VIEWS:
         missing = RECOMMENDED_VIEWS - count
         return f"{words}; {missing} more views needed. Next: {_generic(dataset, count)}", False
@@ -341,5 +340,5 @@ def standing(
         return f"{words}. These views are enough: {gain}{unmet}", True
     if not advice["poses"]:
         return f"{words}. {advice['verdict']}", False
-    after = rounded_um(advice["after_um"])
+    after = number(advice["after_um"], 2)
     return f"{words}; {after} µm with one more view. Next: {advice['poses'][0]['words']}", False

@@ -177,8 +177,6 @@ Progress = Callable[[int, int], None]
 MEGAPIXELS_FOR_WORKERS = 40
 """Number of pixels below which starting worker processes takes longer than they save."""
 
-OVERLAY_WIDTH_PX = 900
-
 NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
 
 
@@ -261,7 +259,7 @@ def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = F
 def _with_overlay(found: ImageDots, image: NDArray[Any]) -> ImageDots:
     from telerig.io.report.overlays import overlay_jpeg
 
-    drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=OVERLAY_WIDTH_PX)
+    drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=900)
     return replace(found, overlay=drawn)
 
 

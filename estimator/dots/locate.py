@@ -63,10 +63,8 @@ COLUMNS = [
 ]
 REJECTED = ["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"]
 
-_FIRST_SIGMA_PX = 1.0
 _FEWEST_PIXELS = 25
 """Least number of pixels for a second fit; a dot whose first fit left the image has fewer."""
-_ROUNDS = 10
 _MOVED_SD = 0.1
 """If a dot moves by more standard deviations than this, its neighbours are fitted again."""
 
@@ -239,12 +237,12 @@ class _Scene:
         """Fit each dot independently, to a part of its pixels."""
         fits = []
         for blob in self.blobs:
-            start = Start(blob.centre_px, blob.shape_px, _FIRST_SIGMA_PX)
+            start = Start(blob.centre_px, blob.shape_px, Prior().edge_px)
             window = dot_window(self.grey, self.labels, blob, start, coarse=True)
             fits.append(fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1))
         return fits
 
-    def second_fits(self, fits: list[DotFit], noise: NoiseModel) -> list[DotFit]:
+    def second_fits(self, fits: list[DotFit], noise: NoiseModel, rounds: int = 10) -> list[DotFit]:
         """Fit each dot again, with the illumination and its neighbours known from the first fits.
 
         Of dots that share pixels, each is fitted after the light of the others was subtracted,
@@ -254,7 +252,7 @@ class _Scene:
         neighbours = close_neighbours(fits)
         fits = list(fits)
         again: Sequence[int] = range(len(fits))
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             moved: set[int] = set()
             for i in again:
                 window = self._window(i, fits, neighbours[i])

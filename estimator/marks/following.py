@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import GeometryError
-from telerig.estimator.dots.grid.numbering import DOT_FALSE, DOT_LOST, WRONG_ODDS
+from telerig.estimator.dots.thresholds import (
+    DOT_LOST,
+    FALSE,
+    LEAST_FRAMES,
+    OUTLIER_SD,
+    TOUCHED,
+    WRONG_ODDS,
+)
 from telerig.estimator.marks.strip_dots import DotLook, DotSightings
 from telerig.rig.camera import Camera
 
@@ -116,16 +123,15 @@ LOST = "no dot is where it was expected"
 
 _FIRST_STEP_MM = 0.3
 _LEAST_STEP_MM = 0.1
-_REACH = 5.0
 _LEARN = 0.1
-_UNMATCHED, _MISSED, _SURE = (-float(np.log(p)) for p in (DOT_FALSE, DOT_LOST, WRONG_ODDS))
+_UNMATCHED, _MISSED, _SURE = (-float(np.log(p)) for p in (FALSE, DOT_LOST, WRONG_ODDS))
 """Log-likelihood that a stray dot, a mark in view without a dot, and a second shift cost at most:
 with the probabilities by which the dots of a target are numbered."""
-_TOLERANCE, _SAME, _APART = 0.06, 0.5, 0.4
-_GATE, _PLACE_PX, _PLACE_GAIN = 5.0, 0.1, 0.3
-_CONFIRM, _FORGET, _MOVED_PX = 3, 50, 2.0
+_TOLERANCE = 0.06
+"""Standard deviation of a dot's place against the other dots', in diameters."""
+_PLACE_PX = 0.1
+_FORGET, _MOVED_PX = 50, 2.0
 _FIRST_SHARE = 0.2
-_TOO_MANY_LOST = 2
 
 
 @dataclass
@@ -218,7 +224,7 @@ class Follower:
                 self._learn(shift.mm - predicted, sd)
                 self._accept(frame, shift.mm, known)
                 return self._sighted(frame, place - shift.mm, dots, shift)
-            if shift is None and known and len(self._expected(predicted)) < _TOO_MANY_LOST:
+            if shift is None and known and len(self._expected(predicted)) < 2:
                 return self._new_marks(frame, place - predicted, dots, range(len(place)))
             self._restart(frame, LOST if shift is None else AMBIGUOUS)
             predicted = predicted if known else np.zeros(2)
@@ -235,7 +241,7 @@ class Follower:
         return [
             m
             for m in [*self.finished, *self.marks]
-            if m.sightings >= _CONFIRM and (m.travelled_px >= far or m.always_seen)
+            if m.sightings >= LEAST_FRAMES and (m.travelled_px >= far or m.always_seen)
         ]
 
     def brief(self, kept: list[Mark]) -> list[Mark]:
@@ -255,7 +261,7 @@ class Follower:
             for m in [*self.finished, *self.marks]
             if m.number not in taken
             and low < m.place_mm[1] < high
-            and (m.always_seen or (m.sightings >= _CONFIRM and m.travelled_px > _MOVED_PX))
+            and (m.always_seen or (m.sightings >= LEAST_FRAMES and m.travelled_px > _MOVED_PX))
         ]
 
     def _prediction(self, frame: int, place: Array, known: bool) -> tuple[Array, float]:
@@ -292,7 +298,8 @@ class Follower:
         """Return the likeliest shift; None if no dot is near a mark."""
         known = np.array([m.place_mm for m in self.marks])
         apart = place[:, None] - known
-        near = np.linalg.norm(apart - predicted, axis=-1) < max(_REACH * sd, self.diameter_mm / 2)
+        reach = max(OUTLIER_SD * sd, self.diameter_mm / 2)
+        near = np.linalg.norm(apart - predicted, axis=-1) < reach
         tries = apart[near]
         if not len(tries):
             return None
@@ -300,7 +307,7 @@ class Follower:
         best = int(costs.argmin())
         pairs = self._pairs(apart, tries[best])
         shift = np.mean([apart[i, k] for i, k in pairs], axis=0)
-        other = np.linalg.norm(tries - tries[best], axis=-1) > _APART * self.diameter_mm
+        other = np.linalg.norm(tries - tries[best], axis=-1) > self.diameter_mm / 2
         sure = not other.any() or float(costs[other].min() - costs[best]) > _SURE
         return _Shift(shift, pairs, sure)
 
@@ -346,11 +353,11 @@ class Follower:
             mark, sigma = self.marks[k], float(dots.sigma_px[i])
             used.add(i)
             seen.append(k)
-            if np.linalg.norm(residual) * self._scale > _GATE * np.hypot(sigma, _PLACE_PX):
+            if np.linalg.norm(residual) * self._scale > OUTLIER_SD * np.hypot(sigma, _PLACE_PX):
                 mark.left_out[MOVED] += 1
                 continue
-            mark.place_mm = mark.place_mm + _PLACE_GAIN / max(1, mark.sightings) * residual
             mark.sightings, mark.last_frame = mark.sightings + 1, frame
+            mark.place_mm = mark.place_mm + residual / mark.sightings
             mark.low_px = np.minimum(mark.low_px, dots.uv_px[i])
             mark.high_px = np.maximum(mark.high_px, dots.uv_px[i])
             out.append((i, mark.number))
@@ -360,7 +367,7 @@ class Follower:
             i
             for i in range(len(place))
             if i not in used
-            and np.linalg.norm(known - place[i], axis=-1).min() > _SAME * self.diameter_mm
+            and np.linalg.norm(known - place[i], axis=-1).min() > self.diameter_mm / 2
         ]
         return out + self._new_marks(frame, place, dots, free)
 
@@ -378,7 +385,7 @@ class Follower:
         self.marks = [
             m
             for m in self.marks
-            if m.sightings >= _CONFIRM or m.always_seen or frame - m.last_frame < _FORGET
+            if m.sightings >= LEAST_FRAMES or m.always_seen or frame - m.last_frame < _FORGET
         ]
         return out
 
@@ -400,8 +407,6 @@ class Follower:
         self._speed, self._step_mm = np.zeros(2), None
 
 
-_RING_PX = 4
-_TOUCHED = 0.85
 _LARGEST = 1.6
 _PAD_PX = 2.0
 
@@ -498,9 +503,9 @@ class StripInImages:
         return np.asarray(small & (near | (cut & in_line)))
 
 
-def _erase(image: NDArray[Any], centre: Array, radius: float) -> None:
+def _erase(image: NDArray[Any], centre: Array, radius: float, ring_px: float = 4.0) -> None:
     """Replace the dot, in place, by a plane through the ring round it if the ring is free."""
-    reach = radius + _RING_PX
+    reach = radius + ring_px
     low = np.maximum(np.floor(centre - reach).astype(int), 0)
     high = np.minimum(np.ceil(centre + reach).astype(int) + 1, image.shape[::-1])
     if np.any(high <= low):
@@ -512,7 +517,7 @@ def _erase(image: NDArray[Any], centre: Array, radius: float) -> None:
     if np.count_nonzero(ring) < 10 or not disc.any():
         return
     grey = window[ring].astype(float)
-    if np.quantile(grey, 0.05) < _TOUCHED * np.median(grey):
+    if np.quantile(grey, 0.05) < (1 - TOUCHED) * np.median(grey):
         return
     terms = np.column_stack([np.ones(grey.size), u[ring], v[ring]])
     plane, *_ = np.linalg.lstsq(terms, grey, rcond=None)

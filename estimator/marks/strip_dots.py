@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.dots.fit.candidates import is_unlike
 from telerig.estimator.dots.locate import COLUMNS, measure_dots
+from telerig.estimator.dots.thresholds import LEAST_FRAMES, TOUCHED
 from telerig.statistics import robust_sd
 
 if TYPE_CHECKING:
@@ -33,9 +34,9 @@ _EXPECTED, _EXPECTED_SD = (0.0, 0.0, -0.5, 0.5), (0.08, 0.15, 0.25, 0.7)
 darker by 40 %, with residuals of a real print; and their standard deviations."""
 _LEAST_SPREAD = (0.03, 0.04, 0.05, 0.15)
 """Least standard deviations of the `_features` of a strip's dots from frame to frame."""
-_LEAST_FRAMES, _LEAST_SHARE = 3, 0.25
+_LEAST_SHARE = 0.25
 _SYSTEMATIC_PX = 0.005
-_RING_TAIL, _RING_STEP = 0.1, 0.25
+_RING_TAIL = 0.1
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ def _is_free(image: NDArray[Any], dot: Any, look: DotLook) -> bool:
     distance = np.hypot(columns + low[0] - dot.u_px, rows + low[1] - dot.v_px)
     ring = window[(distance > first) & (distance < last)]
     off = np.abs(np.quantile(ring, (_RING_TAIL, 1 - _RING_TAIL)) - dot.outer_level)
-    return bool(ring.size > 0 and off.max() < _RING_STEP * abs(dot.outer_level - dot.inner_level))
+    return bool(ring.size > 0 and off.max() < TOUCHED * abs(dot.outer_level - dot.inner_level))
 
 
 def _bands(place: Array, image: Ints, diameter_px: float) -> list[Ints]:
@@ -193,7 +194,7 @@ def _bands(place: Array, image: Ints, diameter_px: float) -> list[Ints]:
     cuts = np.flatnonzero(np.diff(place[order]) > 1.5 * diameter_px) + 1
     groups = np.split(order, cuts)
     frames = [len(np.unique(image[group])) for group in groups]
-    least = min(_LEAST_FRAMES, int(image.max()) + 1)
+    least = min(LEAST_FRAMES, int(image.max()) + 1)
     enough = max(least, _LEAST_SHARE * max(frames))
     counts = [len(g) for g in groups]
     return [g for g, f, n in zip(groups, frames, counts) if f >= enough and n >= 0.2 * max(counts)]

@@ -292,10 +292,6 @@ def linked_parameters(names: tuple[str, ...], covariance: Array) -> list[Finding
 
 WINDOW = 3
 """Number of consecutive views that show together whether two cameras' images belong together."""
-FARTHEST = 2
-"""Largest offset of a camera's images, in views, that is tried."""
-LEAST_PAIRS = 18
-"""Least number of dots in a window, twice that of the unknowns of their common equation."""
 
 
 def refuse_copies(problem: Problem) -> None:
@@ -363,10 +359,15 @@ def refuse_wrong_pairs(problem: Problem) -> None:
     )
 
 
-def _better_pairing(problem: Problem, pair: tuple[int, int]) -> tuple[int, int] | None:
+def _better_pairing(
+    problem: Problem, pair: tuple[int, int], farthest: int = 2
+) -> tuple[int, int] | None:
     """Return the first view from which images of the second camera fit better that are some views
-    later, and how many; 0 if those of the same view fit, and None if the views do not show it."""
-    offsets = [s * n for n in range(1, FARTHEST + 1) for s in (1, -1)]
+    later, and how many; 0 if those of the same view fit, and None if the views do not show it.
+
+    farthest : largest offset that is tried.
+    """
+    offsets = [s * n for n in range(1, farthest + 1) for s in (1, -1)]
     own, *shifted = (epipolar_misfits(problem, pair, s) for s in (0, *offsets))
     least, best = np.min(shifted, axis=0), np.argmin(shifted, axis=0)
     far = np.isfinite(own) & (own > UNPAIRED) & (least < FAR_BETTER * own)
@@ -384,7 +385,8 @@ def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Ar
 
     pair : indices of the cameras. offset : by how many views the second one's images are later.
     Returns the mean squares (W,) of x'^T F x with the F of unit norm that makes them least, in
-    units of half the image; infinite where fewer than two views show enough dots to both cameras.
+    units of half the image; infinite where fewer than two views show enough dots to both cameras,
+    or all together less than twice as many as F has elements.
     """
     count = len(problem.views)
     pixels = np.full((2, count, len(problem.dot_ids), 3), np.nan)
@@ -401,5 +403,5 @@ def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Ar
     windows = first[:, None] + np.arange(WINDOW)
     many = both[windows].sum(1)
     least = np.linalg.eigvalsh(moments[windows].sum(1))[:, 0]
-    shown = ((both[windows] >= LEAST_DOTS).sum(1) > 1) & (many >= LEAST_PAIRS)
+    shown = ((both[windows] >= LEAST_DOTS).sum(1) > 1) & (many >= 2 * products.shape[-1])
     return np.where(shown, np.maximum(least, 0) / np.maximum(many, 1), np.inf)

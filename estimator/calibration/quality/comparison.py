@@ -24,7 +24,7 @@ from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.gaussian import Estimate
-from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
+from telerig.estimator.calibration.solver.problem import HELD_SCALE, Problem, cameras_from_state
 from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.estimator.calibration.thresholds import LEAST_DOTS, LEAST_VIEWS, SURE_SD, UNLIKELY
@@ -471,7 +471,7 @@ def _rig_of(problem: Problem, state: State, views: Ints) -> Rig:
     overlap_tree(half, _images(half))
     if half.scale is not None:
         pair, distance, _ = half.scale
-        half = replace(half, scale=(pair, distance, 1e-7 * distance))
+        half = replace(half, scale=(pair, distance, HELD_SCALE * distance))
     system = System(half)
     gaussian = system.gaussian(state)
     step, _ = gaussian.step()

@@ -9,8 +9,6 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.rig.triangulation import working_volume
 
-STEPS = 7
-
 
 @dataclass(frozen=True)
 class UncertaintyMap:
@@ -30,7 +28,7 @@ class UncertaintyMap:
 
 
 def uncertainty_map(
-    calibration: Calibration, *, sigma_px: float | None = None, steps: int = STEPS
+    calibration: Calibration, *, sigma_px: float | None = None, steps: int = 7
 ) -> UncertaintyMap:
     """Return the covariance of triangulated points on a cubic grid round the origin of the rig.
 

@@ -35,6 +35,8 @@ GAUGE_SIGMA_MM = 1e-4
 (docs/decisions/003)."""
 LOOSE_GAUGE_MM = 1e6
 """The same where scales are held instead."""
+HELD_MM = 1e-6
+"""Standard deviation of a coordinate of a dot that is held."""
 HELD_SCALE = 1e-7
 """Relative standard deviation of a scale that is held to fix the depth of a camera's origin."""
 

@@ -33,7 +33,6 @@ thousandfold rather than tenfold."""
 NEARLY_UNDAMPED = 1e-6
 """With less damping than this, the predicted gain of a step is what Gauss-Newton could still
 gain."""
-LEAST_DAMPING = 1e-12
 Progress = Callable[[int, float], None]
 
 
@@ -71,7 +70,7 @@ def solve(
             done = promised <= relative * cost and cost - trial.cost <= relative * cost
             as_promised = cost - trial.cost > LINEAR * promised
             point, gaussian = moved, trial
-            damping = max(damping / (1000 if as_promised else 10), LEAST_DAMPING)
+            damping = max(damping / (1000 if as_promised else 10), 1e-12)
             if progress is not None:
                 progress(iteration, gaussian.cost)
             if done:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import HELD_MM, Problem
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
 from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.known_target import angle_between, mirrored
@@ -275,9 +275,7 @@ def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
     return other
 
 
-_FLAT_MM = 1e-6
 _MODEL = "tangential"
-_ROUNDS = 6
 
 
 def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
@@ -288,24 +286,24 @@ def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
     return alone, counts[alone].argmax(1)
 
 
-def with_tilt_signs(problem: Problem, state: State) -> State:
+def with_tilt_signs(problem: Problem, state: State, rounds: int = 6) -> State:
     """Return the state in which views with dots in one camera only have the right tilt.
 
     One camera alone does not show the sign of the target's tilt. All signs are first set such that
     they agree with the target's deviations from a plane (`_from_relief`), then each by the cost of
     the two poses. With one camera every view is of this kind, and the mirror image of the whole
-    state remains possible.
+    state remains possible. rounds : how often each sign is decided at most.
     """
     alone, cameras = views_seen_alone(problem)
     relief = float(problem.dot_sigma_mm[:, 2].max())
-    if len(alone) == 0 or relief <= _FLAT_MM:
+    if len(alone) == 0 or relief <= HELD_MM:
         return state
     problem = problem.with_model(_MODEL)
     rough = robust_solve(_tolerant(problem, alone), state)
     problem, state = replace(problem, weight=rough.problem.weight), rough.solution.state
     if len(problem.cameras) == 1:
         state = _flipped(state, alone[_from_relief(problem, state, alone) < 0], 0)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         fitted = solve(problem, state, max_iterations=15, relative=1e-4).state
         other = fitted
         for c in range(len(problem.cameras)):
@@ -332,7 +330,7 @@ def _from_relief(problem: Problem, state: State, alone: Ints) -> Array:
     Fitted with flat dots, view v leaves residuals of the relief s_v z_i: a matrix of rank one.
     """
     sigma = problem.dot_sigma_mm.copy()
-    sigma[:, 2] = _FLAT_MM
+    sigma[:, 2] = HELD_MM
     flat = replace(problem, dot_sigma_mm=sigma)
     fitted = solve(flat, state, max_iterations=20, relative=1e-5).state
     obs = flat.observations()

@@ -12,7 +12,7 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.problem import Problem, known_scale
+from telerig.estimator.calibration.solver.problem import HELD_MM, Problem, known_scale
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve
 from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.known_target import angle_between
@@ -162,7 +162,7 @@ def _spin(k: int, order: int) -> Array:
 
 def _numbered_alike_in_views(problem: Problem, labels: list[Ints]) -> tuple[Problem, float]:
     """Turn whole views until their print errors look like those of the others."""
-    held = replace(problem, dot_sigma_mm=np.full_like(problem.dot_sigma_mm, 1e-6))
+    held = replace(problem, dot_sigma_mm=np.full_like(problem.dot_sigma_mm, HELD_MM))
     start = known_target.stereo_states(held, held.nominal_mm, count=1)[0]
     rough = robust_solve(held.with_model("tangential"), start)
     marks = _print_errors(rough.problem, rough.solution.state, len(labels[0]))

@@ -21,8 +21,6 @@ from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.thresholds import LEAST_VIEWS
 from telerig.estimator.dots.grid.lattice import fit_affine
 
-_SWEEPS = 200
-
 
 def dots_from_images(problem: Problem) -> Array:
     """Return positions (N, 3) in mm of a target's dots that are not known beforehand.
@@ -41,7 +39,7 @@ def dots_from_images(problem: Problem) -> Array:
     return _onto_nominal(shape, problem.nominal_mm)
 
 
-def _factorise(problem: Problem) -> tuple[dict[tuple[int, int], Array], Array]:
+def _factorise(problem: Problem, sweeps: int = 200) -> tuple[dict[tuple[int, int], Array], Array]:
     """Return maps (2, 2) per image and places (N, 2), by alternating least squares over gaps."""
     images = {}
     for v in range(len(problem.views)):
@@ -53,7 +51,7 @@ def _factorise(problem: Problem) -> tuple[dict[tuple[int, int], Array], Array]:
     plane = (plane - plane.mean(0)) / np.maximum(plane.std(0), 1e-9)
     maps: dict[tuple[int, int], Array] = {}
     previous = np.inf
-    for _ in range(_SWEEPS):
+    for _ in range(sweeps):
         maps = {k: fit_affine(plane[dots], uv)[:2] for k, (dots, uv) in images.items()}
         plane, misfit = _plane_points(images, maps, len(plane))
         middle = plane.mean(0)

@@ -24,12 +24,22 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     semi_axes,
 )
 from telerig.estimator.dots.fit.luminance import PARAMETERS, DotFit, Reason
+from telerig.estimator.dots.thresholds import (
+    HOLE_SHARE,
+    LEAST_MISFIT,
+    LOG_FITTED,
+    LOG_MISFIT,
+    LOG_SPREAD,
+    MODEL_RESIDUAL,
+    OUTLINE_PX,
+    OUTLINE_SD,
+    RARE,
+    ROUGH_SPREAD,
+)
 from telerig.statistics import robust_sd
 
 Polarity = Literal["white_on_black", "black_on_white"]
 
-_BLOCK = 4
-_COARSE_WINDOW = 5
 _STRONG_SHARE = 0.15
 _STRONG_SIGMA = 7.0
 _FLAT_DISTANCE_PX = 3
@@ -107,20 +117,22 @@ class EdgeMap:
     has_edges: bool
 
 
-def edge_map(image: Float32, sigma: float) -> EdgeMap:
+def edge_map(image: Float32, sigma: float, block: int = 4, blocks: int = 5) -> EdgeMap:
     """Return the edges and the threshold surface of an image.
 
     image : (rows, columns) grey levels. sigma : approximate standard deviation of their noise.
+    block, blocks : the threshold is between the extremes of squares of blocks x blocks blocks, each
+        of block x block pixels.
     """
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     rows, columns = image.shape
-    missing = (-rows % _BLOCK, -columns % _BLOCK)
+    missing = (-rows % block, -columns % block)
     padded = cv2.copyMakeBorder(smooth, 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE)
-    square = np.ones((_BLOCK, _BLOCK), np.uint8)
+    square = np.ones((block, block), np.uint8)
     anchor = (0, 0)
-    fine_high = cv2.dilate(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
-    fine_low = cv2.erode(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
-    window = np.ones((_COARSE_WINDOW, _COARSE_WINDOW), np.uint8)
+    fine_high = cv2.dilate(padded, square, anchor=anchor)[::block, ::block]
+    fine_low = cv2.erode(padded, square, anchor=anchor)[::block, ::block]
+    window = np.ones((blocks, blocks), np.uint8)
     high, low = cv2.dilate(fine_high, window), cv2.erode(fine_low, window)
     span = high - low
     strong_span = max(_STRONG_SHARE * float(np.quantile(span, 0.995)), _STRONG_SIGMA * sigma)
@@ -313,29 +325,8 @@ def _unevenness(outline: NDArray[np.int32], centre: Array, shape: Array) -> floa
     return max(excess, 0.0) / float(OUTLINE_SD[0] + OUTLINE_SD[1] * semi_axes(shape)[1])
 
 
-REFUSED = 1e-4
-"""Share of true dots that may be refused as unlike the others."""
-OUTLINE_PX, OUTLINE_SD = 0.3, (0.02, 0.004)
-"""RMS distance of a dot's outline from the ellipse of its blob, as pixels are drawn; and standard
-deviation of its excess, in px and per semi-minor axis."""
-ROUGH_SPREAD = 0.3
-"""Standard deviation of the excess where most outlines are uneven, as a share of its median: the
-RMS of the six harmonics or so of a rough edge that an outline shows."""
-LOG_SPREAD = 0.25
-"""Least standard deviation of log radius and log contrast of the dots of one image: marks are up to
-twice as large as dots, and light falls off towards the corners."""
-LOG_FITTED = 0.15
-"""Standard deviation of the log of a dot's fitted size divided by that of its blob, and of the way
-between both centres divided by the radius."""
-MODEL_RESIDUAL, MODEL_RESIDUAL_DOTS = 0.03, 5
-"""What the luminance model leaves of true dots (`DotFit.misfit`) where few dots show it; medians of
-seven images of real plates are 0.026 to 0.058. It counts as so many dots of the image."""
-LOG_MISFIT, LEAST_MISFIT = 0.15, 0.02
-"""Standard deviation of the log of a true dot's misfit about the median of its image, 0.1 to 0.2 on
-real plates; both are increased by a misfit that any dot may have: rounding, specks of dust, an edge
-without blur."""
-_HOLE_SHARE = 0.02
-"""Least share of a ring's area that is hole; specks of dust are smaller."""
+MODEL_RESIDUAL_DOTS = 5
+"""The usual misfit counts as this many dots of the image."""
 
 
 def _weighted_median(values: Array, weights: Array) -> float:
@@ -384,10 +375,10 @@ class Look:
 
 
 def is_unlike(deviations: ArrayLike) -> Bools:
-    """Return whether deviations (..., k), in standard deviations, are together rarer than `REFUSED`
+    """Return whether deviations (..., k), in standard deviations, are together rarer than `RARE`
     among true dots, or not finite, as booleans (...)."""
     square = np.square(np.asarray(deviations, np.float64))
-    return ~np.asarray(chdtrc(square.shape[-1], square.sum(-1)) >= REFUSED)
+    return ~np.asarray(chdtrc(square.shape[-1], square.sum(-1)) >= RARE)
 
 
 def _objection(deviations: Mapping[Reason, float]) -> Reason | None:
@@ -401,7 +392,7 @@ def _objection(deviations: Mapping[Reason, float]) -> Reason | None:
 def is_ring(blob: Candidate) -> bool:
     """Return whether a blob is a ring: its holes are too large for specks of dust."""
     holes = sum(float(cv2.contourArea(hole.reshape(-1, 1, 2))) for hole in blob.holes)
-    return holes > _HOLE_SHARE * blob.area_px2
+    return holes > HOLE_SHARE * blob.area_px2
 
 
 def saturation_level(grey: Float32) -> float:

@@ -31,14 +31,12 @@ from telerig.estimator.dots.fit.kernels import (
     residual_sums,
 )
 from telerig.estimator.dots.fit.rim import NO_EDGE, edge_harmonics
+from telerig.estimator.dots.thresholds import OUTLIER_SD, RARE
 from telerig.estimator.images.noise import NoiseModel
 from telerig.statistics import NORMAL_FROM_MEDIAN
 
 PARAMETERS = 10
 """Free parameters of a fit; the two of the contrast gradient are held by their prior."""
-SIGNIFICANT = 1e-4
-"""A fit is worse than the noise if noise alone gives a chi-square as large with less than this
-probability."""
 
 
 class Reason(StrEnum):
@@ -169,7 +167,7 @@ class DotFit:
     @cached_property
     def _by_chance(self) -> float:
         """The largest chi2_dof that counts as noise."""
-        return float(chdtri(self.dof, SIGNIFICANT)) / self.dof
+        return float(chdtri(self.dof, RARE)) / self.dof
 
     def under_noise(self, factor: float) -> DotFit:
         """Return the fit as it would be if the noise variance were ``factor`` times as large."""
@@ -202,7 +200,6 @@ _FEW_PIXELS = 1e-9
 have a solution."""
 _INSIDE = 0.9
 _CENTRE_AND_CONTRAST = np.array([0, 1, 9])
-_OUTLIER_SIGMA = 5.0
 _MAX_OUTLIER_SHARE = 0.15
 
 
@@ -276,7 +273,7 @@ class _Fit:
         whitened = np.abs(self.residual) / np.sqrt(variance)
         places = [len(whitened) // 2, int(0.95 * (len(whitened) - 1))]
         middle, high = np.partition(whitened, places)[places]
-        limit = _OUTLIER_SIGMA * max(1.0, NORMAL_FROM_MEDIAN * middle, 0.51 * high)
+        limit = OUTLIER_SD * max(1.0, NORMAL_FROM_MEDIAN * middle, 0.51 * high)
         return np.asarray(whitened > limit)
 
     def result(self, converged: bool, edges: bool) -> DotFit:
@@ -332,7 +329,7 @@ def fit_dot(
 ) -> DotFit:
     """Fit the luminance model of a dot to the pixels of its window.
 
-    Pixels whose residual exceeds 5 standard deviations are left out, if they are few; the standard
+    Pixels whose residual exceeds `OUTLIER_SD` are left out, if they are few; the standard
     deviation is enlarged if the fit as a whole is worse than the noise.
 
     iterations : largest number of steps.

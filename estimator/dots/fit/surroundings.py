@@ -27,7 +27,6 @@ from telerig.statistics import robust_sd
 CLEAR_SIGMA = 3.5
 _MAX_MARGIN_PX = 12.0
 _THIN_ABOVE_PIXELS, _COARSE_ABOVE_PIXELS = 3000, 800
-_EDGE_SIGMA = 2.7
 
 
 def dot_window(
@@ -82,7 +81,7 @@ def dot_window(
             fill(holes, 1, hole - low.astype(np.int32))
         mask &= _distance_to(holes > 0) > clear + 0.5
     if np.count_nonzero(mask) > (_COARSE_ABOVE_PIXELS if coarse else _THIN_ABOVE_PIXELS):
-        thin = np.abs(distance) > (0.0 if coarse else _EDGE_SIGMA * start.sigma_px)
+        thin = np.abs(distance) > (0.0 if coarse else CLEAR_SIGMA * start.sigma_px)
         thin[::2, ::2] = False
         mask &= ~thin
     return Window(grey[crop].astype(np.float64), int(low[0]), int(low[1]), mask)

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.dots.grid.numbering import WRONG_ODDS, is_likely
+from telerig.estimator.dots.grid.numbering import is_likely
+from telerig.estimator.dots.thresholds import OUTLIER_SD, WRONG_ODDS
 
 LEAST_PITCHES, LENS_PITCHES = 0.006, 0.03
 """Least and largest standard deviation of a view's distance from the hyperplane, in pitches:
@@ -23,8 +24,6 @@ distortion and perspective bend it. A lens that bends it more decides nothing. I
 twice the RMS of the views that show the hyperplane, as few views bend it towards themselves."""
 LEAST_VIEWS = 2
 """Views that determine the hyperplane: a view of a plane spans two of its three directions."""
-_FAR = 4.5
-"""A view contradicts the hyperplane beyond so many of these standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +65,11 @@ def decided_by_pair(
     known = {name: points for name, points in known.items() if len(points) > LEAST_VIEWS}
     pitch = float(np.median([image.pitch_px for pair in views.values() for image in pair]))
     limit, found = LENS_PITCHES * pitch, dict(known)
-    while len(found) > LEAST_VIEWS and _worst(found, _hyperplane(found)) > _FAR * limit:
+    while len(found) > LEAST_VIEWS and _worst(found, _hyperplane(found)) > OUTLIER_SD * limit:
         found.pop(min(found, key=lambda name: _misfit_without(found, name)))
     plane = _hyperplane(found)
     agree = len(found) >= max(LEAST_VIEWS, 2 * len(known) / 3)
-    if plane is None or not agree or _worst(found, plane) > _FAR * limit:
+    if plane is None or not agree or _worst(found, plane) > OUTLIER_SD * limit:
         return {}
     usual = np.sqrt(np.mean([_misfit(points, plane) ** 2 for points in found.values()]))
     sd_px, out = float(np.clip(2 * usual, LEAST_PITCHES * pitch, limit)), {}
@@ -134,4 +133,4 @@ def _chosen(
     score = pair[0].score[:, None] + pair[1].score - 0.5 * np.minimum(misfit, 100.0) ** 2
     best = np.unravel_index(int(score.argmax()), score.shape)
     clear = np.count_nonzero(score >= score[best] + np.log(WRONG_ODDS)) == 1
-    return (int(best[0]), int(best[1])) if clear and misfit[best] < _FAR else None
+    return (int(best[0]), int(best[1])) if clear and misfit[best] < OUTLIER_SD else None

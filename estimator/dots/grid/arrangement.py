@@ -25,10 +25,7 @@ from telerig.estimator.dots.grid.lattice import (
     fit_homography,
 )
 
-_NEAR = 5
-_TRIANGLES = 240
 _LOCAL = 12
-_REFINED = 12
 
 
 @dataclass(frozen=True)
@@ -91,9 +88,9 @@ def match_points(
     return matches
 
 
-def _triangles(points: Array) -> Ints:
-    """Return triangles (T, 3) of each point and two near ones, without slivers or repeats."""
-    count = min(_NEAR, len(points) - 1)
+def _triangles(points: Array, nearest: int = 5) -> Ints:
+    """Return triangles (T, 3) of each point and two of its nearest, without slivers or repeats."""
+    count = min(nearest, len(points) - 1)
     _, near = cKDTree(points).query(points, count + 1)
     pairs = np.array(list(combinations(range(1, count + 1), 2)))
     corners = np.concatenate(
@@ -120,10 +117,10 @@ def _signature(sides: Array) -> Array:
     return np.column_stack([logs[:, 0] - size, logs[:, 1] - size, size / 3])
 
 
-def _proposals(flat: Array, wanted: Array) -> list[tuple[Array, int]]:
+def _proposals(flat: Array, wanted: Array, most: int = 240) -> list[tuple[Array, int]]:
     """Return maps flat_from_mm, each with a point in its middle, that explain most dots near."""
     ours, theirs = _triangles(flat), _triangles(wanted)
-    ours = ours[:: max(1, len(ours) // _TRIANGLES)]
+    ours = ours[:: max(1, len(ours) // most)]
     if not len(ours) or not len(theirs):
         return []
     theirs = np.concatenate([theirs[:, list(order)] for order in permutations(range(3))])
@@ -140,7 +137,7 @@ def _proposals(flat: Array, wanted: Array) -> list[tuple[Array, int]]:
     expected = apply_homography(affine, wanted[around[corner]])
     miss, _ = cKDTree(flat).query(expected)
     hits = np.sum(miss < 0.25 * _spacing(flat), axis=1)
-    top = np.argsort(-hits, kind="stable")[: 40 * _REFINED]
+    top = np.argsort(-hits, kind="stable")[: 40 * _LOCAL]
     return _distinct(affine[top], corner[top], wanted)
 
 
@@ -157,7 +154,7 @@ def _distinct(affine: Array, corner: Ints, wanted: Array) -> list[tuple[Array, i
             for j in kept
         ):
             kept.append(k)
-        if len(kept) == _REFINED:
+        if len(kept) == _LOCAL:
             break
     return [(affine[k], int(corner[k])) for k in kept]
 

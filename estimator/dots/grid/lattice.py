@@ -112,8 +112,6 @@ _ROUGH = 0.05
 pitch."""
 _ANGLE_REACH = 0.55
 """Steps are looked for within this angle (rad) of the cell's."""
-_PATCH = 60
-_SEEDS = 4
 
 
 @dataclass(frozen=True)
@@ -261,10 +259,10 @@ def frequent_cell(points: Array) -> Array | None:
     return steps[[0, int(np.argmax(aside))]] if aside.any() else None
 
 
-def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
+def _frequent_steps(flat: Array, neighbours: int, patch_size: int = 60) -> tuple[Array, Array]:
     """Return the steps (K, 2) between near dots, up to sign, and how often each occurs (K,)."""
     middle = np.median(flat, axis=0)
-    patch = np.argsort(np.sum((flat - middle) ** 2, axis=1))[:_PATCH]
+    patch = np.argsort(np.sum((flat - middle) ** 2, axis=1))[:patch_size]
     _, near = cKDTree(flat).query(flat[patch], neighbours + 1)
     steps = (flat[near[:, 1:]] - flat[patch][:, None]).reshape(-1, 2)
     steps = np.concatenate([steps, -steps])
@@ -284,14 +282,14 @@ def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
     return np.array(found).reshape(-1, 2), np.array(counts)
 
 
-def _seeds(flat: Array, basis: Array) -> Iterator[int]:
+def _seeds(flat: Array, basis: Array, count: int = 4) -> Iterator[int]:
     """Return dots with good neighbours on all sides, best first and well apart."""
     steps = np.concatenate([basis, -basis])
     miss, _ = cKDTree(flat).query((flat[:, None] + steps).reshape(-1, 2))
     pitch = np.linalg.norm(steps, axis=1)
     part = np.minimum(miss.reshape(-1, 4) / pitch, 1.0)
     order = np.argsort(np.sum(part, axis=1), kind="stable")
-    yield from order[:: max(1, len(order) // (4 * _SEEDS))][:_SEEDS].tolist()
+    yield from order[:: max(1, len(order) // (4 * count))][:count].tolist()
 
 
 class _Growth:

@@ -32,24 +32,17 @@ from telerig.estimator.dots.grid.lattice import (
     next_places,
     shape_matrix,
 )
+from telerig.estimator.dots.thresholds import (
+    DOT_LOST,
+    FALSE,
+    MARK_MISSED,
+    MOST_DOTS,
+    PART_HIDDEN,
+    POSSIBLE_ODDS,
+    WRONG_ODDS,
+)
 from telerig.rig.target import Target
 from telerig.statistics import robust_sd
-
-MARK_MISSED = 0.02
-"""Probability that a mark is seen as a plain dot: its ring is blurred, or dirt fills it."""
-MARK_FALSE = 0.0025
-"""Probability that a plain dot is seen as a mark: one in four plates of a hundred dots has one."""
-DOT_LOST = 0.1
-"""Probability that a dot in view is not found: dirt, glare, a scratch."""
-DOT_FALSE = 0.0025
-"""Probability that something is seen as a dot at a place of the grid where the target has none."""
-PART_HIDDEN = 0.001
-"""Probability that something hides a part of the target that is in view: a shadow, a vignette. It
-bounds what dots that are missing side by side can prove."""
-WRONG_ODDS = 0.005
-"""A numbering is unique if each other one has less than this probability, relative to it."""
-POSSIBLE_ODDS = 1e-6
-"""Numberings with less than this probability, relative to the best one, are not listed."""
 
 
 @dataclass(frozen=True)
@@ -118,8 +111,8 @@ def mark_evidence(lattice: Lattice, rings: Bools, empty: Ints, target: Target) -
     if target.mark_style == "missing":
         gap = gaps(occupied, target.bounded)
         lost = max(0.5, gap.sum() - len(target.marks)) / occupied.sum()
-        gain[occupied] = np.log(DOT_FALSE)
-        gain[gap] = -np.log(np.clip(lost, DOT_FALSE, 2 * DOT_LOST))
+        gain[occupied] = np.log(FALSE)
+        gain[gap] = -np.log(np.clip(lost, FALSE, 2 * DOT_LOST))
         return MarkEvidence(gain, np.argwhere(gap) - 1, empty)
     like = mark_likeness(lattice, rings, target)
     gain[tuple((lattice.places + 1).T)] = mark_gain(like)
@@ -132,7 +125,7 @@ def mark_gain(likeness: Array) -> Array:
     likeness : (n,) probabilities that the dots look like marks, see `mark_likeness`.
     """
     as_mark = likeness * (1 - MARK_MISSED) + (1 - likeness) * MARK_MISSED
-    as_plain = likeness * MARK_FALSE + (1 - likeness) * (1 - MARK_FALSE)
+    as_plain = likeness * FALSE + (1 - likeness) * (1 - FALSE)
     return np.asarray(np.log(as_mark / as_plain))
 
 
@@ -394,7 +387,7 @@ def _bounded_shifts(turned: Ints, empty: Ints, places: Ints) -> tuple[Ints, Arra
     outside, lost = len(turned) - on_target[0], on_target[1]
     near = np.argwhere(outside <= outside.min() + 8)
     few = np.maximum(lost[tuple(near.T)] * np.log(DOT_LOST), np.log(PART_HIDDEN))
-    score = np.log(DOT_FALSE) * outside[tuple(near.T)] + few
+    score = np.log(FALSE) * outside[tuple(near.T)] + few
     return near - target.shape + 1 + low - places.min(0), score
 
 
@@ -413,9 +406,6 @@ def related_by_symmetry(placements: Placements, target: TargetLattice) -> bool:
 
 NEEDED = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 OUTSIDE = "on the grid, outside the target's rows and columns"
-CLEAR_LEAD = 0.8
-"""A match of points is unique if the second-best match explains fewer dots than this share of those
-of the best one."""
 AT_A_GAP = "at the place of a missing mark"
 
 
@@ -583,7 +573,7 @@ def _number_points(points_px: Array, shapes_px2: Array, target: Target) -> Numbe
         dot_radius_mm=target.dot_diameter_mm / 2,
     )
     best = matches[0]
-    close = [m for m in matches if len(m.dot) > CLEAR_LEAD * len(best.dot)]
+    close = [m for m in matches if len(m.dot) > MOST_DOTS * len(best.dot)]
     if len(close) > 1:
         raise DetectionError(
             f"{len(close)} numberings are equally good: they explain "

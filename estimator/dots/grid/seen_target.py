@@ -19,22 +19,14 @@ from telerig.estimator.dots.grid.lattice import (
     shape_matrix,
 )
 from telerig.estimator.dots.grid.numbering import gaps, relative_diameter
+from telerig.estimator.dots.thresholds import MOST_DOTS, SAME_CELL
 from telerig.rig.target import QUARTER_TURNS, MarkStyle, Target
 from telerig.statistics import robust_sd
 
 _RATIOS = (1.0, 1.5, 2.0)
 """Ratios of the pitches of a grid that is looked for; one that is 30 % off is found, too."""
-_ENOUGH = 0.8
-"""Share of the dots on a grid above which no other ratio of the pitches is tried."""
 _OBLIQUE = 0.25
 """Cosine of the angle between rows and columns above which a grid is no rectangular one."""
-_SAME_COSINE, _EQUAL_PITCHES = 0.08, 1.08
-"""Departures of a lattice's cosine, and of its pitches' ratio, that measuring explains."""
-_FILLED = 0.8
-"""Share of its places that a grid seen as a whole has at least, of its own rows and columns."""
-_ON_ONE_GRID = 0.7
-"""Share of the dots that are on one grid at least; 1.00 on real plates, 0.5 with rows staggered by
-half a pitch or on two levels."""
 _POINTS = 'Describe such a plate by the places of its dots: layout = "points", points_mm = ...'
 _LARGER = 1.12
 _LARGER_SD = 6.0
@@ -177,12 +169,12 @@ def seen_points(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenPoints 
     shape = np.median(lattice.shape, axis=0)
     cosine = -float(shape[0, 1] / np.sqrt(shape[0, 0] * shape[1, 1]))
     diameter = 2.0 * np.sqrt((1.0 - cosine**2) * np.diagonal(shape))
-    if max(diameter) > _EQUAL_PITCHES * min(diameter):
+    if max(diameter) > (1 + SAME_CELL) * min(diameter):
         return None
-    if abs(abs(cosine) - 0.5) < _SAME_COSINE:
+    if abs(abs(cosine) - 0.5) < SAME_CELL:
         kind = "a hexagonal grid"
         steps = np.array([[1.0, 0.0], [np.copysign(0.5, cosine), np.sqrt(0.75)]])
-    elif abs(cosine) < _SAME_COSINE and whole and _staggered(lattice.places):
+    elif abs(cosine) < SAME_CELL and whole and _staggered(lattice.places):
         kind = "a grid of staggered rows"
         steps = np.sqrt(0.5) * np.array([[1.0, 1.0], [-1.0, 1.0]])
     else:
@@ -209,7 +201,7 @@ def _staggered(places: Ints) -> bool:
     """Whether places (N, 2) on a square lattice fill a rectangle along its diagonals instead."""
     diagonal = np.stack([places.sum(axis=1), places[:, 1] - places[:, 0]], -1)
     own, theirs = (np.prod(np.ptp(some, axis=0) + 1) for some in (places, diagonal))
-    return bool(len(places) < _FILLED * own and len(places) > _FILLED * theirs / 2)
+    return bool(len(places) < MOST_DOTS * own and len(places) > MOST_DOTS * theirs / 2)
 
 
 def _unusual(dots: pd.DataFrame, lattice: Lattice) -> tuple[Bools, Bools, Array]:
@@ -234,13 +226,13 @@ def _best_lattice(dots: pd.DataFrame) -> tuple[Array, Lattice]:
         except DetectionError as error:
             failure = failure or error
             continue
-        if len(found[-1].index) > _ENOUGH * len(points):
+        if len(found[-1].index) > MOST_DOTS * len(points):
             break
     if not found:
         assert failure is not None
         raise failure
     best = max(found, key=lambda lattice: len(lattice.index))
-    if len(best.index) < _ON_ONE_GRID * len(points):
+    if len(best.index) < MOST_DOTS * len(points):
         raise DetectionError(
             f"only {len(best.index)} of {len(points)} dots are on one grid: are rows staggered, or "
             f"dots on two levels? {_POINTS}"

@@ -78,10 +78,12 @@ class NextView:
                 "µm; no further pose was found in which two cameras see the target"
             )
         worth = ": these views are enough" if self.enough() else ""
+        both = self.before_um, self.after_um
+        digits = 2 if number(both[0], 2) != number(both[1], 2) else 3
+        before, after = (number(um, digits) for um in both)
         return (
             f"{self.views} views; one more would reduce the calibration's share of the errors of "
-            f"points from {number(self.before_um, 3)} to "
-            f"{number(self.after_um, 3)} µm{self._floor()}{worth}"
+            f"points from {before} to {after} µm{self._floor()}{worth}"
         )
 
     def _floor(self) -> str:

@@ -35,6 +35,7 @@ from telerig.estimator.calibration.thresholds import (
     STRONG_PERSPECTIVE,
     UNPAIRED,
 )
+from telerig.estimator.dots.grid.agreement import epipolar_products
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
@@ -380,8 +381,7 @@ def _better_pairing(
 def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Array:
     """Return how far the dots of every `WINDOW` consecutive views are from one epipolar geometry.
 
-    With any lens but its distortion, the pixels x and x' of a dot in two cameras that saw it at the
-    same time satisfy x'^T F x = 0 with one matrix F (Luong and Faugeras, IJCV 17:43, 1996).
+    It is that of dots which both cameras saw at the same time (`epipolar_products`).
 
     pair : indices of the cameras. offset : by how many views the second one's images are later.
     Returns the mean squares (W,) of x'^T F x with the F of unit norm that makes them least, in
@@ -389,13 +389,12 @@ def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Ar
     or all together less than twice as many as F has elements.
     """
     count = len(problem.views)
-    pixels = np.full((2, count, len(problem.dot_ids), 3), np.nan)
+    pixels = np.full((2, count, len(problem.dot_ids), 2), np.nan)
     for own, c, late in zip(pixels, pair, (0, offset)):
         view, half = problem.view - late, np.array(problem.cameras[c].image_size_px) / 2
         mine = (problem.camera == c) & (view >= 0) & (view < count)
-        own[view[mine], problem.dot[mine], :2] = problem.uv_px[mine] / half - 1
-        own[view[mine], problem.dot[mine], 2] = 1
-    products = (pixels[0][..., :, None] * pixels[1][..., None, :]).reshape(*pixels.shape[1:3], 9)
+        own[view[mine], problem.dot[mine]] = problem.uv_px[mine] / half - 1
+    products = epipolar_products(*pixels)
     both = np.isfinite(products[..., 0]).sum(1)
     products = np.where((both >= LEAST_DOTS)[:, None, None], np.nan_to_num(products), 0.0)
     moments = products.mT @ products

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError, suggestion
@@ -306,8 +307,6 @@ def _observed_sigma(
 
     A straight line uses up two of the views' positions in each direction.
     """
-    from scipy.stats import chi2
-
     kept = weights.views > Code.WRONG_READING.limit
     spare = int(kept.sum()) - 2
     if spare < 1:
@@ -321,7 +320,7 @@ def _observed_sigma(
         dof = spare * directions.shape[1]
         score = float((shift**2 / (own + given**2)).sum())
         excess = float((shift**2).sum() / dof - own.mean())
-        out.append(np.sqrt(excess) if score > chi2.isf(limit, dof) and excess > 0 else given)
+        out.append(np.sqrt(excess) if score > chdtri(dof, limit) and excess > 0 else given)
     return float(max(out[0], sigma_mm[0])), float(max(out[1], sigma_mm[1]))
 
 

@@ -373,17 +373,17 @@ def _bounded_shifts(turned: Ints, empty: Ints, places: Ints) -> tuple[Ints, Arra
     turned, empty : (n, 2), (E, 2) places with a dot and of `MarkEvidence`. places : (N, 2) of the
     target.
     """
-    from scipy.signal import correlate
-
     every = np.concatenate([turned, empty])
     low, size = every.min(0), np.ptp(every, axis=0) + 1
     target = np.zeros(np.ptp(places, axis=0) + 1)
     target[tuple((places - places.min(0)).T)] = 1
-    on_target = []
+    whole, on_target = size + target.shape - 1, []
+    mirrored = np.fft.rfft2(target[::-1, ::-1], whole)
     for seen in (turned, empty):
         there = np.zeros(size)
         there[tuple((seen - low).T)] = 1
-        on_target.append(np.rint(correlate(there, target)).astype(np.int64))
+        counts = np.fft.irfft2(np.fft.rfft2(there, whole) * mirrored, whole)
+        on_target.append(np.rint(counts).astype(np.int64))
     outside, lost = len(turned) - on_target[0], on_target[1]
     near = np.argwhere(outside <= outside.min() + 8)
     few = np.maximum(lost[tuple(near.T)] * np.log(DOT_LOST), np.log(PART_HIDDEN))

@@ -13,6 +13,7 @@ from telerig.arrays import Array
 from telerig.estimator.calibration.lens_choice import Choice, Step
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import JointCovariance
+from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.robust_least_squares import (
     RobustFit,
@@ -25,7 +26,7 @@ from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, N
 from telerig.estimator.calibration.thresholds import SURE_SD, UNEXPLAINED
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
-from telerig.rig.lens_parameters import INDEX, groups_of, joint_name, name_of
+from telerig.rig.lens_parameters import GROUPS, INDEX, groups_of, joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.triangulation import aligned_covariance, triangulate_any
 
@@ -48,8 +49,6 @@ class Fit:
     models : name of each camera's lens model.
     model_words : a phrase on how they were chosen.
     choice : the choice of the models; None if the user gave them.
-    centre_held : (C, 4, 4) poses of the cameras from a second fit in which the image centres are
-        held in the middle of the images; None if they are held in this fit.
     mirror : the solution of the mirror ambiguity that was kept.
     mirrored_cost : cost of the other.
     tilts_deg : by (view, camera) the angle between the target's normal and the optical axis.
@@ -59,7 +58,6 @@ class Fit:
     models: tuple[str, ...]
     model_words: str
     choice: Choice | None
-    centre_held: Array | None
     mirror: MirrorChoice | None = None
     mirrored_cost: float = np.nan
     tilts_deg: dict[tuple[int, int], float] = field(default_factory=dict)
@@ -274,7 +272,7 @@ def _from_first(fit: Fit, joint: JointCovariance, camera: int) -> dict[str, Any]
     # the first axis in this camera's coordinates; a turn about its x, y tips its axis
     slope = np.array([-turn[1, 2], turn[0, 2]]) / max(np.sin(angle), 1e-12)
     sd = float(np.sqrt(slope @ covariance[np.ix_(index, index)] @ slope))
-    systematic = _angle_systematic(fit, angle, camera)
+    systematic = float(slope @ _centres_held(fit, names, covariance)[index])
     return {
         "inter_camera_rotvec_deg": np.degrees(rotvec).tolist(),
         "axes_angle_deg": float(np.degrees(angle)),
@@ -283,15 +281,23 @@ def _from_first(fit: Fit, joint: JointCovariance, camera: int) -> dict[str, Any]
     }
 
 
-def _angle_systematic(fit: Fit, angle_rad: float, camera: int) -> float:
-    """Return how far the angle (rad) changes with the image centres held, 0 if the model fits.
+def _centres_held(fit: Fit, names: Sequence[str], covariance: Array) -> Array:
+    """Return by how much the rig's parameters (P,) change, to first order, if free image centres
+    are held in the middle of the images; 0 if the model fits.
 
     With strong perspective, an error of the distortion model moves both angle and centres.
+    names, covariance : of the P parameters.
     """
-    noise = _scatter(fit.robust.problem.covariance_px2 - fit.robust.floor_px**2 * np.eye(2))
-    if fit.centre_held is None or fit.robust.floor_px <= UNEXPLAINED * noise:
-        return 0.0
-    return float(angle_rad - np.arccos(fit.centre_held[camera, 2, 2]))
+    problem, value = fit.robust.problem, np.zeros(len(names))
+    noise = _scatter(problem.covariance_px2 - fit.robust.floor_px**2 * np.eye(2))
+    found = fit.robust.solution.state.intrinsics
+    for c, camera in enumerate(problem.cameras):
+        for parameter in GROUPS["centre"]:
+            if (name := f"{camera.name}.{parameter}") in names:
+                value[names.index(name)] = found[c, INDEX[parameter]] - camera[parameter]
+    if fit.robust.floor_px <= UNEXPLAINED * noise or not value.any():
+        return np.zeros(len(names))
+    return Estimate(value, covariance).hold(np.flatnonzero(value).tolist()).value
 
 
 def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dict[str, Any]:

@@ -326,7 +326,7 @@ def _fit(
     progress: Progress | None,
 ) -> Fit:
     """Fit a rich model robustly, choose the lens model, and fit that to convergence."""
-    choice, held = None, None
+    choice = None
     weighed = problem
     words = f"{joint_name(models, [c.name for c in problem.cameras])}: as given"
     if AUTO in models:
@@ -339,7 +339,6 @@ def _fit(
                 "meets the image) is free, too, which makes the angle between the cameras less "
                 "certain"
             )
-            held = _centre_held(first.problem, start, models)
     final = problem.with_model(models)
     if choice is None:
         begin = robust_solve(final, model_start(final, start)).solution.state
@@ -348,7 +347,7 @@ def _fit(
         begin = solve(sound, held_at_nominal(final, start), max_iterations=15, relative=1e-5).state
     final = replace(final, eccentricity_px=eccentricity_px(final, begin))
     robust = robust_solve(final, begin, progress=progress)
-    return Fit(robust, models, words, choice, held)
+    return Fit(robust, models, words, choice)
 
 
 def choose_model(
@@ -399,12 +398,6 @@ def _strong(fit: RobustFit) -> NDArray[np.bool_]:
             if parameter == kappa:
                 out[c] &= strength[c] > SURE_SD * sd * camera.rho_mm
     return out
-
-
-def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Array:
-    """Return the poses (C, 4, 4) rig_from_camera of the same models with image centres held."""
-    held = problem.with_model([name_of(set(groups_of(m)) - {"centre"}) for m in models])
-    return solve(held, held_at_nominal(held, state), relative=1e-7).state.rig_from_camera
 
 
 def _on_the_right_side(

@@ -25,7 +25,7 @@ from telerig.estimator.calibration.solver.robust_least_squares import robust_sol
 from telerig.estimator.calibration.solver.system import System
 from telerig.estimator.calibration.start.known_target import angle_between, mirrored
 from telerig.estimator.calibration.thresholds import STRONG_PERSPECTIVE, TIE_DEG
-from telerig.factors.calibration import State, whitened_error, whitened_residuals
+from telerig.factors.calibration import State, whitened_residuals
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import rotation_from_rotvec
@@ -286,13 +286,13 @@ def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
     return alone, counts[alone].argmax(1)
 
 
-def with_tilt_signs(problem: Problem, state: State, rounds: int = 6) -> State:
+def with_tilt_signs(problem: Problem, state: State) -> State:
     """Return the state in which views with dots in one camera only have the right tilt.
 
-    One camera alone does not show the sign of the target's tilt. All signs are first set such that
-    they agree with the target's deviations from a plane (`_from_relief`), then each by the cost of
-    the two poses. With one camera every view is of this kind, and the mirror image of the whole
-    state remains possible. rounds : how often each sign is decided at most.
+    One camera alone does not show the sign of the target's tilt. The signs are set such that these
+    views show the relief of the dots (their deviations from a plane) that the other views show.
+    With one camera every view is of this kind, and the mirror image of the whole state remains
+    possible.
     """
     alone, cameras = views_seen_alone(problem)
     relief = float(problem.dot_sigma_mm[:, 2].max())
@@ -301,18 +301,9 @@ def with_tilt_signs(problem: Problem, state: State, rounds: int = 6) -> State:
     problem = problem.with_model(_MODEL)
     rough = robust_solve(_tolerant(problem, alone), state)
     problem, state = replace(problem, weight=rough.problem.weight), rough.solution.state
-    if len(problem.cameras) == 1:
-        state = _flipped(state, alone[_from_relief(problem, state, alone) < 0], 0)
-    for _ in range(rounds):
-        fitted = solve(problem, state, max_iterations=15, relative=1e-4).state
-        other = fitted
-        for c in range(len(problem.cameras)):
-            other = _flipped(other, alone[cameras == c], c)
-        costs = [_view_costs(problem, pose_only(problem, s)) for s in (fitted, other)]
-        better = alone[(costs[1] < costs[0])[alone]]
-        state = _with_views(fitted, other, better)
-        if len(better) == 0:
-            break
+    wrong = _tilt_signs(problem, state, alone) < 0
+    for c in range(len(problem.cameras)):
+        state = _flipped(state, alone[wrong & (cameras == c)], c)
     return state
 
 
@@ -324,8 +315,8 @@ def _tolerant(problem: Problem, views: Ints) -> Problem:
     return replace(problem, covariance_px2=problem.covariance_px2 + extra)
 
 
-def _from_relief(problem: Problem, state: State, alone: Ints) -> Array:
-    """Return the signs (len(alone),) that make the reliefs seen in all views most alike.
+def _tilt_signs(problem: Problem, state: State, alone: Ints) -> Array:
+    """Return the signs (len(alone),) with which the relief in views fits that of the other views.
 
     Fitted with flat dots, view v leaves residuals of the relief s_v z_i: a matrix of rank one.
     """
@@ -341,8 +332,14 @@ def _from_relief(problem: Problem, state: State, alone: Ints) -> Array:
     np.add.at(seen, (obs.view, obs.dot), -(by_relief * jac.value).sum(-1))
     np.add.at(weight, (obs.view, obs.dot), (by_relief**2).sum(-1))
     seen = _without_plane(seen / np.maximum(weight, 1e-12), weight > 0, flat.nominal_mm)
-    left, _, _ = np.linalg.svd(seen[alone], full_matrices=False)
-    return np.where(left[:, 0] < 0, -1.0, 1.0)
+    seen, weight = seen[alone], weight[alone]
+    if len(alone) < len(flat.views):
+        return np.asarray(np.sign(np.sum(weight * seen * state.dots_mm[:, 2], axis=1)))
+    relief = np.linalg.svd(seen, full_matrices=False)[2][0]
+    for _ in range(10):
+        signs = np.sign(np.sum(weight * seen * relief, axis=1))
+        relief = (signs[:, None] * weight * seen).sum(0) / np.maximum(weight.sum(0), 1e-12)
+    return np.asarray(signs)
 
 
 def _without_plane(relief: Array, seen: NDArray[np.bool_], nominal_mm: Array) -> Array:
@@ -355,22 +352,6 @@ def _without_plane(relief: Array, seen: NDArray[np.bool_], nominal_mm: Array) ->
     return out
 
 
-def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
-    """Return the state in which the pose of the target in every view fits best.
-
-    All other parameters stay as they are. steps : largest number of Gauss-Newton steps.
-    """
-    system = System(problem)
-    views = np.arange(system.views_at, system.dots_at)
-    others, step = np.delete(np.arange(system.size), views), np.zeros(system.size)
-    for _ in range(steps):
-        step[views], _ = system.gaussian(state).hold(others).step()
-        state = system.moved(state, step)
-        if np.abs(step).max() < 1e-10:
-            break
-    return state
-
-
 def _flipped(state: State, views: Ints, camera: int) -> State:
     """Return the state with some views in the pose that is mirrored for one camera."""
     rig_from_camera = state.rig_from_camera[camera]
@@ -378,16 +359,3 @@ def _flipped(state: State, views: Ints, camera: int) -> State:
     poses = state.rig_from_target.copy()
     poses[views] = mirror @ poses[views] @ _D
     return replace(state, rig_from_target=poses)
-
-
-def _with_views(state: State, other: State, views: Ints) -> State:
-    poses = state.rig_from_target.copy()
-    poses[views] = other.rig_from_target[views]
-    return replace(state, rig_from_target=poses)
-
-
-def _view_costs(problem: Problem, state: State) -> Array:
-    """Return the sum of squared residuals (V,) of each view."""
-    obs = problem.observations()
-    squares = (whitened_error(state, obs, problem.rho_mm) ** 2).sum(-1)
-    return np.asarray(np.bincount(obs.view, squares, minlength=len(problem.views)), float)

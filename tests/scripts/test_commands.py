@@ -72,7 +72,7 @@ def test_calibrate_writes_every_file_of_the_contract(calibrated):
     dots = pd.read_csv(out / "dots.csv")
     assert list(dots.columns) == [
         "view", "camera", "dot", "row", "column", "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2",
-        "chi2_dof",
+        "edge_suu_px2", "edge_suv_px2", "edge_svv_px2", "chi2_dof",
     ]  # fmt: skip
     residuals = pd.read_csv(out / "residuals.csv")
     assert list(residuals.columns) == [

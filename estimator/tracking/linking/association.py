@@ -118,18 +118,33 @@ def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
     return out
 
 
+def likeliest_shift(pairs: Evidence, common: Common) -> Array:
+    """Return the innovation (3,) which, as the shift that all bubbles share, explains most.
+
+    The shift may be larger than the distance of two bubbles: it is where tracks agree on it.
+    """
+    if not len(pairs.row):
+        return common.shift_mm
+    pull = (pairs.information @ pairs.innovation_mm[..., None])[..., 0]
+    square = (pairs.innovation_mm * pull).sum(1)
+    flat = (pairs.innovation_mm[:, :, None] * pairs.innovation_mm[:, None]).reshape(-1, 9)
+    distance2 = (
+        square + flat @ pairs.information.reshape(-1, 9).T - 2 * pairs.innovation_mm @ pull.T
+    )
+    starts = np.flatnonzero(np.diff(pairs.row, prepend=-1))  # pairings are in the order of tracks
+    each = np.maximum(np.maximum.reduceat(pairs.constant - distance2 / 2, starts, axis=1), 0.0)
+    left = pairs.innovation_mm - common.shift_mm
+    total = np.linalg.inv(common.covariance_mm2 + pairs.covariance_mm2)
+    prior = np.einsum("ei,eij,ej->e", left, total, left) / 2
+    return np.asarray(pairs.innovation_mm[np.argmax(each.sum(1) - prior)])
+
+
 def picked_with_shift(pairs: Evidence, rows: int, common: Common) -> Evidence:
     """Return the best assignment of so many rows; the common shift is estimated with it in turn."""
     now, chosen = common, np.full(rows, -1)
     picked = pairs.take(slice(0))
     for turn in range(_SHIFT_ROUNDS):
-        score = pairs.scores(now.shift_mm)
-        if turn == 0:
-            # before the shift is known its covariance belongs to the distance
-            left = pairs.innovation_mm - now.shift_mm
-            total = np.linalg.inv(pairs.covariance_mm2 + now.covariance_mm2)
-            wide = np.einsum("ei,eij,ej->e", left, total, left) / 2
-            score = score + pairs.distance2(now.shift_mm) / 2 - wide
+        score = pairs.scores(likeliest_shift(pairs, common) if turn == 0 else now.shift_mm)
         found = best_assignment(rows, pairs.row, pairs.column, score)
         if turn and np.array_equal(found, chosen):
             break

@@ -42,6 +42,20 @@ def test_a_shake_far_beyond_the_settings_breaks_no_track(count: int) -> None:
     assert kinds(events) == ["birth"] * count
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_jump_beyond_the_distance_of_the_bubbles_exchanges_none(seed: int) -> None:
+    """5 mm at 31 Hz: up to 4.9 mm from frame to frame at 200 Hz, of 40 bubbles 3 to 5 mm apart."""
+    rng = np.random.default_rng(seed)
+    shake = 5.0 * np.sin(2 * np.pi * 31 * np.arange(80) / 200)
+    bubbles = rng.uniform(-15, 15, (40, 3))
+    frames = [bubbles + [s, 0.3 * s, 0.0] + rng.normal(0, 0.01, (40, 3)) for s in shake]
+    ids, events = run(Tracker(settings=STILL), frames, hz=200.0)
+    known = np.array(ids[8:])
+    assert ((known == known.max(0)) | (known < 0)).all() and (known >= 0).mean() > 0.97
+    assert len(np.unique(known.max(0))) == 40
+    assert not {"break", "death"} & {*kinds(events)}
+
+
 def passing(offset_mm: float, rng: np.random.Generator) -> list[Array]:
     """Two bubbles on straight lines, 100 mm/s towards each other, ``offset_mm`` apart at best."""
     t = (np.arange(60) - 30) / 500

@@ -7,8 +7,9 @@ It is the same for points that several cameras see, for what one camera alone se
 depth is unknown), and for predictions from smoothed tracks.
 
 The shift of a frame, which all bubbles share, is expected to be as large as those of the last
-frames or as the settings say. If tracks are left without a measurement and the pairings are clearly
-more probable with an unusually large shift, the rig has moved so far in this frame.
+frames or as the settings say, and is looked for where the tracks agree on it. If tracks are left
+without a measurement and the pairings are clearly more probable with an unusually large shift, the
+rig has moved so far in this frame.
 
 Confirmed tracks that compete for what several cameras see are in conflict: hypotheses say how all
 of them continue, each with its log weight relative to the best. Those with the same recent pairings

@@ -35,7 +35,7 @@ from telerig.estimator.calibration.thresholds import (
     STRONG_PERSPECTIVE,
     UNPAIRED,
 )
-from telerig.estimator.dots.grid.agreement import epipolar_products
+from telerig.estimator.dots.grid.lattice import epipolar_products
 from telerig.factors.calibration import State
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import INDEX

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from telerig.arrays import Array, Ints
+from telerig.estimator.dots.grid.lattice import epipolar_products
 from telerig.estimator.dots.grid.numbering import is_likely
 from telerig.estimator.dots.thresholds import OUTLIER_SD, WRONG_ODDS
 
@@ -85,15 +86,6 @@ def _matched(pair: tuple[PossibleNumbers, PossibleNumbers]) -> Array:
     _, one, two = np.intersect1d(pair[0].ids[0], pair[1].ids[0], return_indices=True)
     real = pair[0].ids[0][one] >= 0
     return np.concatenate([pair[0].uv_px[one[real]], pair[1].uv_px[two[real]]], axis=1)
-
-
-def epipolar_products(first: Array, second: Array) -> Array:
-    """Return the products (..., 9) of (u, v, 1) and (u', v', 1), in which x'^T F x is linear.
-
-    first, second : (..., 2) pixels of the same points in two cameras.
-    """
-    one, two = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (first, second))
-    return np.asarray((one[..., :, None] * two[..., None, :]).reshape(*one.shape[:-1], 9))
 
 
 def _epipolar(views: Mapping[str, Array]) -> Array | None:

@@ -93,6 +93,15 @@ def apply_homography(homography: Array, points: ArrayLike) -> Array:
     return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
 
+def epipolar_products(first: Array, second: Array) -> Array:
+    """Return the products (..., 9) of (u, v, 1) and (u', v', 1), in which x'^T F x is linear.
+
+    first, second : (..., 2) pixels of the same points in two cameras.
+    """
+    one, two = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (first, second))
+    return np.asarray((one[..., :, None] * two[..., None, :]).reshape(*one.shape[:-1], 9))
+
+
 def fit_affine(source: ArrayLike, target: ArrayLike) -> Array:
     """Return the affine map, as a homography (3, 3), that fits N pairs of points (N, 2) best."""
     a, b = np.asarray(source, float), np.asarray(target, float)

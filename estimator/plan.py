@@ -56,7 +56,7 @@ from telerig.rig.units import STANDARD_GRAVITY_M_S2
 from telerig.short_text import counted, share
 
 _SAMPLE_HZ = 2000.0
-_FORCE_HZ, _DAMPING = 60.0, 0.03
+_DAMPING = 0.03
 _COMMON, _ARM_RATIO = 0.75, 1.6
 _EDGE = 0.1
 _INSIDE = 0.8

@@ -74,7 +74,6 @@ class Disagreement(StrEnum):
     OUTLIERS = "outliers"
     BIAS = "bias"
     DELAY = "delay"
-    MOTION = "motion"
     SPEED = "speed"
 
 

@@ -193,7 +193,6 @@ _WORDS_OF_TEST = {
     Disagreement.BIAS: "the bias is {factor} standard deviations from 0; unit, axes or gravity may "
     "be wrong",
     Disagreement.DELAY: "the delay is {factor} standard deviations from the stated one",
-    Disagreement.MOTION: "motion is {factor} times as lively as the prior allows",
     Disagreement.SPEED: "the bubbles' mean speed is {factor} times the highest possible one",
 }
 

@@ -112,7 +112,8 @@ def in_process(name: str, size: str, limit_s: float) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         return {"beyond": limit_s}
     if done.returncode:
-        return {"error": done.stderr.strip().splitlines()[-1]}
+        words = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
+        return {"error": words[-1]}
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
@@ -166,7 +167,7 @@ def main() -> None:
     )
     parser.add_argument("--sizes", default=",".join(SIZES))
     parser.add_argument("--solvers", default=",".join(SOLVERS))
-    parser.add_argument("--limit", type=float, default=600.0, help="seconds a run may take")
+    parser.add_argument("--limit", type=float, default=90.0, help="seconds a run may take")
     parser.add_argument("--records", type=Path, help="runs done before are kept here, as JSON")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--run", nargs=2, metavar=("SOLVER", "SIZE"), help="one run")

@@ -1,6 +1,6 @@
 """Solvers of one and the same calibration, from a dozen images to four hundred of 2,000 dots.
 
-Usage: python benchmarks/solvers.py [--sizes 12x15,...] [--solvers numpy,...] [--limit 600]
+Usage: python benchmarks/solvers.py [--sizes 12x15,...] [--solvers numpy,...] [--limit 90]
                                     [--out benchmarks/results/solvers.md]
 
 Views x 2 cameras x dots, every dot in every image; model kappa+tangential, dots in 3-D with the

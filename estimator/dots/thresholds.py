@@ -19,6 +19,8 @@ twice as large as dots, and light falls off towards the corners."""
 LOG_FITTED = 0.15
 """Standard deviation of the log of a dot's fitted size divided by that of its blob, and of the way
 between both centres divided by the radius."""
+BLOB_BLUR = 1.2
+"""Semi-axis of a blurred line at half of its light, in standard deviations of the blur."""
 LOG_MISFIT = 0.15
 """Standard deviation of the log of a true dot's misfit about the median of its image, 0.1 to 0.2 on
 real plates."""

@@ -25,6 +25,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
 )
 from telerig.estimator.dots.fit.luminance import PARAMETERS, DotFit, Reason
 from telerig.estimator.dots.thresholds import (
+    BLOB_BLUR,
     HOLE_SHARE,
     LEAST_MISFIT,
     LOG_FITTED,
@@ -433,13 +434,16 @@ def reason_against_fit(
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
         return Reason.TOUCHES_BORDER
     axes, own = (np.add(semi_axes(shape), 1.0) for shape in (fit.shape_px, blob.shape_px))
+    # The blob of a dot that is thinner than the blur is up to the blur wide.
+    blurred = np.hypot(axes, BLOB_BLUR * fit.sigma_px)
+    misshapen = float(np.log(np.maximum(axes / own, own / blurred)).max())
     way = float(np.linalg.norm(fit.centre_px - blob.centre_px) / np.mean(own))
     sign = 1.0 if polarity == "white_on_black" else -1.0
     faint = np.log(max(sign * fit.contrast, 1e-12)) - look.log_contrast
     misfit = np.log((fit.misfit + LEAST_MISFIT) / (look.misfit + LEAST_MISFIT))
     return _objection({
         **_of_blob(blob, look),
-        Reason.MISPLACED: max(way, float(np.abs(np.log(axes / own)).max())) / LOG_FITTED,
+        Reason.MISPLACED: max(way, misshapen) / LOG_FITTED,
         Reason.FAINT: max(float(-faint), 0.0) / look.contrast_spread,
         Reason.MISFIT: max(float(misfit), 0.0) / look.misfit_spread,
     })  # fmt: skip

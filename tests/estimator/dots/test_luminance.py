@@ -148,6 +148,22 @@ def test_a_fit_that_left_its_blob_is_no_dot(change: dict[str, Any]) -> None:
     assert reason_against_fit(blob, replace(fit, **change), *rest) == Reason.MISPLACED
 
 
+@pytest.mark.parametrize(("sigma_px", "reason"), [(1.6, None), (0.8, Reason.MISPLACED)])
+def test_the_blob_of_a_thin_dot_is_as_wide_as_the_blur(
+    sigma_px: float, reason: Reason | None
+) -> None:
+    thin, shape = (shape_from_axes(4, b, 0.3) for b in (0.9, 3.8))
+    grey = picture(thin)
+    whole = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
+    fit = replace(
+        fit_dot(whole, Start(CENTRE, thin, SIGMA), noise_of(2.0), HELD),
+        shape_px=thin, sigma_px=sigma_px,
+    )  # fmt: skip
+    blob = Candidate(1, CENTRE, shape, 34.0, (), 0.0, None)
+    look = replace(LOOK, log_radius=float(np.log(34.0 / np.pi) / 2))
+    assert reason_against_fit(blob, fit, grey.shape, "white_on_black", look) == reason
+
+
 @pytest.mark.parametrize(
     ("unevenness", "contrast", "reason"),
     [(4.0, 1.0, None), (0.0, 0.4, None), (4.0, 0.4, Reason.NOT_ELLIPSE)],

@@ -29,6 +29,8 @@ from telerig.rig.projection import distort
 
 WORST_FIT_PX = 0.5
 """A camera whose distortion cannot be fitted better than this is refused."""
+LEAST_PIXEL_MM = 1e-6
+"""No sensor has smaller pixels; with such a number the focal length in pixels overflows."""
 
 _FREE = ("scale_px_per_mm", "aspect", "skew", "centre_u_px", "centre_v_px",
          "k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4")  # fmt: skip
@@ -172,11 +174,11 @@ def _pixel_from_metric(file: _Orientation, sensor: Sensor) -> Array:
 
 
 def _pinhole(file: _Orientation, sensor: Sensor) -> Pinhole:
-    if min(*sensor.image_size_px, *sensor.pixel_size_mm) <= 0:
+    if min(sensor.image_size_px) <= 0 or min(sensor.pixel_size_mm) < LEAST_PIXEL_MM:
         raise InputError(
             f"image {sensor.image_size_px} px, pixel {sensor.pixel_size_mm} mm",
             where=str(file.path),
-            todo="give the sizes in ptv.par, all positive",
+            todo="give the sizes in ptv.par: px, and mm of one pixel, about 0.01",
         )
     (x, y), distance = file.principal, file.distance
     k1, k2, k3, p1, p2 = file.added[:5]

@@ -212,6 +212,13 @@ def test_openptv_refuses_what_it_cannot_read(tmp_path: Path) -> None:
     paths[0].write_text("one two")
     with pytest.raises(InputError, match="no number"):
         read_openptv_cameras(paths, SENSOR)
+
+
+@pytest.mark.parametrize("pixel_mm", [0.0, -0.01, 1e-310])
+def test_openptv_pixels_without_a_size_are_refused(tmp_path: Path, pixel_mm: float) -> None:
+    paths = write_openptv(tmp_path, (0.0, 0.0, 60.0), None)
+    with pytest.raises(InputError, match="mm of one pixel"):
+        read_openptv_cameras(paths, Sensor((1280, 1024), (0.012, pixel_mm)))
     with pytest.raises(InputError, match="does not exist"):
         read_openptv_cameras([tmp_path / "none.ori"], SENSOR)
 

@@ -780,13 +780,11 @@ def track_log_odds(found: Candidates, model: RigModel, predicted: Prediction) ->
     a track is expected, and so do the detections of bubbles that only one camera found; one track
     cannot be the unmatched detection of two cameras.
     """
-    groups, rays = found.groups, []
-    for c, (points, covariances, by_pixel) in enumerate(found.rays):
-        # errors of the model that a track does not share
-        bias = [m.bias_px[0] for pair, m in model.pairs.items() if c in pair]
-        common = model.mean("scatter_px", c) ** 2 + model.mean("frame_px", c) ** 2
-        common += float(np.mean(np.square(bias))) / 4
-        rays.append((points, covariances + common * by_pixel @ by_pixel.mT))
+    groups = found.groups
+    rays = [
+        (points, covariances + common * by_pixel @ by_pixel.mT)
+        for common, (points, covariances, by_pixel) in zip(model.apart_px2, found.rays)
+    ]
     scales = np.array([camera["scale_px_per_mm"] for camera in model.cameras])
     blur_px2 = model.mean("scatter_px") ** 2 + model.mean("frame_px") ** 2
     blurred = groups.covariance_mm2 + blur_px2 / np.mean(scales) ** 2 * np.eye(3)

@@ -197,7 +197,18 @@ class RigModel:
         """Return the variance (C,) of an image beyond its own covariance: half of that of gaps."""
         return np.array([self.mean("scatter_px", c) ** 2 for c in range(len(self.cameras))]) / 2
 
-    @property
+    @cached_property
+    def apart_px2(self) -> Array:
+        """Return the variance (C,) of an image's place against that of a track: scatter, shift of a
+        frame, and the constant part of the offsets."""
+        out = []
+        for c in range(len(self.cameras)):
+            bias = [m.bias_px[0] for pair, m in self.pairs.items() if c in pair]
+            common = self.mean("scatter_px", c) ** 2 + self.mean("frame_px", c) ** 2
+            out.append(common + float(np.mean(np.square(bias))) / 4)
+        return np.array(out)
+
+    @cached_property
     def unmatched(self) -> Array:
         """Return for each camera (C,) the mean share of its detections without a partner."""
         own = [[m.unmatched_share[p.index(c)] for p, m in self.pairs.items() if c in p]
@@ -217,7 +228,7 @@ class RigModel:
             out[a, b] = axis * np.sign(first[np.argmax(np.abs(first))])
         return out
 
-    @property
+    @cached_property
     def volume_mm3(self) -> float:
         """Return the volume that the images of two cameras show."""
         a, b = next(iter(self.pairs))
@@ -227,7 +238,7 @@ class RigModel:
         span = self.pairs[a, b].span_px
         return float(self.areas_px2[[a, b]].prod() / span / scale**3 / sine)
 
-    @property
+    @cached_property
     def areas_px2(self) -> Array:
         """Return the areas (C,) of the images."""
         return np.array([float(np.prod(c.image_size_px)) for c in self.cameras])

@@ -142,18 +142,35 @@ class Views:
         Of those that fit equally well the one of largest volume is taken. Also the directions
         (B, 3 n, k) of g that no ellipsoid explains, and the components (B, k) of the misfit there.
         """
-        basis = silhouette.SYMMETRIC.reshape(6, 9).T
-        system = self.measure @ basis
         target = self.round
-        left, values, right = np.linalg.svd(system)
-        rank = 6 - (self.count == 2)
-        unseen = left[..., rank:]
-        known = (left[..., :rank].mT @ target) / values[:, :rank]
-        fitted = (known[:, None] @ right[:, :rank])[:, 0]
-        moments = (fitted @ basis.T).reshape(-1, 3, 3)
         if self.count == 2:
-            moments = silhouette.largest(moments, (right[:, -1] @ basis.T).reshape(-1, 3, 3))
+            moments, unseen = self._free_of_two()
+        else:
+            basis = silhouette.SYMMETRIC.reshape(6, 9).T
+            left, values, right = np.linalg.svd(self.measure @ basis)
+            unseen = left[..., 6:]
+            fitted = (((left[..., :6].mT @ target) / values)[:, None] @ right)[:, 0]
+            moments = (fitted @ basis.T).reshape(-1, 3, 3)
         return silhouette.proper(moments), unseen, (unseen.mT @ target)
+
+    def _free_of_two(self) -> tuple[Array, Array]:
+        """Return `free`'s moments and directions of two views.
+
+        Neither sees the product of both lines of sight d; both see the extent along d1 x d2.
+        """
+        lines = np.cross(self.jacobian[:, :, 0], self.jacobian[:, :, 1])
+        lines /= np.linalg.norm(lines, axis=-1, keepdims=True)
+        shear = lines[:, 0, :, None] * lines[:, 1, None, :]
+        shear = shear + shear.mT
+        both = np.cross(lines[:, 0], lines[:, 1])[:, None, :, None]
+        j = self.jacobian
+        a, b = np.moveaxis(self.axes_px.mT @ np.linalg.solve(j @ j.mT, j @ both), -2, 0)[..., 0]
+        extent = np.stack([a * a + b * b, a * a - b * b, 2 * a * b], -1) * [[1.0], [-1.0]]
+        unseen = extent.reshape(-1, 6, 1) / np.linalg.norm(extent, axis=(1, 2))[:, None, None]
+        basis = silhouette.SYMMETRIC.reshape(6, 9).T
+        regular = self.measure @ basis + unseen * shear[:, *np.triu_indices(3)][:, None]
+        fitted = np.linalg.solve(regular, self.round[:, None])[..., 0] @ basis.T
+        return silhouette.largest(fitted.reshape(-1, 3, 3), shear), unseen
 
     @cached_property
     def shared(self) -> Array:

@@ -28,7 +28,14 @@ from telerig.estimator.tracking.linking.filter import (
     TrackerSettings,
     birth_covariance,
 )
-from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles, Frame, Motion, Seen
+from telerig.estimator.tracking.linking.frames import (
+    NO_PARTICLE,
+    Bubbles,
+    Frame,
+    Motion,
+    Seen,
+    starts,
+)
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import UNKNOWN_MM, stacked_jacobian
 
@@ -73,14 +80,22 @@ def smooth_points(
 
 
 def readings_of(frames: Sequence[Frame], particles: Sequence[int]) -> tuple[Array, Array]:
-    """Return the measurements of K tracks in F frames, as `smooth_points` takes them."""
+    """Return the measurements of K tracks (ascending) in F frames, as `smooth_points` takes them."""
     points = np.full((len(frames), len(particles), 3), np.nan)
     covariances = np.full((*points.shape, 3), np.nan)
-    for i, frame in enumerate(frames):
-        _, mine, at = np.intersect1d(particles, frame.particle, return_indices=True)
-        points[i, mine] = frame.bubbles.points_mm[at]
-        covariances[i, mine] = frame.bubbles.covariance_mm2[at]
+    frame, track, at = _bubbles_of(frames, particles)
+    points[frame, track] = np.concatenate([f.bubbles.points_mm for f in frames])[at]
+    covariances[frame, track] = np.concatenate([f.bubbles.covariance_mm2 for f in frames])[at]
     return points, covariances
+
+
+def _bubbles_of(frames: Sequence[Frame], particles: Sequence[int]) -> tuple[Ints, Ints, Ints]:
+    """Return the bubbles (N,) of K tracks (ascending): frame, track, place among all bubbles."""
+    ids = np.concatenate([frame.particle for frame in frames])
+    track = np.searchsorted(particles, ids)
+    at = np.flatnonzero(np.append(particles, NO_PARTICLE - 1)[track] == ids)
+    frame = np.repeat(np.arange(len(frames)), [len(frame.particle) for frame in frames])
+    return frame[at], track[at], at
 
 
 _LEAST_POINTS = 4
@@ -140,27 +155,30 @@ def follow_back(tracks: SmoothedTracks, changeable: set[int]) -> None:
     """
     frames = tracks.frames
     sizes = _sizes(frames, _LEAST_POINTS)
+    changed, filled = set(sizes), set[int]()
     for _ in range(_PASSES):
         missing = [
             (i, here)
             for i, here in enumerate(_missing(frames, changeable, sorted(sizes)))
-            if here and (frames[i].owners() == NO_PARTICLE).any()
+            if (i in filled or not changed.isdisjoint(here))  # in others nothing is new
+            and here
+            and (frames[i].owners() == NO_PARTICLE).any()
         ]
         if not missing:
             break
         tracks.prepare(chain.from_iterable(here for _, here in missing))
-        changed = set()
+        changed, filled = set(), set()
         for i, here in missing:
             d_eq = np.array([sizes[p] for p in here])
             predicted = Prediction(np.array(here), *tracks.at(i, here), d_eq)
             found = _nearest(frames[i], predicted, tracks.cameras, tracks.settings)
-            changed |= {
+            taken = {
                 here[k]
-                for k, rays in enumerate(found)
-                if _claim(frames[i], rays[rays >= 0], predicted.take([k]))
+                for k in np.flatnonzero((found >= 0).any(1)).tolist()
+                if _claim(frames[i], found[k][found[k] >= 0], predicted.take([k]))
             }
-        if not changed:
-            break
+            changed |= taken
+            filled |= {i} if taken else set()
         tracks.forget(changed)
 
 
@@ -182,8 +200,7 @@ def _missing(
 ) -> list[list[int]]:
     """Per frame the particles that it lacks, in the gaps of their tracks and a little beyond."""
     seen = np.zeros((len(frames), len(particles)), bool)
-    for i, frame in enumerate(frames):
-        seen[i] = np.isin(particles, frame.particle)
+    seen[_bubbles_of(frames, particles)[:2]] = True
     first, last = seen.argmax(0), len(seen) - 1 - seen[::-1].argmax(0)
     index = np.arange(len(frames))[:, None]
     reach = (index >= first - _REACH_FRAMES) & (index <= last + _REACH_FRAMES)
@@ -251,29 +268,43 @@ def place_hidden(tracks: SmoothedTracks, frames: slice) -> None:
     behind that outline, so that motion is not counted twice when tracks are smoothed.
     """
     sizes = _sizes(tracks.frames, 1)
-    known = [*sizes]
     lonely = [
-        (i, frame, np.flatnonzero(frame.bubbles.alone & np.isin(frame.particle, known)))
+        (i, frame, np.array([k for k in np.flatnonzero(frame.bubbles.alone)
+                             if int(frame.particle[k]) in sizes], np.int64))
         for i, frame in list(enumerate(tracks.frames))[frames]
-    ]
+    ]  # fmt: skip
+    lonely = [(i, frame, own) for i, frame, own in lonely if len(own)]
+    if not lonely:
+        return
     tracks.prepare(chain.from_iterable(frame.particle[own].tolist() for _, frame, own in lonely))
+    each = []
     for i, frame, own in lonely:
-        if len(own):
-            ids = frame.particle[own]
-            d_eq = np.array([sizes[p] for p in ids.tolist()])
-            one = Prediction(ids, *tracks.at(i, ids.tolist()), d_eq)
-            _place(frame, own, one, tracks.cameras)
+        ids = frame.particle[own]
+        d_eq = np.array([sizes[p] for p in ids.tolist()])
+        each.append(Prediction(ids, *tracks.at(i, ids.tolist()), d_eq))
+    every = stacked_jacobian(tracks.cameras, np.concatenate([one.points_mm for one in each]))
+    for (_, frame, own), one, begin in zip(lonely, each, starts(one.ids for one in each)):
+        here = slice(begin, begin + len(own))
+        _place(frame, own, one, (every[0][here], every[1][here]), tracks.cameras)
 
 
-def _place(frame: Frame, own: Ints, smoothed: Prediction, cameras: Sequence[Camera]) -> None:
+def _place(
+    frame: Frame,
+    own: Ints,
+    smoothed: Prediction,
+    projected: tuple[Array, Array],
+    cameras: Sequence[Camera],
+) -> None:
     """Write the places of hidden bubbles (K,) of a frame, unless another track's bubble is there.
 
     A point must be certain, and an outline in front must explain why a camera does not show it, or
     the image's border.
+
+    projected : what `stacked_jacobian` returns for the smoothed points.
     """
     bubbles, (shape, size_mm) = frame.bubbles, ((len(own), len(cameras)), smoothed.d_eq_mm)
-    uv, by_point = stacked_jacobian(tuple(cameras), smoothed.points_mm)
-    uv, by_point = uv.reshape(*shape, 2) + frame.offset_px, by_point.reshape(*shape, 2, 3)
+    uv, by_point = projected[0].reshape(*shape, 2), projected[1].reshape(*shape, 2, 3)
+    uv = uv + frame.offset_px
     spread = by_point @ smoothed.covariance_mm2[:, None] @ by_point.mT
     diameter = size_mm[:, None] * np.linalg.det(by_point @ by_point.mT) ** 0.25
     sharp = np.minimum(_SHARPNESS * diameter, _SHARPNESS_PX)
@@ -283,6 +314,8 @@ def _place(frame: Frame, own: Ints, smoothed: Prediction, cameras: Sequence[Came
     limit = np.array([camera.image_size_px for camera in cameras]) - 1.0
     inside = ((uv > -radius) & (uv < limit + radius)).all(-1)
     good = ((seen | covered).sum(1) > 1) & (seen | covered | ~inside).all(1)
+    if not good.any():
+        return
     beside = bubbles.take((frame.particle != NO_PARTICLE) & ~bubbles.alone)
     points, sizes = [*beside.points_mm], beside.d_eq_mm.tolist()
     for k in np.argsort(np.trace(smoothed.covariance_mm2, axis1=1, axis2=2)).tolist():

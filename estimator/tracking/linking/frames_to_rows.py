@@ -243,8 +243,8 @@ def grouped_frame(
         offset = np.median(sight.candidates.groups.left_px[found.candidate][~part], axis=0)
     rays = sight.rays(offset)
     for k in np.flatnonzero(part) if offset.any() else ():
-        own = rays.take(bubbles.rows[k, bubbles.rows[k] >= 0])
-        bubbles.points_mm[k] = fused(own.points_mm, own.covariance_mm2)[0]
+        own = bubbles.rows[k, bubbles.rows[k] >= 0]
+        bubbles.points_mm[k] = fused(rays.points_mm[own], rays.covariance_mm2[own])[0]
     single = rays.given == NO_PARTICLE
     single[bubbles.rows[bubbles.rows >= 0]] = False
     return Bubbles.concat([bubbles, rays.take(single)]), rays, offset

@@ -321,6 +321,8 @@ class Tracker:
 
     def _keep(self, kept: Bools) -> None:
         """Forget the other states (K,), of which none is in a conflict."""
+        if kept.all():
+            return
         places = np.cumsum(kept) - 1
         self.states = self.states.take(kept)
         self.conflicts = [replace(c, rows=places[c.rows]) for c in self.conflicts]

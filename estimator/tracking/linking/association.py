@@ -346,16 +346,16 @@ class _Pairings:
         pairs = gated_pairs(expected(states), measured, allowed, common, scan.settings, misses)
         sure = confirmed[pairs.row] & ~measured.alone[pairs.column]
         firm, weak = pairs.take(sure), pairs.take(~sure)
-        for some in (firm, weak.take(~measured.alone[weak.column])):
-            picked = picked_with_shift(some.take(best[some.row]), len(states), common)
-            if len(picked.row):
-                break
+        picked = picked_with_shift(firm.take(best[firm.row]), len(states), common)
+        if not len(picked.row):
+            some = weak.take(~measured.alone[weak.column] & best[weak.row])
+            picked = picked_with_shift(some, len(states), common)
         return _Pairings(states, scan, firm, weak, owner, picked, common)
 
     @property
     def now(self) -> Common:
         """The shift of this frame that all bubbles share."""
-        return self.outside(())
+        return self.prior.informed(self.picked.innovation_mm, self.picked.covariance_mm2)
 
     @property
     def score(self) -> float:

@@ -28,14 +28,7 @@ from telerig.estimator.tracking.linking.filter import (
     TrackerSettings,
     birth_covariance,
 )
-from telerig.estimator.tracking.linking.frames import (
-    NO_PARTICLE,
-    Bubbles,
-    Frame,
-    Motion,
-    Seen,
-    starts,
-)
+from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles, Frame, Motion, Seen
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import UNKNOWN_MM, stacked_jacobian
 
@@ -80,7 +73,7 @@ def smooth_points(
 
 
 def readings_of(frames: Sequence[Frame], particles: Sequence[int]) -> tuple[Array, Array]:
-    """Return the measurements of K tracks (ascending) in F frames, as `smooth_points` takes them."""
+    """Return the measurements of K ascending tracks in F frames, as `smooth_points` takes them."""
     points = np.full((len(frames), len(particles), 3), np.nan)
     covariances = np.full((*points.shape, 3), np.nan)
     frame, track, at = _bubbles_of(frames, particles)
@@ -273,38 +266,24 @@ def place_hidden(tracks: SmoothedTracks, frames: slice) -> None:
                              if int(frame.particle[k]) in sizes], np.int64))
         for i, frame in list(enumerate(tracks.frames))[frames]
     ]  # fmt: skip
-    lonely = [(i, frame, own) for i, frame, own in lonely if len(own)]
-    if not lonely:
-        return
     tracks.prepare(chain.from_iterable(frame.particle[own].tolist() for _, frame, own in lonely))
-    each = []
     for i, frame, own in lonely:
-        ids = frame.particle[own]
-        d_eq = np.array([sizes[p] for p in ids.tolist()])
-        each.append(Prediction(ids, *tracks.at(i, ids.tolist()), d_eq))
-    every = stacked_jacobian(tracks.cameras, np.concatenate([one.points_mm for one in each]))
-    for (_, frame, own), one, begin in zip(lonely, each, starts(one.ids for one in each)):
-        here = slice(begin, begin + len(own))
-        _place(frame, own, one, (every[0][here], every[1][here]), tracks.cameras)
+        if len(own):
+            ids = frame.particle[own]
+            d_eq = np.array([sizes[p] for p in ids.tolist()])
+            one = Prediction(ids, *tracks.at(i, ids.tolist()), d_eq)
+            _place(frame, own, one, tracks.cameras)
 
 
-def _place(
-    frame: Frame,
-    own: Ints,
-    smoothed: Prediction,
-    projected: tuple[Array, Array],
-    cameras: Sequence[Camera],
-) -> None:
+def _place(frame: Frame, own: Ints, smoothed: Prediction, cameras: Sequence[Camera]) -> None:
     """Write the places of hidden bubbles (K,) of a frame, unless another track's bubble is there.
 
     A point must be certain, and an outline in front must explain why a camera does not show it, or
     the image's border.
-
-    projected : what `stacked_jacobian` returns for the smoothed points.
     """
     bubbles, (shape, size_mm) = frame.bubbles, ((len(own), len(cameras)), smoothed.d_eq_mm)
-    uv, by_point = projected[0].reshape(*shape, 2), projected[1].reshape(*shape, 2, 3)
-    uv = uv + frame.offset_px
+    uv, by_point = stacked_jacobian(tuple(cameras), smoothed.points_mm)
+    uv, by_point = uv.reshape(*shape, 2) + frame.offset_px, by_point.reshape(*shape, 2, 3)
     spread = by_point @ smoothed.covariance_mm2[:, None] @ by_point.mT
     diameter = size_mm[:, None] * np.linalg.det(by_point @ by_point.mT) ** 0.25
     sharp = np.minimum(_SHARPNESS * diameter, _SHARPNESS_PX)

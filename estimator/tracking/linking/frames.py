@@ -128,13 +128,13 @@ class Sight:
 
     def groups(self, chosen: Ints) -> Bubbles:
         """Return some of the groups as bubbles."""
-        found = self.candidates.groups.take(chosen)
+        found = self.candidates.groups
         first = np.searchsorted(self.seen.sightings.camera, np.arange(found.rows.shape[1]))
-        rows = moved(found.rows, first)
+        rows = moved(found.rows[chosen], first)
         given = np.append(self.seen.given, NO_PARTICLE)[rows].max(1)
         sizes = self.bodies.d_eq_mm[chosen]
-        every = Bubbles.of(rows, found.points_mm, found.covariance_mm2, given, sizes)
-        return replace(every, body=chosen)
+        points, covariances = found.points_mm[chosen], found.covariance_mm2[chosen]
+        return replace(Bubbles.of(rows, points, covariances, given, sizes), body=chosen)
 
     def rays(self, offset_px: Array) -> Bubbles:
         """Return each detection as a bubble that no other camera sees: a point of unknown depth.

@@ -405,9 +405,12 @@ class Tracker:
 
     def _deaths(self, scan: Scan) -> None:
         """End the tracks without rivals that have been unseen for too long."""
-        states, settings, confirmed = self.states, self.settings, self._confirmed()
+        states, settings = self.states, self.settings
         unseen = self._single & (states.track > NO_PARTICLE) & (states.seen_frame != scan.frame)
-        lost = states.take(unseen)
+        if not unseen.any():
+            self._lost = {}
+            return
+        confirmed, lost = self._confirmed(), states.take(unseen)
         nearest = beside(confirmed, lost.points_mm, lost.track)
         self._lost = {t: self._lost.get(t) or new for t, new in zip(lost.track.tolist(), nearest)}
         waited_s, frames = scan.t_s - states.seen_t_s, scan.frame - states.seen_frame

@@ -21,6 +21,12 @@ def bubbles(
     min_diameter: Annotated[
         float, typer.Option(help="Dark spots with a smaller diameter, in px, are no bubbles.")
     ] = 8.0,
+    min_contrast: Annotated[
+        float,
+        typer.Option(
+            help="Fainter shadows, as a share of the screen's brightness, are no bubbles."
+        ),
+    ] = 0.3,
     region: Annotated[
         str,
         typer.Option(
@@ -54,7 +60,8 @@ def bubbles(
         inputs = fingerprints(out, files if mask is None else [*files, mask])
         with replaced_results(out, "bubbles", again=again, inputs=inputs) as staged:
             words = write_bubbles(
-                files, staged, min_diameter_px=min_diameter, region_px=corners, mask=mask,
+                files, staged, min_diameter_px=min_diameter, min_contrast=min_contrast,
+                region_px=corners, mask=mask,
                 progress=lambda done, total: stage("images", done, total),
             )  # fmt: skip
     for line in words:

@@ -50,6 +50,7 @@ def write_bubbles(
     folder: Path,
     *,
     min_diameter_px: float = 8.0,
+    min_contrast: float = 0.3,
     region_px: Sequence[Sequence[float]] | None = None,
     mask: Path | None = None,
     progress: Callable[[int, int], None] = lambda _done, _all: None,
@@ -59,6 +60,7 @@ def write_bubbles(
     files : grey images; their names without ending are the names in the tables.
     region_px : corners (u, v) of a polygon, and ``mask`` an image that is not 0 where bubbles are
         looked for. Without both, a dark surround is found in each image and left out.
+    min_diameter_px, min_contrast : as for `detect_bubbles`.
     progress : is called with the number of images that are done, and of all.
 
     Returns a summary of each image in one line. Raises InputError for what is no grey image, for
@@ -75,7 +77,9 @@ def write_bubbles(
         image = read_image(file)
         shape = (image.shape[0], image.shape[1])
         field = described_field(shape, region_px, mask, f"--region, {file.name}")
-        bubbles = find_bubbles(image, field=field, min_diameter_px=min_diameter_px)
+        bubbles = find_bubbles(
+            image, field=field, min_diameter_px=min_diameter_px, min_contrast=min_contrast
+        )
         _draw(image, bubbles, folder / "overlays" / f"{file.stem}.jpg")
         found.append(_found(file.stem, bubbles))
         words.append(found[-1].words)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from places import REAL
+from places import REAL, ROOT
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import detect_bubbles, find_bubbles
 from telerig.estimator.bubbles.field import lit_field, mask_field, region_field
 from telerig.estimator.bubbles.single_images import CLUSTER_COLUMNS, write_bubbles
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from bubble_outline_renderer import Drawn, draw
 
 PLACES = np.array([(150.0, 140.0), (260.0, 180.0), (200.0, 270.0), (300.0, 300.0)])
 RADIUS_PX = 16.0
@@ -138,3 +142,24 @@ def test_real_bubbles_behind_a_window() -> None:
     away = mine[["u_px", "v_px"]].to_numpy()[:, None] - sharp[["u_px", "v_px"]].to_numpy()
     assert np.mean(np.linalg.norm(away, axis=2).min(axis=1) < 3.0) > 0.6
     assert len(sharp) < 250 and not any("merged" in words for words in found.accepted["flags"])
+
+
+@pytest.mark.parametrize("diameter", [5.0, 6.0])
+@pytest.mark.parametrize(("noise", "level"), [(0.01, 0.12), (0.03, 0.12)])
+def test_bubbles_of_5_px_are_found(diameter: float, noise: float, level: float) -> None:
+    rng = np.random.default_rng(5)
+    places = np.stack(np.meshgrid(np.arange(20, 170, 20), np.arange(20, 170, 20)), -1).reshape(
+        -1, 2
+    )
+    places = places + rng.uniform(-2, 2, places.shape)
+    bubbles = [Drawn((u, v, diameter / 2, diameter / 2, 0.0), level=level) for u, v in places]
+    # Specks of 3 px beside them are none.
+    bubbles += [Drawn((u + 10.0, v + 10.0, 1.5, 1.5, 0.0), level=level) for u, v in places[::4]]
+    image = 30000.0 * (draw(bubbles, (190, 190), blur_px=1.0) + rng.normal(0.0, noise, (190, 190)))
+    found = detect_bubbles(
+        np.clip(image, 0, 65535).astype(np.uint16), min_diameter_px=4.5, min_contrast=0.15
+    )
+    away = found[["u_px", "v_px"]].to_numpy()[:, None] - places
+    near = np.linalg.norm(away, axis=2) < 0.5
+    assert near.any(axis=0).mean() > 0.93 and near.any(axis=1).mean() > 0.98
+    assert found["d_eq_px"].median() == pytest.approx(diameter, abs=0.1)

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from telerig.io.files.csv_table import Column, no_rows, read_part, read_table
 from telerig.io.files.frame_table import Read
@@ -147,6 +149,7 @@ VIEW = named("view", "name of the view")
 PIXEL = ("u_px", "v_px")
 PIXEL_COVARIANCE = ("suu_px2", "suv_px2", "svv_px2")
 EDGE_COVARIANCE = ("edge_suu_px2", "edge_suv_px2", "edge_svv_px2")
+"""The part of `PIXEL_COVARIANCE` that is the same in all images of a dot."""
 POINT = ("x_mm", "y_mm", "z_mm")
 SILHOUETTES = tuple(f"silhouettes_{axis}_mm" for axis in "xyz")
 COVARIANCE = ("sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2")
@@ -199,3 +202,12 @@ OF_SHAPE = (
 )  # fmt: skip
 """What outlines tell of a bubble's shape; blank where one is missing, cut or covered."""
 SHAPE_COLUMNS = [column.name for column in OF_SHAPE]
+
+
+def covariance_of_image(dots: pd.DataFrame) -> NDArray[np.float64]:
+    """Return uu, uv and vv (N, 3) in px^2 of dots, without the part that all their images share."""
+    whole = dots[list(PIXEL_COVARIANCE)].to_numpy(float)
+    if not set(EDGE_COVARIANCE) <= set(dots):
+        return whole
+    shared: NDArray[np.float64] = dots[list(EDGE_COVARIANCE)].fillna(0.0).to_numpy(float)
+    return whole - shared

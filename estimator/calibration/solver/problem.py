@@ -24,7 +24,7 @@ from telerig.estimator.calibration.thresholds import (
     OUTLIER_SD,
 )
 from telerig.factors.calibration import Observations, State, pixels
-from telerig.io.tables.table import EDGE_COVARIANCE
+from telerig.io.tables.table import EDGE_COVARIANCE, covariance_of_image
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX, LENS_PARAMETERS, parameters_of
 from telerig.rig.pose import Pose
@@ -285,15 +285,11 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
     view = _index(table["view"].astype(str), views)
     order = np.lexsort((table["dot"].to_numpy(), camera, view))
     table = table.iloc[order]
-    covariance = np.empty((len(table), 2, 2))
-    covariance[:, 0, 0] = table["suu_px2"]
-    covariance[:, 1, 1] = table["svv_px2"]
-    covariance[:, 0, 1] = covariance[:, 1, 0] = table["suv_px2"]
+    covariance = covariance_of_image(table)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     sigma = [target.print_sigma_mm, target.print_sigma_mm, target.flatness_sigma_mm]
     if set(EDGE_COVARIANCE) <= set(table):
         parts = table[list(EDGE_COVARIANCE)].fillna(0.0).to_numpy(float)
         edge = parts[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        covariance -= edge
         scale = np.array([c["scale_px_per_mm"] for c in cameras])[camera[order]]
         edge_mm = np.sqrt(np.linalg.eigvalsh(edge)[:, 1]) / scale
         sigma[:2] = 2 * [float(np.hypot(target.print_sigma_mm, np.median(edge_mm)))]
@@ -329,7 +325,7 @@ def _natural(name: str) -> tuple[int, float, str]:
 def _check(table: pd.DataFrame, names: Sequence[str], target: Target) -> None:
     """Raise InputError if some rows cannot be used; the error names the first of them."""
     columns = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
-    uu, uv, vv = (table[name].to_numpy(float) for name in columns[2:])
+    uu, uv, vv = covariance_of_image(table).T
     finite = np.isfinite(table[columns].to_numpy(float)).all(1)
     known = ", ".join(repr(n) for n in names)
     faults = {

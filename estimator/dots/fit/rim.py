@@ -5,7 +5,7 @@ In the dot's own circle (its ellipse divided by its semi-axes) an edge at the ra
 that of the centre. a_0 to b_2 are parameters of the luminance model and not seen in one dot; but
 those of k = 2 show in how the shapes of neighbouring dots differ, and those of k = 3 to 5 in the
 residuals at the edge. ln of their power is continued to k = 1 as a parabola in k, which is exact
-for a Gaussian correlation along the edge, and 10 % low for an exponential one.
+for a Gaussian correlation along the edge, and 9 % low where power is (1 + k^2)^-1.5.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DOTS_PER_TERM = 4
 are there for each of them; else fewer."""
 CURVATURE_SD = 0.5
 """Prior standard deviation of the second difference of ln power by k: it is -0.64 for a Gaussian
-correlation along 0.8 rad of the edge, 0.24 for an exponential one along 1 rad."""
+correlation along 0.8 rad of the edge, 0.24 where power is (1 + k^2)^-1.5."""
 SLOPE_SD = 10.0
 PARABOLA_SD = 0.05
 """By so much ln power differs from a parabola, relative to its noise."""

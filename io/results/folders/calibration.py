@@ -25,7 +25,7 @@ from telerig.io.results.findings import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
 from telerig.io.tables.calibration import DOTS, REJECTED, RESIDUALS
-from telerig.io.tables.table import PIXEL_COVARIANCE
+from telerig.io.tables.table import EDGE_COVARIANCE, PIXEL_COVARIANCE, covariance_of_image
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -264,8 +264,9 @@ def _with_whitened(table: pd.DataFrame, file: Path, floor_px: float) -> pd.DataF
     if not set(names) <= set(dots.columns):
         return table
     keys = ["view", "camera", "dot"]
-    merged = table.merge(dots[keys + names].drop_duplicates(keys), on=keys, how="left")
-    uu, uv, vv = (merged[name].to_numpy() for name in names)
+    kept = [name for name in (*names, *EDGE_COVARIANCE) if name in dots]
+    merged = table.merge(dots[keys + kept].drop_duplicates(keys), on=keys, how="left")
+    uu, uv, vv = covariance_of_image(merged).T
     uu, vv = uu + floor_px**2, vv + floor_px**2
     if not np.all((uu > 0) & (uu * vv > uv**2)):
         return table

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from telerig.errors import CalibrationError
+from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.solver import covariance
 from telerig.estimator.calibration.solver import robust_least_squares as lm
 from telerig.estimator.calibration.solver import system as systems
@@ -497,3 +497,6 @@ def test_what_rough_edges_do_counts_as_an_error_of_the_dots_places(scene: Any) -
     expected = np.hypot(made.target.print_sigma_mm, np.sqrt(0.05) / scale)
     np.testing.assert_allclose(rough.dot_sigma_mm[:, :2], expected, rtol=0.05)
     np.testing.assert_array_equal(rough.dot_sigma_mm[:, 2], plain.dot_sigma_mm[:, 2])
+    dots["edge_suu_px2"] = dots["suu_px2"] * 1.01
+    with pytest.raises(InputError, match="no positive definite covariance"):
+        problem_from_dots(dots, made.cameras, made.target)

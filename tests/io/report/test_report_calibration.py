@@ -202,6 +202,18 @@ def test_whitened_residuals_are_unit_normal(folder: Path) -> None:
     assert abs(np.corrcoef(white.T)[0, 1]) < 0.2
 
 
+def test_what_rough_edges_share_in_all_images_does_not_whiten_residuals(folder: Path) -> None:
+    before = read_calibration_results(folder).residuals
+    file = folder / "dots.csv"
+    dots = pd.read_csv(file, dtype={"view": str})
+    for name, shared in (("suu_px2", 0.09), ("suv_px2", 0.01), ("svv_px2", 0.09)):
+        dots[name], dots[f"edge_{name}"] = dots[name] + shared, shared
+    dots.to_csv(file, index=False)
+    after = read_calibration_results(folder).residuals
+    columns = ["whitened_u", "whitened_v"]
+    np.testing.assert_allclose(after[columns], before[columns], rtol=1e-6)
+
+
 def test_parameter_rows_tell_held_from_free_and_distortion_in_px(folder: Path) -> None:
     results = read_calibration_results(folder)
     rows = {row.cells[0]: row for row in parameter_rows(results)}

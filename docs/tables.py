@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from telerig.io.tables.declared import TABLES
@@ -16,12 +17,19 @@ BEGIN, END = "<!-- made by docs/tables.py -->\n", "<!-- end of tables -->\n"
 
 
 def markdown(table: Table) -> str:
-    """Return one table's columns as Markdown: those of one meaning stand in one row."""
+    """Return one table's columns as Markdown: those of one meaning stand in one row.
+
+    If a table ends in all columns of another one, it links to that.
+    """
     lines = [f"### {table.file}\n", f"One row: {table.row}.\n"]
     lines += ["| column | unit | what |", "|---|---|---|"]
-    for names, unit, what in table.rows_of_words():
+    others = [t for t in TABLES if t is not table and table.columns[-len(t.columns) :] == t.columns]
+    own = table.columns[: -len(others[0].columns)] if others else table.columns
+    for names, unit, what in replace(table, columns=own).rows_of_words():
         shown = ", ".join(f"`{name.replace(CAMERA, '<camera>')}`" for name in names)
         lines.append(f"| {shown} | {unit} | {what.replace('|', '&#124;')} |")
+    for other in others[:1]:
+        lines.append(f"\nThen the columns of [{other.file}](#{other.file.replace('.', '')}).")
     return "\n".join(lines) + "\n"
 
 

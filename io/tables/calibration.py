@@ -33,7 +33,7 @@ DOTS = Table(
         *sure(PIXEL, "px", "centre of the dot's image, as measured"), *OF_PIXELS,
         *may("chi2_dof", "", "chi-square per degree of freedom of the luminance fit"),
         *may(EDGE_COVARIANCE, "px2", "part of the covariance from rough edges of the dots: it is "
-             " the same in all images of a dot, so it counts as an error of its place"),
+             "the same in all images of a dot, so it counts as an error of its place"),
     ),
 )  # fmt: skip
 

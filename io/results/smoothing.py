@@ -49,8 +49,8 @@ class Flag(StrEnum):
     SHAKE_BELOW_NOISE : the shake is smaller than the noise of the positions.
     SHAKE_UNMEASURED : nothing but the motion of one or two bubbles at a time shows the shake, so
         that all numbers depend on the priors.
-    ARMS_UNMEASURED : an accelerometer measures the carriage, and nothing but the motion of one
-        bubble at a time shows how the cameras' arms move on it.
+    ARMS_UNMEASURED : an accelerometer measures the carriage, and nothing but the motion of one or
+        two bubbles at a time shows how the cameras' arms move on it.
     """
 
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"

@@ -42,7 +42,7 @@ _MOSTLY = 0.5
 
 
 class Measured(IntEnum):
-    """Name of what part of the rig the shake is measured, by more than one bubble alone.
+    """Name of what part of the rig the shake is measured, by more than one or two bubbles alone.
 
     CARRIAGE : of the carriage, without the arms' own motion.
     CAMERAS : of the cameras.
@@ -93,7 +93,7 @@ def axis_verdict(
     encoder : (n,) standard deviations (mm) that the encoder's scale and the travel axis add.
     eta, rms : as in `AxisVerdict`.
     inflation : factor of the standard deviations because of contradictions.
-    measured : what but one bubble alone shows the shake. Without anything eta does not count; if
+    measured : what but one or two bubbles alone shows the shake. Without anything eta does not count; if
         only the carriage's motion is measured, it cannot make the axis RESOLVED, because the part
         of the arms in it follows from the priors.
     given : whether the user states the shake's prior. If nothing measures the shake and nobody

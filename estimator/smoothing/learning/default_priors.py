@@ -23,7 +23,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Stage,
 )
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
-from telerig.factors.state_space import broad_band_density
+from telerig.factors.state_space import broad_band_density, forced_mass
 
 SHAKE_RMS_MM = 0.2
 _ZIGZAG_HZ = (3.0, 12.0)
@@ -208,8 +208,8 @@ def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> Carr
     wanted = bool(problem.accelerometers) or not _dense(stage, problem.t_s, encoder_sigma_mm)
     if not wanted:
         return CarriageModel()
-    rms = acceleration_rms(stage)
-    return CarriageModel("force", acceleration_rms_mm_s2=max(1.5 * rms, 100.0))
+    rms = acceleration_rms(stage, encoder_sigma_mm)
+    return CarriageModel("force", acceleration_rms_mm_s2=max(rms, 100.0))
 
 
 def _dense(stage: Stage, t_s: Array, sigma_mm: float) -> bool:
@@ -217,20 +217,32 @@ def _dense(stage: Stage, t_s: Array, sigma_mm: float) -> bool:
     if len(stage.t_s) < 3:
         return False
     step = float(np.median(np.diff(stage.t_s)))
-    bend = acceleration_rms(stage) * step**2 / 8
+    bend = acceleration_rms(stage, sigma_mm) * step**2 / 8
     return bend < _INTERPOLATION_SHARE * max(sigma_mm, 1e-4)
 
 
-def acceleration_rms(stage: Stage) -> float:
-    """Return the RMS acceleration of the stage in mm/s^2, from parabolas over 20 ms."""
-    step = float(np.median(np.diff(stage.t_s)))
-    window = int(np.clip(round(0.02 / step) // 2 * 2 + 1, 5, len(stage.t_s) // 2 * 2 - 1))
-    if window < 5:
+def acceleration_rms(stage: Stage, sigma_mm: float) -> float:
+    """Return the RMS (mm/s^2) of `forced_mass` that explains the encoder's readings best.
+
+    It maximises Whittle's likelihood (Arkiv foer Matematik 2, 1953) of their second differences,
+    which need no trend taken away. A vibration of the stage is a line: parabolas over many readings
+    would not follow it.
+
+    sigma_mm : standard deviation of a reading.
+    """
+    from scipy.signal import welch
+
+    if len(stage.t_s) < _FEWEST_READINGS:
         return 1000.0
-    x = (np.arange(window) - window // 2) * step
-    parabola = np.linalg.pinv(np.stack([np.ones(window), x, x**2], -1))[2] * 2
-    bend = np.convolve(stage.position_mm, parabola[::-1], mode="valid")
-    return float(np.sqrt(np.mean(bend**2)))
+    step = float(np.median(np.diff(stage.t_s)))
+    even = np.arange(stage.t_s[0], stage.t_s[-1] + step / 2, step)
+    bend = np.diff(np.interp(even, stage.t_s, stage.position_mm), 2)
+    frequency, seen = welch(bend, 1 / step, nperseg=min(len(bend), _SEGMENT), detrend="linear")
+    frequency, seen = frequency[2:], seen[2:] / (2 * np.sin(np.pi * frequency[2:] * step)) ** 4
+    unit, noise = forced_mass(1.0).density(frequency), 2 * step * max(sigma_mm, 1e-5) ** 2
+    rms = np.geomspace(1.0, 1e6, 240)
+    cost = [np.sum(np.log(d := r**2 * unit + noise) + seen / d) for r in rms]
+    return float(rms[np.argmin(cost)])
 
 
 _INFLATE_BEYOND = 0.05
@@ -243,6 +255,7 @@ _FLOORS = np.geomspace(0.03, 0.4, 40)
 _FLOOR_SPREAD = np.log(2.0)
 _LOW_BAND = 0.4
 _FEWEST_BINS = 3
+_FEWEST_READINGS, _SEGMENT = 8, 8192
 _UNSEEN_MM = 1e-6
 _INDEPENDENT = 0.5
 """Share of independent bins: a tapered spectrum's neighbours, and cameras, are correlated."""

@@ -13,6 +13,7 @@ import telerig
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.learning.default_priors import (
     DEFAULT_FLOOR,
+    acceleration_rms,
     adapted,
     default_model,
     fitted_floor,
@@ -24,8 +25,15 @@ from telerig.estimator.smoothing.problem.problem import (
     BroadBand,
     ShakeModel,
     SmoothingProblem,
+    Stage,
 )
-from telerig.factors.state_space import broad_band, broad_band_density, discretise
+from telerig.factors.state_space import (
+    broad_band,
+    broad_band_density,
+    discretise,
+    exact_step,
+    forced_mass,
+)
 
 RATE_HZ, RMS_MM = 500.0, 0.3
 BAND = {"low_hz": 12.0, "high_hz": 60.0}
@@ -161,3 +169,30 @@ def test_sensors_that_are_sampled_together_have_one_delay_although_a_sample_of_o
     sensors = telerig.smooth(**given | {"accelerometers": table}).summary["accelerometers"]
     assert sensors["arm_left"]["masked_samples"] > 0 == sensors["arm_right"]["masked_samples"]
     assert sensors["arm_left"]["delay_s"] == sensors["arm_right"]["delay_s"]
+
+
+@pytest.mark.parametrize("rate_hz", [200, 1000])
+def test_rms_acceleration_of_a_carriage_from_noisy_readings(rate_hz: int) -> None:
+    # the process itself, drawn step by step, in eight runs of half a second to 2.5 s
+    part, sigma_mm, found = forced_mass(500.0), 0.002, []
+    step, noise = exact_step(part.drift, part.noise, 1 / rate_hz)
+    root = np.linalg.cholesky(noise + 1e-12 * np.diag(np.diag(noise)))
+    start = np.linalg.cholesky(part.start_covariance)
+    for seed in range(8):
+        rng = np.random.default_rng([seed, rate_hz])
+        states = [start @ rng.normal(size=part.size)]
+        for _ in range(500):
+            states.append(step @ states[-1] + root @ rng.normal(size=part.size))
+        place = np.array(states) @ part.position + rng.normal(0, sigma_mm, 501)
+        found.append(acceleration_rms(Stage(np.arange(501) / rate_hz, place), sigma_mm))
+    assert np.abs(np.mean(np.log(np.array(found) / 500.0))) < 0.12, found
+
+
+def test_carriage_that_a_pump_shakes_may_move_as_the_encoder_reads() -> None:
+    # 0.04 mm at 39 Hz; parabolas over 20 ms showed a tenth of it
+    t, noise = np.arange(600) / 1000, np.random.default_rng(4).normal(0, 0.005, 600)
+    vibration = 0.04 * np.sin(2 * np.pi * 39.0 * t)
+    rms = acceleration_rms(Stage(t, 80.0 * t + vibration + noise), 0.005)
+    true = 0.04 / np.sqrt(2) * (2 * np.pi * 39.0) ** 2
+    assert 0.5 * true < rms < 3 * true
+    assert acceleration_rms(Stage(t, 80.0 * t + noise), 0.005) < 0.02 * true

@@ -253,10 +253,13 @@ def _found(
     if not len(start):
         nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
         return replace(nothing, clusters=clusters)
-    # All that is known of a bubble of a merged outline is that it is somewhere in it.
-    bent = implausible_outlines(outlines)[1]
-    within = np.where(merged, radius_px(outlines) ** 2 / 4.0, bent)[:, None, None] * np.eye(2)
-    outlines = outlines.changed(covariance_px2=outlines.covariance_px2 + within)
+    # A centre is somewhere in its outline, however short the arc that its fit rests on, and all
+    # that is known of a bubble of a merged outline is that it is somewhere in it.
+    inside = radius_px(outlines)[:, None, None] ** 2 / 4.0 * np.eye(2)
+    covariance = inside @ np.linalg.inv(outlines.covariance_px2 + inside) @ outlines.covariance_px2
+    bent = implausible_outlines(outlines)[1][:, None, None] * np.eye(2)
+    within = np.where(merged[:, None, None], inside, bent)
+    outlines = outlines.changed(covariance_px2=covariance + within)
     defocused = _defocused(outlines)
     judged = {"defocus": defocused, "merged": merged}
     columns = _columns(outlines, judged, image.shape, field, clipped)

@@ -57,6 +57,28 @@ def test_hidden_outlines_are_less_certain_than_whole_ones() -> None:
     assert partly["svv_px2"] > alone["svv_px2"]
 
 
+@pytest.mark.parametrize("seed", [5, 16])
+def test_the_centre_of_a_short_arc_is_somewhere_in_its_outline(seed: int) -> None:
+    """Five bubbles before each other at the border; the fits alone state up to 66 radii."""
+    rng = np.random.default_rng(seed)
+    bubbles = []
+    for _ in range(5):
+        radius, stretch = rng.uniform(18, 38), rng.uniform(1, 1.15)
+        place = rng.uniform(40, 160), rng.uniform(-8, 45)
+        axes = radius * stretch, radius / stretch
+        bubbles.append(Drawn((*place, *axes, rng.uniform(0, 3.1)), heart=0.3))
+    table = seen(bubbles, (160, 200), seed)
+    spread = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy().reshape(-1, 2, 2)
+    sd = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
+    # half a radius of one in a disc, and as much again where several may be in one outline
+    assert np.all(sd <= np.sqrt(table["a_px"] * table["b_px"] / 2) + 1e-9)
+    vague = sd > 0.4 * np.sqrt(table["a_px"] * table["b_px"])
+    assert vague.any()
+    truth = np.array([bubble.ellipse[:2] for bubble in bubbles])
+    away = np.linalg.norm(table[["u_px", "v_px"]].to_numpy()[:, None] - truth, axis=2).min(1)
+    assert np.all(away[vague] < 2 * sd[vague])
+
+
 def test_chain_of_three_gives_the_middle_one_both_its_arcs() -> None:
     bubbles = [Drawn((40.0 + 24.0 * i, 48.0 + 3.0 * i, 15.0, 15.0, 0.0)) for i in range(3)]
     table = seen(bubbles, (100, 130))

@@ -182,7 +182,7 @@ def test_pages_build_without_a_warning(tmp_path: Path) -> None:
         assert (tmp_path / "text" / f"{page}.txt").is_file()
     api = (tmp_path / "text" / "api.txt").read_text(encoding="utf-8")
     assert "telerig.smooth(" in api and "Raises InputError" in api
-    assert "class telerig.rig.camera.Camera(" in api and "the rig frame" in api
+    assert "class telerig.Calibration(" in api and "the rig frame" in api
 
 
 def test_the_page_of_python_names_has_every_public_one() -> None:

@@ -93,9 +93,9 @@ def axis_verdict(
     encoder : (n,) standard deviations (mm) that the encoder's scale and the travel axis add.
     eta, rms : as in `AxisVerdict`.
     inflation : factor of the standard deviations because of contradictions.
-    measured : what but one or two bubbles alone shows the shake. Without anything eta does not count; if
-        only the carriage's motion is measured, it cannot make the axis RESOLVED, because the part
-        of the arms in it follows from the priors.
+    measured : what but one or two bubbles alone shows the shake. Without anything eta does not
+        count; if only the carriage's motion is measured, it cannot make the axis RESOLVED, because
+        the part of the arms in it follows from the priors.
     given : whether the user states the shake's prior. If nothing measures the shake and nobody
         states it, q does not count either.
     """

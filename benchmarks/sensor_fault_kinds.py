@@ -290,7 +290,7 @@ def repaired(inputs: Inputs, fix: Mapping[str, Any]) -> Inputs | None:
         if "axes" in left:
             sensor["axes"] = left.pop("axes")
         key = READING if READING in sensor else "a"
-        sensor[key] = left.pop("factor", 1.0) * sensor[key] + np.asarray(left.pop("add_m_s2", 0.0))
+        sensor[key] = sensor[key] + np.asarray(left.pop("add_m_s2", 0.0))
         sensor[TIME] = sensor[TIME] + left.pop("offset_s", 0.0)
     if "encoder_factor" in left:
         table = out["stage"]

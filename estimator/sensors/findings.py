@@ -45,11 +45,11 @@ class Finding:
     todo : what the user can do.
     code : name of a fault that is refused unless the user accepts it; None for a warning.
     fix : the correction as data, or {}. For an accelerometer it is {"sensor": name} with one of
-        "unit": "g"; "axes": rows; "factor": number by which readings are multiplied; "add_m_s2":
-        [x, y, z]; "offset_s": s, which is added to its times. {"exchange": [name, name]} exchanges
-        two records. For the encoder it is {"encoder_factor": -1.0}, {"encoder_offset_s": s}, or
-        {"encoder_jumps": [[t_s, mm], ...]}, lengths that are subtracted from t_s on. For the stage
-        it is {"stage_axis": [x, y, z]}, for the frames {"frame_time_factor": 0.001}.
+        "unit": "g"; "axes": rows; "add_m_s2": [x, y, z]; "offset_s": s, which is added to its
+        times. {"exchange": [name, name]} exchanges two records. For the encoder it is
+        {"encoder_factor": -1.0}, {"encoder_offset_s": s}, or {"encoder_jumps": [[t_s, mm], ...]},
+        lengths that are subtracted from t_s on. For the stage it is {"stage_axis": [x, y, z]}, for
+        the frames {"frame_time_factor": 0.001}.
     is_fault : False for what was assumed because it is not stated.
     """
 

@@ -1,4 +1,4 @@
-"""Tests how sensors are mounted and in which unit they and the encoder read.
+"""Tests how sensors are mounted.
 
 The regression is that of the clocks (see ``alignment``). Every mounting, the stated one or another,
 is a hypothesis about its coefficients; axes and exchanged records are compared by likelihood.
@@ -19,8 +19,6 @@ CLEAR_LOG_RATIO = 8.0
 _SHIFTS = 24
 _CHANCE = 1.5
 _UPRIGHT_DEG = 30.0
-_SDS = 5.0
-_USUAL_GAIN = (0.5, 2.0)
 _LEAST_SAMPLES = 60
 
 
@@ -31,8 +29,8 @@ class Expected:
     direction : (3,) unit vector in the rig frame.
     values : (n,) acceleration in mm/s^2 along it.
     known : (n,) whether it is known.
-    whole : whether it is the sensor's complete acceleration along the direction, which then gives
-        the sensor's gain. For an arm that of the stage or of another arm is not, nor for the stage
+    whole : whether it is the sensor's complete acceleration along the direction. For an arm that of
+        the stage or of another arm is not, nor for the stage
         that of an arm: beyond its resonance an arm moves in the opposite direction. It only tells
         which axes replace stated ones that gravity excludes.
     """
@@ -50,22 +48,11 @@ class Mounting:
     axes : (3, 3) whose rows are unit vectors in the rig frame.
     clear : whether they fit clearly better than the stated axes.
     lead : log-likelihood ratio of these axes to the stated ones.
-    gain, gain_sd : reading divided by true acceleration, and its standard deviation; NaN and
-        infinity if the images show no acceleration.
     """
 
     axes: Array
     clear: bool
     lead: float
-    gain: float
-    gain_sd: float
-
-    @property
-    def wrong_gain(self) -> bool:
-        """Whether the gain differs from 1 by clearly more than any usual scale error."""
-        inverse, sd = 1 / self.gain, self.gain_sd / self.gain**2
-        clear = inverse > _SDS * sd and abs(inverse - 1) > _SDS * sd
-        return bool(clear and not _USUAL_GAIN[0] < self.gain < _USUAL_GAIN[1])
 
 
 def signed_permutations() -> Array:
@@ -81,7 +68,7 @@ def signed_permutations() -> Array:
 def mounting(
     axes: Array, at_rest: Array, up: Array, x: Array, known: Bools, expected: Sequence[Expected]
 ) -> Mounting:
-    """Return the axes and the gain of a sensor that agree best with gravity and expected motion.
+    """Return the axes of a sensor that agree best with gravity and expected motion.
 
     All signed permutations of the stated axes are compared, by what is whole alone if the stated
     ones agree with gravity.
@@ -104,7 +91,7 @@ def mounting(
     fits = [(f, r) for f in judging if (r := Regression.of(f.values, f.known & known, x))]
     if not fits:
         found = axes if len(stated) else candidates[0]
-        return Mounting(found, not len(stated), 0.0, float("nan"), float("inf"))
+        return Mounting(found, not len(stated), 0.0)
 
     def scores(axes: Array, shift: int = 0) -> Array:
         each = [r.log_ratios(axes @ f.direction, shift) for f, r in fits]
@@ -113,16 +100,15 @@ def mounting(
     score = scores(candidates)
     changes = np.abs(candidates - axes).sum((1, 2))
     best = int(np.lexsort((changes, -score))[0])
-    gain, gain_sd = _gain(candidates[best], [(f, r) for f, r in fits if f.whole])
     if not len(stated):
-        return Mounting(candidates[best], True, float("inf"), gain, gain_sd)
+        return Mounting(candidates[best], True, float("inf"))
     own = int(stated[0])
     shifts = np.linspace(0.1, 0.9, _SHIFTS) * len(fits[0][1].x)
     both = candidates[[best, own]]
     chance = [float(np.ptp(scores(both, int(s)))) for s in shifts]
     lead = float(score[best] - score[own])
     clear = best != own and lead > max(CLEAR_LOG_RATIO, _CHANCE * max(chance))
-    return Mounting(candidates[best], bool(clear), lead, gain, gain_sd)
+    return Mounting(candidates[best], bool(clear), lead)
 
 
 @dataclass(frozen=True)
@@ -163,22 +149,3 @@ class Regression:
         rest = ((self.y - gain[:, None] * predicted) ** 2).sum(1)
         total = max(float(self.y @ self.y), 1e-12)
         return np.asarray(-0.5 * self.size * np.log(np.maximum(rest, 1e-12) / total))
-
-
-def _gain(axes: Array, fits: Sequence[tuple[Expected, Regression]]) -> tuple[float, float]:
-    """Return reading over true acceleration, and its sd."""
-    weight = total = 0.0
-    for expected, fit in fits:
-        force = fit.x @ (axes @ expected.direction)
-        square = float(force @ force)
-        if square <= 0:
-            continue
-        ratio = float(force @ fit.y) / square
-        spread = float(((fit.y - ratio * force) ** 2).mean()) / square
-        variance = spread * len(fit.y) / fit.size
-        weight += 1 / max(variance, 1e-12)
-        total += ratio / max(variance, 1e-12)
-    if not weight or not total > 0:
-        return float("nan"), float("inf")
-    inverse, sd = total / weight, float(weight**-0.5)
-    return 1 / inverse, sd / inverse**2

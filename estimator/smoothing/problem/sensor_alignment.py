@@ -632,18 +632,17 @@ def _mountings(
     problem: SmoothingProblem, images: _Images, refused: Sequence[Finding],
     log_evidence: LogEvidence,
 ) -> list[Finding]:  # fmt: skip
-    """Return findings about sensors whose axes, place or unit contradict the other measurements.
+    """Return findings about sensors whose axes or place contradict the other measurements.
 
     The clearest contradiction comes first. Axes that gravity allows are judged by the images of the
     sensor's own camera, and a correction has to make all measurements together at least as likely
     as before; where gravity excludes those stated, the encoder and the other sensors, corrected so
-    far, help to choose.
+    far, help to choose. Scales are judged by gravity alone: in a short record a bubble that swings
+    as fast as the rig shakes shows any.
 
-    refused : earlier findings. Sensors with a wrong unit are not tested for it again, and axes are
-        not tested without gravity.
+    refused : earlier findings. Axes are not tested without gravity.
     """
     without = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_GRAVITY}
-    measured = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_UNIT}
     sensors = [
         s
         for s in problem.accelerometers
@@ -673,20 +672,7 @@ def _mountings(
         if np.isfinite(found.lead) and log_evidence_of(corrected) < log_evidence_of(axes):
             continue
         axes = corrected
-        judged[sensor.name] = found
         findings.append(_axes_finding(sensor.name, found))
-    for name, found in judged.items():
-        if found.wrong_gain and name not in measured:
-            findings.append(
-                Finding(
-                    f"reads {found.gain:.4g} ± {found.gain_sd:.2g} times the acceleration that the "
-                    "images show",
-                    f"accelerometer {name}",
-                    f"check its unit and scale: readings times {1 / found.gain:.4g} would fit",
-                    Code.SENSOR_SCALE,
-                    {"sensor": name, "factor": 1 / found.gain},
-                )
-            )
     return findings
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from functools import partial
@@ -30,6 +31,7 @@ from telerig.estimator.bubbles.outline.blobs import (
     find_blobs,
     noise_shares,
     split_blobs,
+    split_where_flat,
 )
 from telerig.estimator.bubbles.outline.crowds import WHOLE, around, resolved_crowd, settled
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
@@ -44,6 +46,7 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     Outlines,
     blur_px,
     fit_outlines,
+    fits_badly,
     implausible_outlines,
     radius_px,
     start_outlines,
@@ -206,8 +209,11 @@ def _found(
     parts, slender = _without_slender(parts)
     rejected += slender
     clusters: list[Array] = []
+    fitted = partial(fit_outlines, ratio, noise=noise, shadows=shadows)
+    parts, outlines = _divided(
+        blobs, parts, fitted(_start(parts, blobs)), fitted, ratio.shape, min_diameter_px
+    )
     start = _start(parts, blobs)
-    outlines = fit_outlines(ratio, start, noise, shadows=shadows)
     merged = _merged(outlines, parts)
     known = ~merged & np.isfinite(outlines.ellipse).all(axis=1)
     known &= outlines.coverage > _KNOWN_COVERAGE
@@ -241,7 +247,7 @@ def _found(
     if found:
         every = Rims.concat(found)
         own_start = start_outlines(every.ellipse, every.blur_px, every.inner)
-        fit = fit_outlines(ratio, own_start, noise, beside=outlines.take(known), shadows=True)
+        fit = fitted(own_start, beside=outlines.take(known), shadows=True)
         start = Outlines.concat([start.take(kept), own_start])
         outlines = Outlines.concat([outlines.take(kept), settled(fit, every)])
         # In a crowd it is rather a neighbour in front that bends an outline than a second bubble.
@@ -345,6 +351,36 @@ def _start(parts: list[Part], blobs: list[Blob]) -> Outlines:
         np.array([blob.blur_px for blob in own]),
         np.array([blob.inner for blob in own]),
     )
+
+
+def _divided(
+    blobs: list[Blob],
+    parts: list[Part],
+    outlines: Outlines,
+    fitted: Callable[..., Outlines],
+    shape: tuple[int, ...],
+    min_diameter_px: float,
+) -> tuple[list[Part], Outlines]:
+    """Return the parts of an image and their outlines; those along a whole dark region that no
+    single bubble has are divided where several fit and are seen well."""
+    unlike = implausible_outlines(outlines)[0] | fits_badly(outlines)
+    again = [
+        new
+        for part, odd in zip(parts, unlike.tolist(), strict=True)
+        if odd and not (part.merged or part.shared or blobs[part.blob].touches_border)
+        for new in split_where_flat(blobs[part.blob], part.blob, shape, min_diameter_px)
+    ]
+    if not again:
+        return parts, outlines
+    one, several = (np.array([part.blob for part in some]) for some in (parts, again))
+    others = outlines.take(~np.isin(one, several))
+    fit = fitted(_start(again, blobs), beside=others)
+    bad = implausible_outlines(Outlines.concat([others, fit]))[0][len(others) :]
+    bad |= fits_badly(fit) | ~(fit.coverage > _KNOWN_COVERAGE)
+    sound = ~np.isin(several, several[bad])
+    kept = np.concatenate([~np.isin(one, several[sound]), sound])
+    parts = [part for part, good in zip([*parts, *again], kept.tolist(), strict=True) if good]
+    return parts, Outlines.concat([outlines, fit]).take(kept)
 
 
 def _columns(

@@ -211,7 +211,8 @@ def _traced(
     return blobs
 
 
-_TURN_RAD = -0.1
+_TURN_RAD, _FLAT = -0.1, 0.5
+"""Turn at a notch, and share of a circle's turn below which an outline is flat."""
 _SHORTEST_ARC = 5
 
 
@@ -294,11 +295,12 @@ def _turning(points: Array, arm: int) -> Array:
     return np.asarray(np.arctan2(cross, np.sum(back * ahead, axis=1)))
 
 
-def _notches(turn: Array, arm: int) -> list[int]:
-    """Return the deepest inward turns first, none nearer than ``arm`` to a deeper one."""
+def _notches(turn: Array, arm: int, most_rad: float = _TURN_RAD) -> list[int]:
+    """Return where an outline turns by less than ``most_rad``; of places nearer than ``arm`` the
+    one that turns least."""
     found, near = [], np.zeros(turn.size, np.bool_)
     for index in np.argsort(turn).tolist():
-        if turn[index] > _TURN_RAD:
+        if turn[index] > most_rad:
             break
         if not near[index]:
             found.append(index)
@@ -306,12 +308,14 @@ def _notches(turn: Array, arm: int) -> list[int]:
     return sorted(found)
 
 
-def _cut_closed(contour: Array, sense: float) -> list[Array]:
+def _cut_closed(contour: Array, sense: float, *, flat: bool = False) -> list[Array]:
+    """Cut a closed outline at its notches, or wherever it is flat."""
     points = _spaced(contour, closed=True)
     arm = _arm(points)
     if len(points) < 4 * arm:
         return [points]
-    notches = _notches(sense * _turning(points, arm), arm)
+    most_rad = _FLAT * 2.0 * np.pi * arm / len(points) if flat else _TURN_RAD
+    notches = _notches(sense * _turning(points, arm), arm, most_rad)
     if not notches:
         return [points]
     points = np.roll(points, -notches[0], axis=0)
@@ -394,6 +398,19 @@ def split_blobs(blobs: list[Blob], shape: tuple[int, ...], *, min_diameter_px: f
         parts[index] = [Part(ellipse, index, shared=len(good) > 1) for ellipse in good]
         parts[index] = parts[index] or [Part(whole[index], index, merged=True)]
     return [part for index in range(len(blobs)) for part in parts[index]]
+
+
+def split_where_flat(
+    blob: Blob, index: int, shape: tuple[int, ...], min_diameter_px: float
+) -> list[Part]:
+    """Divide a dark region that is not one bubble wherever its outline is flat.
+
+    index : of the region. Returns its bubbles, one for each arc; [] if they do not explain it.
+    """
+    contour = _in_image(blob)
+    arcs = _cut_closed(contour, _sense(contour), flat=True)
+    good = _explained(arcs, contour, shape, min_diameter_px) if len(arcs) <= _MAX_ARCS else []
+    return [Part(ellipse, index, shared=True) for ellipse in good] if len(good) > 1 else []
 
 
 def _in_image(blob: Blob) -> Array:

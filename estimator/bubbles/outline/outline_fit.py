@@ -23,7 +23,7 @@ import numpy as np
 from telerig.arrays import Array, Bools, Float32, Ints, Rows
 from telerig.estimator.bubbles.outline import kernels
 from telerig.estimator.bubbles.outline.ellipse_geometry import Index
-from telerig.rig.outline import HARMONICS
+from telerig.rig.outline import HARMONICS, points_on
 from telerig.statistics import robust_sd
 
 _NODES = 96
@@ -162,6 +162,7 @@ _ENOUGH_WHOLE = 4
 _WHOLE = 0.9
 _FAR_SHIFT_PX = 0.25
 _STEPS = 3
+_ANGLES, _BEYOND_CHANCE = 64, 3.0
 _MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
 _ODD, _BAD_FIT = 4.0, 1.5
 """Standard deviations of the shapes of an image, and chi2_dof, beyond which it is no bubble."""
@@ -218,18 +219,41 @@ def implausible_outlines(outlines: Outlines) -> tuple[Bools, Array]:
     """Return which outlines (B,) of an image cannot belong to a single bubble, and the variance
     (B,) in px^2 of the centres of those that may.
 
-    They miss the rim, or they fit badly and have a shape that is unlike the others of the image: an
-    order of their coefficients is many standard deviations off. What bends an outline that fits
-    badly beyond the shapes of the image has moved it as much: this is the variance.
+    They miss the rim, or they fit badly and turn inwards or have a shape that is unlike the others
+    of the image: an order of their coefficients is many standard deviations off. What bends an
+    outline that fits badly beyond the shapes of the image has moved it as much: this is the
+    variance.
     """
     learnt, radius2 = shape_spread(outlines), radius_px(outlines) ** 2
     spread = np.full(len(HARMONICS), _UNLEARNT) if learnt is None else learnt
     own2 = np.nan_to_num(outlines.sigma_outline_px, nan=np.inf)[:, None] ** 2 / radius2[:, None]
     power = _power(outlines)
     odd = np.max(power / (spread**2 + own2), axis=1) > _ODD**2
-    bad = outlines.chi2_dof > _BAD_FIT
+    bad = fits_badly(outlines)
     beyond = 2.0 * np.sum(np.maximum(power - spread**2, 0.0), axis=1) * radius2
-    return (odd & bad) | missed_rims(outlines), np.where(bad, beyond, 0.0)
+    merged = (odd | _concave(outlines)) & bad
+    return merged | missed_rims(outlines), np.where(bad, beyond, 0.0)
+
+
+def _concave(outlines: Outlines) -> Bools:
+    """Return which outlines (B,) turn inwards somewhere, beyond what their errors allow.
+
+    The outline of one bubble is convex; that of two turns inwards where their rims meet.
+    """
+    phi = np.linspace(0.0, 2.0 * np.pi, _ANGLES, endpoint=False)
+    points = points_on(outlines.ellipse, outlines.harmonics, phi) @ np.array([1.0, 1j])
+    edge = np.roll(points, -1, axis=1) - points
+    after = np.roll(edge, -1, axis=1)
+    # Curvature times radius, 1 on a circle; a wave of order k changes it by (k^2 - 1) of its share.
+    turn = 2.0 * np.angle(after / edge) / (np.abs(edge) + np.abs(after))
+    order = np.array(HARMONICS)
+    sd = float(np.linalg.norm(order**2 - 1)) * outlines.sigma_outline_px / radius_px(outlines)
+    return np.asarray(np.min(turn, axis=1) * radius_px(outlines) < -_BEYOND_CHANCE * sd)
+
+
+def fits_badly(outlines: Outlines) -> Bools:
+    """Return which outlines (B,) leave more than noise unexplained."""
+    return np.asarray(outlines.chi2_dof > _BAD_FIT)
 
 
 def missed_rims(outlines: Outlines) -> Bools:

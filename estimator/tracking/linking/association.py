@@ -8,8 +8,8 @@ depth is unknown), and for predictions from smoothed tracks.
 
 The shift of a frame, which all bubbles share, is expected to be as large as those of the last
 frames or as the settings say, and is looked for where the tracks agree on it. If tracks are left
-without a measurement and the pairings are clearly more probable with an unusually large shift, the
-rig has moved so far in this frame.
+without a measurement and it is more probable that the rig has moved unusually far than that they
+were missed beside new bubbles, the rig has moved so far in this frame.
 
 Confirmed tracks that compete for what several cameras see are in conflict: hypotheses say how all
 of them continue, each with its log weight relative to the best. Those with the same recent pairings
@@ -494,7 +494,7 @@ def advance(states: States, conflicts: Sequence[Conflict], scan: Scan, common: C
     found = _Pairings.of(states, scan, owner, best, common)
     if len(found.picked.row) < min((best & confirmed).sum(), (~measured.alone).sum()):
         jump = _Pairings.of(states, scan, owner, best, common.jumped(settings))
-        least = found.score + settings.margin_log_ratio - np.log(_JUMP_SHARE)
+        least = found.score - np.log(_JUMP_SHARE)
         found = jump if jump.score > least else found
     now, weak, gain = found.now, found.weak, found.gain
     near = found.near()

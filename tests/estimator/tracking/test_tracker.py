@@ -56,6 +56,35 @@ def test_a_jump_beyond_the_distance_of_the_bubbles_exchanges_none(seed: int) -> 
     assert not {"break", "death"} & {*kinds(events)}
 
 
+@pytest.mark.parametrize(("hz", "sway_mm"), [(200.0, 2.0), (200.0, 5.0), (500.0, 8.0)])
+@pytest.mark.parametrize("seed", [4, 5, 10])
+def test_a_bubble_alone_is_followed_through_jumps_of_the_rig(
+    hz: float, sway_mm: float, seed: int
+) -> None:
+    """The rig begins to sway at 31 Hz, by up to 4.9 mm from frame to frame; the size is known."""
+    rng, frame = np.random.default_rng(seed), np.arange(100)
+    sway = sway_mm * np.sin(2 * np.pi * 31 * frame / hz + rng.uniform(0, 6.3))
+    sway *= np.clip((frame - 15) / 5, 0, 1)
+    places = rng.normal(0, 0.01, (100, 1, 3)) + sway[:, None, None] * [1.0, 0.3, 0.0]
+    sizes = 5 * np.exp(rng.normal(0, 0.02, 100))
+    frames = [frame_of(place, d_eq_mm=size) for place, size in zip(places, sizes)]
+    ids, events = run(Tracker(settings=STILL), frames, hz=hz)
+    assert np.array_equal(np.concatenate(ids), np.zeros(100))
+    assert kinds(events) == ["birth"]
+
+
+def test_a_bubble_that_comes_when_another_leaves_is_another_one() -> None:
+    """In the same frame, 15 mm away or of another size: the rig has not jumped."""
+    rng = np.random.default_rng(0)
+    for away, sizes in ((15.0, (5.0, 5.0)), (5.0, (5.0, 3.0))):
+        frames = [
+            frame_of(rng.normal(0, 0.01, (1, 3)) + [away * (k >= 20), 0, 0], d_eq_mm=sizes[k >= 20])
+            for k in range(60)
+        ]
+        ids, _ = run(Tracker(settings=STILL), frames)
+        assert [i.tolist() for i in ids] == [[0]] * 20 + [[1]] * 40
+
+
 def passing(offset_mm: float, rng: np.random.Generator) -> list[Array]:
     """Two bubbles on straight lines, 100 mm/s towards each other, ``offset_mm`` apart at best."""
     t = (np.arange(60) - 30) / 500

@@ -123,6 +123,12 @@ def proper(moments: Array) -> Array:
 
     Moments that were fitted to outlines which do not fit together can have negative eigenvalues.
     """
-    squares, axes = np.linalg.eigh(moments)
-    squares = np.maximum(squares, _THINNEST**2 * np.abs(squares).max(-1, keepdims=True))
+    squares, axes = proper_axes(moments)
     return np.asarray((axes * squares[..., None, :]) @ axes.mT)
+
+
+def proper_axes(moments: Array) -> tuple[Array, Array]:
+    """Return the squares (..., 3), ascending, and the directions (..., 3, 3), as columns, of the
+    principal semi-axes of `proper`."""
+    squares, axes = np.linalg.eigh(moments)
+    return np.maximum(squares, _THINNEST**2 * np.abs(squares).max(-1, keepdims=True)), axes

@@ -150,7 +150,7 @@ def starts(views: Views) -> list[tuple[Array, Array, Array]]:
     oblate = _oblate_pair(views) if views.count == 2 else [views.free[0]]
     starts = []
     for moments, polar in (*((m, 0) for m in oblate), (views.free[0], 2)):
-        squares, axes = np.linalg.eigh(silhouette.proper(moments))
+        squares, axes = silhouette.proper_axes(moments)
         logs = np.log(squares) / 2
         aspect = (3 * logs.mean(-1) - logs[:, polar]) / 2 - logs[:, polar]
         starts.append((axes[..., polar], logs.mean(-1), aspect))

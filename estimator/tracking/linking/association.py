@@ -7,8 +7,8 @@ It is the same for points that several cameras see, for what one camera alone se
 depth is unknown), and for predictions from smoothed tracks.
 
 The shift of a frame, which all bubbles share, is expected to be as large as those of the last
-frames or as the settings say, and is looked for where the tracks agree on it. If tracks are left
-without a measurement and it is more probable that the rig has moved unusually far than that they
+frames or as the settings say, and is looked for where the tracks agree on it. If half of them are
+left without a measurement and it is more probable that the rig has moved unusually far than that they
 were missed beside new bubbles, the rig has moved so far in this frame.
 
 Confirmed tracks that compete for what several cameras see are in conflict: hypotheses say how all
@@ -142,17 +142,14 @@ def likeliest_shift(pairs: Evidence, common: Common) -> Array:
 
 def picked_with_shift(pairs: Evidence, rows: int, common: Common) -> Evidence:
     """Return the best assignment of so many rows; the common shift is estimated with it in turn."""
-    now, chosen = common, np.full(rows, -1)
-    picked = pairs.take(slice(0))
+    shift, chosen, picked = likeliest_shift(pairs, common), np.full(rows, -1), np.zeros(0, np.int64)
     for turn in range(_SHIFT_ROUNDS):
-        score = pairs.scores(likeliest_shift(pairs, common) if turn == 0 else now.shift_mm)
-        found = best_assignment(rows, pairs.row, pairs.column, score)
+        found = best_assignment(rows, pairs.row, pairs.column, pairs.scores(shift))
         if turn and np.array_equal(found, chosen):
             break
-        chosen = found
-        picked = pairs.take(chosen[pairs.row] == pairs.column)
-        now = common.informed(picked.innovation_mm, picked.covariance_mm2)
-    return picked
+        chosen, picked = found, np.flatnonzero(found[pairs.row] == pairs.column)
+        shift = common.informed(pairs.innovation_mm[picked], pairs.information[picked]).shift_mm
+    return pairs.take(picked)
 
 
 def clear_assignment(
@@ -355,7 +352,7 @@ class _Pairings:
     @property
     def now(self) -> Common:
         """The shift of this frame that all bubbles share."""
-        return self.prior.informed(self.picked.innovation_mm, self.picked.covariance_mm2)
+        return self.prior.informed(self.picked.innovation_mm, self.picked.information)
 
     @property
     def score(self) -> float:
@@ -389,7 +386,7 @@ class _Pairings:
     def outside(self, members: Sequence[int]) -> Common:
         """Return the shift of this frame that all bubbles share, without those of some owners."""
         others = self.picked.take(~np.isin(self.owner[self.picked.row], members))
-        return self.prior.informed(others.innovation_mm, others.covariance_mm2)
+        return self.prior.informed(others.innovation_mm, others.information)
 
     def grown(
         self, before: Sequence[Conflict], pairs: Evidence, outside: Common
@@ -425,7 +422,7 @@ class _Pairings:
         kept = found.rows[:, 0] // rows.shape[1]
         commons = []
         for own in (used[k] for k in kept):
-            commons.append(outside.informed(pairs.innovation_mm[own], pairs.covariance_mm2[own]))
+            commons.append(outside.informed(pairs.innovation_mm[own], pairs.information[own]))
         return replace(found, rows=rows[kept]), commons
 
 
@@ -492,7 +489,7 @@ def advance(states: States, conflicts: Sequence[Conflict], scan: Scan, common: C
         owner[conflict.rows], best[conflict.rows[1:]] = c, False
     confirmed, single = states.track > NO_PARTICLE, owner >= len(conflicts)
     found = _Pairings.of(states, scan, owner, best, common)
-    if len(found.picked.row) < min((best & confirmed).sum(), (~measured.alone).sum()):
+    if 2 * len(found.picked.row) <= min((best & confirmed).sum(), (~measured.alone).sum()):
         jump = _Pairings.of(states, scan, owner, best, common.jumped(settings))
         least = found.score - np.log(_JUMP_SHARE)
         found = jump if jump.score > least else found
@@ -524,11 +521,11 @@ def advance(states: States, conflicts: Sequence[Conflict], scan: Scan, common: C
     alone = np.flatnonzero(single & (confirmed | clear | (given < 0)))
     parents = np.concatenate([alone, *(one.rows.ravel() for one in later)])
     taken = np.concatenate([columns[alone], *(one.taken[..., -1].ravel() for one in later)])
-    each = [now] * len(alone) + [
-        own for one, shifts in zip(later, commons) for own in shifts for _ in one.rows[0]
-    ]
-    shift = np.array([own.shift for own in each]).reshape(-1, STATES)
-    unsure = np.array([own.covariance_mm2 for own in each]).reshape(-1, 3, 3)
+    every = [now, *(own for shifts in commons for own in shifts)]
+    tracks = [one.rows.shape[1] for one, shifts in zip(later, commons) for _ in shifts]
+    which = np.repeat(np.arange(len(every)), [len(alone), *tracks])
+    shift, unsure = (np.array([getattr(own, name) for own in every])[which]
+                     for name in ("shift", "covariance_mm2"))  # fmt: skip
     states = states.take(parents).updated(scan, taken, shift, unsure, gain)
     at = len(alone)
     for k, one in enumerate(later):

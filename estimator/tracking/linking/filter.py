@@ -425,15 +425,15 @@ class Common:
         covariance[POSITION, POSITION] += (_JUMP * settings.shake_sd_mm) ** 2 * np.eye(3)
         return replace(self, covariance=covariance)
 
-    def informed(self, innovations: Array, covariances: Array) -> Common:
+    def informed(self, innovations: Array, information: Array) -> Common:
         """Return the common error after it has been estimated from E bubbles.
 
         innovations : (E, 3) measured minus predicted positions in mm.
-        covariances : (E, 3, 3) covariances of the innovations in mm^2, without the common error.
+        information : (E, 3, 3) inverse covariances of the innovations in 1/mm^2, without the common
+            error.
         """
         if len(innovations) == 0:
             return self
-        information = np.linalg.inv(covariances)
         score = np.einsum("eij,ej->i", information, innovations - self.shift_mm)
         total = information.sum(0)
         gain = self.covariance[:, POSITION] @ np.linalg.inv(np.eye(3) + total @ self.covariance_mm2)

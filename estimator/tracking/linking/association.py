@@ -8,8 +8,8 @@ depth is unknown), and for predictions from smoothed tracks.
 
 The shift of a frame, which all bubbles share, is expected to be as large as those of the last
 frames or as the settings say, and is looked for where the tracks agree on it. If half of them are
-left without a measurement and it is more probable that the rig has moved unusually far than that they
-were missed beside new bubbles, the rig has moved so far in this frame.
+left without a measurement and it is more probable that the rig has moved unusually far than that
+they were missed beside new bubbles, the rig has moved so far in this frame.
 
 Confirmed tracks that compete for what several cameras see are in conflict: hypotheses say how all
 of them continue, each with its log weight relative to the best. Those with the same recent pairings

@@ -2,7 +2,8 @@
 
 A luminance model is fitted to every candidate (after Lavest, Viala, Dhome 1999), twice: the first
 fits yield the contrast of every dot and so the illumination across the image; the second fits use
-it as a prior for each dot's own contrast gradient, and take the neighbours' blur away.
+it as a prior for each dot's own contrast gradient, and take the neighbours' blur away. Dots that
+are smaller than the others, or that one disc fits badly, are fitted once more with a heart.
 """
 
 from __future__ import annotations
@@ -31,8 +32,16 @@ from telerig.estimator.dots.fit.candidates import (
     edge_map,
     find_candidates,
     is_ring,
+    is_unlike,
     reason_against_blob,
     reason_against_fit,
+)
+from telerig.estimator.dots.fit.hearts import (
+    FEWEST_DOTS,
+    FEWEST_PIXELS,
+    of_other_size,
+    too_small_sd,
+    with_hearts,
 )
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dot
 from telerig.estimator.dots.fit.rim import centre_shift
@@ -62,11 +71,6 @@ COLUMNS = [
     *EDGE_COVARIANCE,
 ]
 REJECTED = ["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"]
-
-_FEWEST_PIXELS = 25
-"""Least number of pixels for a second fit; a dot whose first fit left the image has fewer."""
-_MOVED_SD = 0.1
-"""If a dot moves by more standard deviations than this, its neighbours are fitted again."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,7 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     scene = _Scene(grey, found.labels, blobs)
     fits = scene.first_fits(noise)
     noise = _noise_with_inner_level(noise, fits)
-    fits = scene.second_fits(fits, noise)
+    fits = scene.with_hearts(scene.second_fits(fits, noise), noise, look)
     factor = agreed_factor(
         noise, np.array([fit.chi2_dof for fit in fits]), np.array([fit.dof for fit in fits])
     )
@@ -178,8 +182,8 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     look = look.with_fits(fits)
     rough = _roughness(fits)
     accepted: list[tuple[Any, ...]] = []
-    for blob, fit in zip(blobs, fits):
-        reason = reason_against_fit(blob, fit, grey.shape, found.polarity, look)
+    for blob, fit, smaller in zip(blobs, fits, too_small_sd(fits)):
+        reason = reason_against_fit(blob, fit, grey.shape, found.polarity, look, smaller)
         if reason:
             rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
         else:
@@ -255,11 +259,11 @@ class _Scene:
         for _ in range(rounds):
             moved: set[int] = set()
             for i in again:
-                window = self._window(i, fits, neighbours[i])
-                if np.count_nonzero(window.mask) < _FEWEST_PIXELS:
+                window = self._window(i, fits[i].start, fits, neighbours[i])
+                if np.count_nonzero(window.mask) < FEWEST_PIXELS:
                     continue
-                fit = fit_dot(window, _start(fits[i]), noise, priors[i], edges=True)
-                if neighbours[i] and _has_moved(fits[i], fit):
+                fit = fit_dot(window, fits[i].start, noise, priors[i], edges=True)
+                if neighbours[i] and fit.has_moved_from(fits[i]):
                     moved |= {i, *neighbours[i]}
                 fits[i] = fit
             again = sorted(moved)
@@ -267,18 +271,24 @@ class _Scene:
                 break
         return fits
 
-    def _window(self, dot: int, fits: list[DotFit], near: list[int]) -> Window:
+    def with_hearts(self, fits: list[DotFit], noise: NoiseModel, look: Look) -> list[DotFit]:
+        """Fit dots of another size than most, or with larger residuals, again with a heart."""
+        look = look.with_fits(fits)
+        unlike = [i for i, fit in enumerate(fits) if is_unlike([look.misfit_sd(fit)])]
+        doubtful = sorted({*unlike, *of_other_size(fits)})
+        doubtful = [i for i in doubtful if not is_ring(self.blobs[i])]
+        if not doubtful or len(fits) < FEWEST_DOTS:
+            return fits
+        priors, neighbours = priors_from(fits, self.grey.shape), close_neighbours(fits)
+
+        def window(dot: int, start: Start) -> Window:
+            return self._window(dot, start, fits, neighbours[dot])
+
+        return with_hearts(fits, noise, priors, window, doubtful)
+
+    def _window(self, dot: int, start: Start, fits: list[DotFit], near: list[int]) -> Window:
         """Return the pixels of a dot after the light of its neighbours is subtracted."""
         blobs = self.blobs
         known = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
-        window = dot_window(self.grey, self.labels, blobs[dot], _start(fits[dot]), known=known)
+        window = dot_window(self.grey, self.labels, blobs[dot], start, known=known)
         return without_neighbours(window, [fits[k] for k in near])
-
-
-def _start(fit: DotFit) -> Start:
-    return Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
-
-
-def _has_moved(before: DotFit, after: DotFit) -> bool:
-    step = float(np.linalg.norm(after.centre_px - before.centre_px))
-    return bool(step > _MOVED_SD * np.sqrt(np.trace(after.covariance_px2)))

@@ -19,6 +19,12 @@ twice as large as dots, and light falls off towards the corners."""
 LOG_FITTED = 0.15
 """Standard deviation of the log of a dot's fitted size divided by that of its blob, and of the way
 between both centres divided by the radius."""
+SIZE_SPREAD, OTHER_SIZE_SD = 0.01, 5.0
+"""Standard deviation of the log radii of a plate's dots about their trend, 0.003 to 0.008 on real
+plates; and by how many standard deviations a dot of another size differs."""
+SIZES_SPREAD_SD = 3.0
+"""Where the scatter of the sizes is more than this many times that of a plate, a disc is not what
+most dots look like."""
 BLOB_BLUR = 1.2
 """Semi-axis of a blurred line at half of its light, in standard deviations of the blur."""
 LOG_MISFIT = 0.15

@@ -374,6 +374,11 @@ class Look:
         )
         return Look(self.log_radius, self.unevenness, misfit, scatter, middle, spread)
 
+    def misfit_sd(self, fit: DotFit) -> float:
+        """Return how many standard deviations a fit's misfit is above that of the image's dots."""
+        excess = np.log((fit.misfit + LEAST_MISFIT) / (self.misfit + LEAST_MISFIT))
+        return max(float(excess), 0.0) / self.misfit_spread
+
 
 def is_unlike(deviations: ArrayLike) -> Bools:
     """Return whether deviations (..., k), in standard deviations, are together rarer than `RARE`
@@ -422,11 +427,17 @@ def reason_against_blob(blob: Candidate, look: Look) -> Reason | None:
 
 
 def reason_against_fit(
-    blob: Candidate, fit: DotFit, size_px: tuple[int, ...], polarity: Polarity, look: Look
+    blob: Candidate,
+    fit: DotFit,
+    size_px: tuple[int, ...],
+    polarity: Polarity,
+    look: Look,
+    smaller_sd: float = 0.0,
 ) -> Reason | None:
     """Return why a dot is left out after the luminance model was fitted to it; None for a good fit.
 
-    size_px : (rows, columns) of the image.
+    size_px : (rows, columns) of the image. smaller_sd : how many standard deviations the fit is
+    smaller than those of the dots around.
     """
     if fit.pixels <= PARAMETERS:
         return Reason.HIDDEN
@@ -440,12 +451,13 @@ def reason_against_fit(
     way = float(np.linalg.norm(fit.centre_px - blob.centre_px) / np.mean(own))
     sign = 1.0 if polarity == "white_on_black" else -1.0
     faint = np.log(max(sign * fit.contrast, 1e-12)) - look.log_contrast
-    misfit = np.log((fit.misfit + LEAST_MISFIT) / (look.misfit + LEAST_MISFIT))
+    of_blob = _of_blob(blob, look)
     return _objection({
-        **_of_blob(blob, look),
+        **of_blob,
+        Reason.MUCH_SMALLER: max(of_blob[Reason.MUCH_SMALLER], smaller_sd),
         Reason.MISPLACED: max(way, misshapen) / LOG_FITTED,
         Reason.FAINT: max(float(-faint), 0.0) / look.contrast_spread,
-        Reason.MISFIT: max(float(misfit), 0.0) / look.misfit_spread,
+        Reason.MISFIT: look.misfit_sd(fit),
     })  # fmt: skip
 
 

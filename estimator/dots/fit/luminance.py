@@ -35,6 +35,7 @@ from telerig.estimator.dots.thresholds import OUTLIER_SD, RARE
 from telerig.estimator.images.noise import NoiseModel
 from telerig.statistics import NORMAL_FROM_MEDIAN
 
+_MOVED_SD = 0.1
 PARAMETERS = 10
 """Free parameters of a fit; the two of the contrast gradient are held by their prior."""
 
@@ -118,6 +119,7 @@ class DotFit:
         y) is the offset from origin_px (2,), the middle of the window, divided by radius_px.
     covariance_px2 : (2, 2) of the centre.
     contrast_sigma : standard deviation of C.
+    log_radius_sd : standard deviation of ln of the mean radius.
     chi2_dof : chi-square per degree of freedom.
     pixels : number of pixels in the mask.
     dropped : how many of these were left out as outliers or as clipped.
@@ -135,6 +137,7 @@ class DotFit:
     radius_px: float
     covariance_px2: Array
     contrast_sigma: float
+    log_radius_sd: float
     chi2_dof: float
     pixels: int
     dropped: int
@@ -144,6 +147,16 @@ class DotFit:
     converged: bool
     edge: Array
     edge_variance: Array
+
+    @property
+    def start(self) -> Start:
+        """Return the start of another fit of the dot."""
+        return Start(self.centre_px, self.shape_px, self.sigma_px, previous=self)
+
+    def has_moved_from(self, before: DotFit) -> bool:
+        """Return whether the dot has moved so far that what depends on it is fitted again."""
+        step = float(np.linalg.norm(self.centre_px - before.centre_px))
+        return bool(step > _MOVED_SD * np.sqrt(np.trace(self.covariance_px2)))
 
     @property
     def dof(self) -> int:
@@ -176,6 +189,7 @@ class DotFit:
             covariance_px2=self.covariance_px2 * factor,
             edge_variance=self.edge_variance * factor,
             contrast_sigma=self.contrast_sigma * np.sqrt(factor),
+            log_radius_sd=self.log_radius_sd * np.sqrt(factor),
             chi2_dof=self.chi2_dof / factor,
         )
 
@@ -199,8 +213,15 @@ _FEW_PIXELS = 1e-9
 """Weight of a prior of 0 for each grey level, relative to one pixel, so that too few pixels still
 have a solution."""
 _INSIDE = 0.9
-_CENTRE_AND_CONTRAST = np.array([0, 1, 9])
+_CENTRE_SHAPE_CONTRAST = np.array([0, 1, 2, 3, 4, 9])
 _MAX_OUTLIER_SHARE = 0.15
+
+
+def _log_radius_sd(shape_px: Array, covariance: Array) -> float:
+    """Return the standard deviation of half of ln(m11 m22 - m12^2)."""
+    m11, m12, m22 = shape_px
+    slope = 0.5 * np.array([m22, -2.0 * m12, m11]) / (m11 * m22 - m12 * m12)
+    return float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
 
 
 class _Fit:
@@ -281,8 +302,8 @@ class _Fit:
         information, pull = np.empty((12, 12)), np.empty(12)
         normal_equations(self.prior, self.radius, self.parameters, self.residual, self.weight,
                          self.jacobian, information, pull)  # fmt: skip
-        covariance = np.empty((3, 3))
-        covariance_of(information, _CENTRE_AND_CONTRAST, covariance)
+        covariance = np.empty((6, 6))
+        covariance_of(information, _CENTRE_SHAPE_CONTRAST, covariance)
         theta, noise, sums = self.parameters[:6], self.noise, np.empty(6)
         distance = approximate_distance_px(theta[2:5], self.x - theta[0], self.y - theta[1])
         residual_sums(
@@ -304,7 +325,8 @@ class _Fit:
             self.origin,
             self.radius,
             covariance[:2, :2],
-            float(np.sqrt(max(covariance[2, 2], 0.0))),
+            float(np.sqrt(max(covariance[5, 5], 0.0))),
+            _log_radius_sd(theta[2:5], covariance[2:5, 2:5]),
             chi2 / max(count - PARAMETERS, 1),
             len(self.grey),
             len(self.grey) - int(count),

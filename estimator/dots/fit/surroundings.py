@@ -161,7 +161,8 @@ PRIOR_GRADIENT_PER_PX = 4e-4
 _PRIOR_SCATTER, _PRIOR_SCATTER_DOTS = 0.01, 4.0
 _FAR_SDS = 2.0
 _FLOOR_PER_PX = 5e-6
-_BLUR_SPREAD = 0.1
+BLUR_SPREAD = 0.1
+"""Least relative standard deviation of the dots' blur."""
 
 
 def priors_from(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
@@ -184,7 +185,7 @@ def priors_from(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]
     coefficients, covariance = _cubic(position, value, own, PRIOR_GRADIENT_PER_PX * reach)
     sigmas = np.array([fit.sigma_px for fit in fits])
     usual = float(np.median(sigmas))
-    spread = max(_BLUR_SPREAD * usual, float(robust_sd(sigmas - usual)))
+    spread = max(BLUR_SPREAD * usual, float(robust_sd(sigmas - usual)))
     gradients = (_gradient_at(p, coefficients, covariance, reach) for p in position)
     return [Prior(*gradient, edge_px=usual, edge_spread_px=spread) for gradient in gradients]
 

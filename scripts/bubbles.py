@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from telerig.command_options import TrackingOptions
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, run_file, say, typed_command
 
@@ -18,15 +19,8 @@ def bubbles(
         list[Path], typer.Argument(help="Backlit grey images, or folders of such images.")
     ],
     out: Annotated[Path, typer.Option(help="Results folder.")] = Path("bubbles"),
-    min_diameter: Annotated[
-        float, typer.Option(help="Dark spots with a smaller diameter, in px, are no bubbles.")
-    ] = 8.0,
-    min_contrast: Annotated[
-        float,
-        typer.Option(
-            help="Fainter shadows, as a share of the screen's brightness, are no bubbles."
-        ),
-    ] = 0.3,
+    min_diameter: options.MinDiameter = TrackingOptions.min_diameter_px,
+    min_contrast: options.MinContrast = TrackingOptions.min_contrast,
     region: Annotated[
         str,
         typer.Option(

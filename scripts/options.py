@@ -9,7 +9,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from telerig.command_options import Options, SmoothingOptions
+from telerig.command_options import Options, SmoothingOptions, TrackingOptions
 from telerig.errors import InputError
 
 Dataset = Annotated[
@@ -49,6 +49,10 @@ AcceptedFaults = Annotated[
     list[str] | None,
     typer.Option("--accept", help=SmoothingOptions.settings()["accept"].help),
 ]
+MinDiameter = Annotated[
+    float, typer.Option(help=TrackingOptions.settings()["min_diameter_px"].help)
+]
+MinContrast = Annotated[float, typer.Option(help=TrackingOptions.settings()["min_contrast"].help)]
 Report = Annotated[bool, typer.Option(help="Write report.html.")]
 View = Annotated[
     bool,

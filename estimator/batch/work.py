@@ -111,8 +111,8 @@ def track_run(
         publish("recording", path=data.path, rig=of_run(calibrated, data.cameras).cameras)
         summary = write_tracking(
             data if count is None else data.first(count), calibrated, folder,
-            options=TrackOptions(options.min_diameter_px), record=record, report=report,
-            stage=stage, executor=executor,
+            options=TrackOptions(options.min_diameter_px, options.min_contrast),
+            record=record, report=report, stage=stage, executor=executor,
         )  # fmt: skip
     publish("results", folder=folder.resolve())
     return summary

@@ -31,11 +31,17 @@ def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: flo
     check_grey_image(image, 16, "bubbles")
     if not min_diameter_px >= 4.0:
         raise InputError(
-            f"must be at least 4, not {min_diameter_px}", where="min_diameter_px", todo="try 8.0"
+            f"bubbles of {min_diameter_px:g} px have too few pixels: no outline of less than 4 px "
+            "is measured",
+            where="min_diameter_px (--min-diameter)",
+            todo="give 4 or more, half a pixel less than your smallest bubbles, as half of those "
+            "at the limit are measured smaller; smaller bubbles need a larger magnification",
         )
     if not 0.05 <= min_contrast < 1.0:
         raise InputError(
-            f"must lie in 0.05 .. 1, not {min_contrast}", where="min_contrast", todo="try 0.3"
+            f"must lie in 0.05 .. 1, not {min_contrast}",
+            where="min_contrast (--min-contrast)",
+            todo="try 0.3, the default, or 0.15 for bubbles that are out of focus or of 5 px",
         )
     return image
 

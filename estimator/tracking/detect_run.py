@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -62,19 +62,26 @@ _BATCHES, _LEAST_BATCH, _LARGEST_BATCH = 64, 4, 64
 cores, so that a run can go on with another one."""
 
 
+class Sought(NamedTuple):
+    """Which dark spots count as bubbles; see `telerig.detect_bubbles`."""
+
+    min_diameter_px: float
+    min_contrast: float
+
+
 @dataclass(frozen=True)
 class Scene:
     """Hold what the detections of all F frames have in common.
 
     backgrounds : background of each camera, by name.
-    min_diameter_px : dark spots that are smaller count as dirt.
+    sought : which dark spots count as bubbles.
     strips : by camera name, the dots fixed to the tank, which are erased from the images.
     fields : by camera name, where bubbles are looked for (rows, columns); absent for everywhere.
     """
 
     run: RunData
     backgrounds: dict[str, Background]
-    min_diameter_px: float
+    sought: Sought
     strips: Mapping[str, StripInImages] = field(default_factory=dict)
     fields: Mapping[str, Bools] = field(default_factory=dict)
 
@@ -89,7 +96,7 @@ def make_scene(
     run: RunData,
     cameras: Sequence[Camera],
     axis_rig: Array,
-    min_diameter_px: float,
+    sought: Sought,
     progress: Progress | None = None,
     strips: Mapping[str, StripInImages] | None = None,
 ) -> Scene:
@@ -110,7 +117,7 @@ def make_scene(
         backgrounds[name] = found
         if progress is not None:
             progress("background", len(backgrounds), len(names))
-    return Scene(run, backgrounds, min_diameter_px, strips or {}, fields)
+    return Scene(run, backgrounds, sought, strips or {}, fields)
 
 
 def described_fields(run: RunData) -> dict[str, Bools]:
@@ -368,7 +375,7 @@ def _detect(scene: Scene, camera: str, frame: int) -> tuple[pd.DataFrame, pd.Dat
         try:
             bubbles = find_bubbles(
                 image, background=level, field=scene.fields.get(camera),
-                min_diameter_px=scene.min_diameter_px,
+                **scene.sought._asdict(),
             )  # fmt: skip
         except InputError as error:
             raise InputError(

@@ -34,6 +34,7 @@ from telerig.estimator.tracking.corrections import Corrections, read_corrections
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     Progress,
+    Sought,
     described_fields,
     described_strip,
     detect_missing,
@@ -81,11 +82,12 @@ _FRAMES_AT_ONCE = 64
 class TrackOptions:
     """Hold the options of tracking.
 
-    min_diameter_px : dark spots that are smaller count as dirt.
+    min_diameter_px, min_contrast : as for `telerig.detect_bubbles`.
     tracker : settings of the tracker.
     """
 
     min_diameter_px: float = 8.0
+    min_contrast: float = 0.3
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
 
 
@@ -172,8 +174,8 @@ class TrackingStream:
             raise InputError(
                 f"no bubble was found in {run.frame_count} frames",
                 where=str(run.path),
-                todo="look at the images; bubbles must be darker than the screen, and wider than "
-                "--min-diameter",
+                todo="look at the images; bubbles must be darker than the screen by "
+                "--min-contrast, and wider than --min-diameter",
             )
         used = [c for c in self.calibration.cameras if c.name in run.cameras]
         change, known = self._pairs.found(), self.calibration.covariance_known
@@ -326,7 +328,8 @@ def tracking_stream(
     else:
         if run.detections is None and store.missing():
             strips = marks.strips if marks is not None else None
-            scene = make_scene(run, cameras, axis, chosen.min_diameter_px, stage, strips)
+            sought = Sought(chosen.min_diameter_px, chosen.min_contrast)
+            scene = make_scene(run, cameras, axis, sought, stage, strips)
             detect_missing(scene, store, stage, executor)
         if stage is not None:
             stage("pair model", 0, 0)

@@ -136,8 +136,13 @@ class TrackingOptions(Options):
 
     min_diameter_px: float = _setting(
         8.0,
-        "Dark spots with a smaller diameter, in px, are not taken for bubbles.",
+        "Dark spots with a smaller diameter, in px, are not taken for bubbles; at least 4.",
         "--min-diameter",
+    )
+    min_contrast: float = _setting(
+        0.3,
+        "Fainter shadows, as a share of the screen's brightness, are not taken for bubbles.",
+        "--min-contrast",
     )
     source: Literal["images", "detections"] | None = _setting(
         None,

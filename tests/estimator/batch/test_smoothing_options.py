@@ -155,7 +155,7 @@ def test_the_functions_have_the_defaults_of_the_command_line(
 def test_options_are_kept_in_the_record_and_in_words() -> None:
     for options in (
         CalibrationOptions("radial", "plane", 5.0, "water", "dots"),
-        TrackingOptions(5.0, "images", "0:100"),
+        TrackingOptions(5.0, 0.2, "images", "0:100"),
         SmoothingOptions("default", True, ("A", "B")),
     ):
         assert type(options).of(json.loads(json.dumps(options.record()))) == options

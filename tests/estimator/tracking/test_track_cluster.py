@@ -91,7 +91,7 @@ def _kill_a_busy_worker(cluster: Any, killed: list[int]) -> None:
 def test_an_error_on_a_worker_is_raised_here(cluster: Any, data: Path, tmp_path: Path) -> None:
     with (
         dask_executor(cluster.scheduler_address, "--cluster") as executor,
-        pytest.raises(InputError, match="must be at least 4"),
+        pytest.raises(InputError, match="no outline of less than 4 px"),
     ):
         write_tracking(
             telerig.load_run(data / "runs" / "rise"),

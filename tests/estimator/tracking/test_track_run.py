@@ -81,6 +81,12 @@ def test_one_bubble_is_one_track_at_the_true_pixels(rise: Path, whole: Tracks) -
     assert np.allclose(table["d_eq_mm"], table["d_eq_mm_true"], rtol=0.03)
 
 
+def test_min_contrast_reaches_the_detection(rise: Path) -> None:
+    run = telerig.load_run(rise / "runs" / "rise").first(1)
+    with pytest.raises(InputError, match="no bubble was found in 1 frames"):
+        telerig.track(run, truth_calibration(), options=TrackOptions(min_contrast=0.98))
+
+
 def test_detections_alone_give_the_same_track(rise: Path, whole: Tracks, tmp_path: Path) -> None:
     bare = tmp_path / "data" / "runs" / "rise"
     bare.mkdir(parents=True)

@@ -30,6 +30,7 @@ import pandas as pd
 import telerig
 from telerig.arrays import Array
 from telerig.estimator.physics.frames import frames_table
+from telerig.estimator.physics.means import Lasting
 from telerig.estimator.physics.summary import summary_table
 from telerig.io.rig_file.fluid import liquid_of
 from telerig.io.simulation.config import RunConfig
@@ -187,7 +188,7 @@ def errors(
 
 
 def given_motion(
-    frames: pd.DataFrame, bodies: pd.DataFrame, truth: pd.DataFrame, config: RunConfig,
+    frames: pd.DataFrame, smoothing: telerig.Smoothing, truth: pd.DataFrame, config: RunConfig,
     rng: np.random.Generator,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:  # fmt: skip
     """Both tables for motion that is the truth plus 0.02 mm, 2 mm/s and 100 mm/s^2."""
@@ -201,9 +202,10 @@ def given_motion(
             table[f"s{name}"] = sd
     fluid = {k: v for k, v in vars(config.fluid).items() if k != "law"}
     gravity = config.stage.gravity_m_s2
-    made = frames_table(table.assign(observed=1), bodies, UP, gravity, fluid)
-    known = liquid_of(fluid, gravity)
-    return made, summary_table(made, UP, None if known is None else known[0])
+    made = frames_table(table.assign(observed=1), smoothing.bodies, UP, gravity, fluid)
+    known, lasting = liquid_of(fluid, gravity), Lasting.of(smoothing.summary["bodies"])
+    liquid = None if known is None else known[0]
+    return made, summary_table(made, UP, liquid, lasting=lasting)
 
 
 def case(config: RunConfig, seed: int) -> dict[str, list[tuple[str, str, Array, Array, Array]]]:
@@ -218,7 +220,7 @@ def case(config: RunConfig, seed: int) -> dict[str, list[tuple[str, str, Array, 
         smoothing = telerig.smooth(tracks, calibration, stage=run)
     frames = telerig.bubble_table(smoothing)
     truth = true_table(config, seed)
-    made = given_motion(frames, smoothing.bodies, truth, config, np.random.default_rng([seed, 1]))
+    made = given_motion(frames, smoothing, truth, config, np.random.default_rng([seed, 1]))
     alone = [e for e in errors(*made, truth) if e[0] == "frame" or e[1] in ("d_eq_mm", "aspect")]
     return {
         "smoothed": errors(frames, telerig.bubble_summary(smoothing, frames), truth),

@@ -47,8 +47,8 @@ class Inertia:
     """Describes the first-order low-pass filter through which forces move a bubble.
 
     time_s : time constant of the filter along the rig's x, y and z axes.
-    forces : intensity of the forces along these axes, divided by their intensity in the model. The
-        zigzags keep their RMS; their damping is multiplied by this factor instead.
+    forces : intensity of the path's forces along these axes, divided by the model's.
+    swings : damping of the zigzags along these axes, divided by the model's; they keep their RMS.
     noise : standard deviation of the pixels' white noise along the rise and across it, divided by
         the stated one.
     unseen : variances of the velocity (mm^2/s^2) along the axes that a shorter low-pass, which the
@@ -59,6 +59,7 @@ class Inertia:
 
     time_s: Triple
     forces: Triple = (1.0, 1.0, 1.0)
+    swings: Triple = (1.0, 1.0, 1.0)
     noise: tuple[float, float] = (1.0, 1.0)
     unseen: Triple = (0.0, 0.0, 0.0)
     cancelled: tuple[float, float] = (0.0, 0.0)
@@ -132,7 +133,12 @@ INERTIA_S = Prior(0.0005, 0.05, 0.002, 1.0, 0.7)
 most have, where a run does not show how much."""
 
 FORCES = Prior(0.02, 10.0, 1.0, 1.0, 0.7)
-"""Prior of the intensity of the forces on a bubble, over that of the model."""
+"""Prior of the intensity of the forces on a bubble's path, over that of the model."""
+
+SWINGS = Prior(0.02, 4.0, 1.0, 1.0, 0.7)
+"""Prior of the damping of a bubble's zigzags, over the model's 0.04: how much of a regular swing is
+forced anew says nothing of how the path wanders. More than four times is no swing, and would stand
+for shake where only one bubble shows both."""
 
 NOISE = Prior(0.03, 2.0, 1.0, 0.5, 0.3)
 """Prior of the white noise of a bubble's pixels over the stated one, which contains what changes
@@ -224,9 +230,11 @@ def inertial_bubble_path(model: BubbleModel, direction: Array, inertia: Inertia)
     The first states of the process are position, velocity and acceleration.
     """
     share = np.square(direction)
-    intensity, time_s = float(share @ inertia.forces), float(share @ inertia.time_s)
-    sigma = model.velocity_sigma_mm_s * float(np.sqrt(intensity))
-    zigzags = tuple(replace(z, damping=z.damping * intensity) for z in model.zigzags)
+    time_s, forces, swing = (
+        float(share @ each) for each in (inertia.time_s, inertia.forces, inertia.swings)
+    )
+    sigma = model.velocity_sigma_mm_s * float(np.sqrt(forces))
+    zigzags = tuple(replace(z, damping=z.damping * swing) for z in model.zigzags)
     swings = bubble_processes(replace(model, zigzags=zigzags), direction)[1:]
     return inertial_path(
         sigma, model.velocity_tau_s, time_s, [p.component for p in swings],

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from telerig.arrays import Array
 
-LEAST_PERIODS = 1.5
+_LEAST_PERIODS = 1.5
 _LEAST_SAMPLES = 16
 _PADDING, _FINER = 8, 8
 _DENSEST = 16
-SIGNIFICANT = 6.0
+_SIGNIFICANT = 6.0
+_ZIGZAG = 4.5
+"""Least amplitude of a zigzag over its standard deviation, lower than for a line anywhere in a
+spectrum."""
 _UNLIKE = 0.9
 """Least chi-square between a sinusoid and its alias, over that of the least significant one. An
 alias of an uninterrupted record explains a few per cent of a sinusoid, so that no line is lost."""
@@ -22,13 +25,13 @@ _NEAR_PERIODS, _FALL = 5.0, 2.5
 
 @dataclass(frozen=True)
 class Oscillation:
-    """An oscillation c cos(2 pi f t) + s sin(2 pi f t) of K components, K = 1 or 2.
+    """An oscillation of K components with one frequency, K = 1 or 2.
 
-    frequency_hz, s_frequency_hz : f and its standard deviation.
+    frequency_hz, s_frequency_hz : frequency and its standard deviation.
     major, minor : semi-axes of the ellipse that two components describe, in their unit. For one
         component, major is the amplitude and minor is 0.
     s_major, s_minor : standard deviations of the semi-axes.
-    cosine, sine : (K,) c and s.
+    amplitudes : (K,) of the components.
     """
 
     frequency_hz: float
@@ -37,13 +40,29 @@ class Oscillation:
     minor: float
     s_major: float
     s_minor: float
-    cosine: Array
-    sine: Array
+    amplitudes: Array
 
-    def at(self, t_s: Array) -> Array:
-        """Return the values (N, K) at times t_s (N,)."""
-        phase = 2 * np.pi * self.frequency_hz * np.asarray(t_s)[:, None]
-        return np.asarray(np.cos(phase) * self.cosine + np.sin(phase) * self.sine)
+
+def zigzag(
+    t_s: Array, velocity_mm_s: Array, errors_mm_s: Array | None = None
+) -> Oscillation | None:
+    """Return the strongest oscillation of a bubble's lateral velocity, as a displacement in mm.
+
+    The velocity's noise is white where a wandering path's is red, so that a slow drift is not taken
+    for a zigzag.
+
+    t_s : (N,).  velocity_mm_s : (N, K) components across the vertical.
+    errors_mm_s : (N, M) draws of their errors, as ``alike`` of `dominant_oscillation`.
+    """
+    found = dominant_oscillation(t_s, velocity_mm_s, significant=_ZIGZAG, alike=errors_mm_s)
+    if found is None:
+        return None
+    w, relative = 2 * np.pi * found.frequency_hz, found.s_frequency_hz / found.frequency_hz
+    return replace(
+        found, major=found.major / w, minor=found.minor / w, amplitudes=found.amplitudes / w,
+        s_major=float(np.hypot(found.s_major, found.major * relative)) / w,
+        s_minor=float(np.hypot(found.s_minor, found.minor * relative)) / w,
+    )  # fmt: skip
 
 
 def dominant_oscillation(
@@ -51,7 +70,10 @@ def dominant_oscillation(
     values: Array,
     low_hz: float = 0.0,
     high_hz: float = np.inf,
-    significant: float = SIGNIFICANT,
+    significant: float = _SIGNIFICANT,
+    *,
+    noise: float = 0.0,
+    alike: Array | None = None,
 ) -> Oscillation | None:
     """Return the strongest sinusoid of a series between two frequencies.
 
@@ -59,6 +81,9 @@ def dominant_oscillation(
         quantile) are not sought.
     values : (N, K), K = 1 or 2 components of one common frequency.
     significant : least amplitude over its standard deviation.
+    noise : standard deviation of the values' white noise, of which the density has at least.
+    alike : (N, M) series with the spectrum of further errors, which may oscillate at f as the
+        values do, so that the residuals do not show them.
 
     The series is modelled as a straight line, a sinusoid of frequency f, and coloured noise. The
     one-sided density S of the noise near f is taken from the residuals. In a record of T seconds a
@@ -76,7 +101,7 @@ def dominant_oscillation(
         return None
     duration = (t[-1] - t[0]) * len(t) / (len(t) - 1)
     step = max(float(np.quantile(np.diff(t), 0.1)), duration / (_DENSEST * len(t)))
-    lowest, highest = LEAST_PERIODS / duration, 0.45 / step
+    lowest, highest = _LEAST_PERIODS / duration, 0.45 / step
     low, high = max(low_hz, lowest), min(high_hz, highest)
     if low >= high:
         return None
@@ -87,11 +112,10 @@ def dominant_oscillation(
         return None
     f = _refined(t, y, start, 0.5 / duration)
     coefficients, left = _fitted(t, y, f)
-    density = _density(t, left, f, duration)
+    density = max(_density(t, left, f, duration), 2 * noise**2 * duration / len(t))
     if not density > (_ROUNDING * np.abs(y).max()) ** 2 * duration:
         return None
-    cosine, sine = coefficients[2], coefficients[3]
-    _, axes, _ = np.linalg.svd(np.stack([cosine, sine]), full_matrices=False)
+    axes = np.linalg.svd(coefficients[2:])[1]
     minor = float(axes[1]) if len(axes) > 1 else 0.0
     s_amplitude = float(np.sqrt(density / duration))
     if axes[0] < significant * s_amplitude or not low <= f <= high:
@@ -105,9 +129,18 @@ def dominant_oscillation(
             return None
     total = float((axes**2).sum())
     s_f = float(np.sqrt(density / (4 * np.pi**2 * total * duration * t.var())))
+    if alike is not None:
+        # of unknown phase: the half of its square is in that of the sinusoid
+        waves = _basis(t, f)
+        waves = np.concatenate([waves, (t - t.mean())[:, None] * waves[:, 2:]], -1)
+        level, slope = np.linalg.lstsq(waves, alike[good], rcond=None)[0][2:].reshape(2, 2, -1)
+        s_amplitude = float(np.sqrt(s_amplitude**2 + (level**2).sum(0).mean() / 2))
+        added = (slope**2).sum(0).mean() / (2 * total)
+        s_f = float(np.sqrt(s_f**2 + added / (4 * np.pi**2)))
     return Oscillation(
-        f, s_f, float(axes[0]), minor, s_amplitude, s_amplitude * (len(axes) > 1), cosine, sine
-    )
+        f, s_f, float(axes[0]), minor, s_amplitude, s_amplitude * (len(axes) > 1),
+        np.linalg.norm(coefficients[2:], axis=0),
+    )  # fmt: skip
 
 
 def _strongest(
@@ -166,9 +199,15 @@ def _density(t: Array, left: Array, f: float, duration: float) -> float:
     periods = np.arange(1, np.ceil(f * duration + _NEAR_PERIODS))
     frequency = periods[np.abs(periods - f * duration) < _NEAR_PERIODS] / duration
     waves = np.exp(-2j * np.pi * np.outer(frequency, t))
-    periodogram = 2 * duration / len(t) ** 2 * (np.abs(waves @ left) ** 2).mean(-1)
+    periodogram = _periodogram(t, left, frequency, duration)
     taken = (np.abs(waves @ np.linalg.qr(_basis(t, f))[0]) ** 2).sum(-1) / len(t)
     kept = (1 - taken).clip(0).sum()
     squares = 2 * left.shape[1] * kept
     each = periodogram * (frequency / f) ** _FALL
     return float(each.sum() / kept * squares / max(squares - 2, 1))
+
+
+def _periodogram(t: Array, y: Array, frequency: Array, duration: float) -> Array:
+    """Return the one-sided densities (F,) of values (N, K) at frequencies (F,), by component."""
+    waves = np.exp(-2j * np.pi * np.outer(frequency, t))
+    return np.asarray(2 * duration / len(t) ** 2 * (np.abs(waves @ y) ** 2).mean(-1))

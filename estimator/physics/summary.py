@@ -10,16 +10,17 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.estimator.physics.frames import AXES
-from telerig.estimator.physics.means import SD, Lasting, mean_of_body
-from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillation
+from telerig.estimator.physics.means import SD, Lasting, mean_of_body, parts_of_body
+from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillation, zigzag
 from telerig.io.tables.smoothing import SUMMARY
 from telerig.rig.bubble_physics import Liquid
 
 _ABOVE_ZIGZAG = 2.6
 """Shape oscillations are sought above the zigzag's second harmonic, with which the aspect ratio
 follows the bubble's speed."""
-_ZIGZAG = 4.5
-"""Least amplitude over its standard deviation, lower than for a line anywhere in a spectrum."""
+_TURNING_HZ = 10.0
+"""How far from the shape's frequency the spectral lines of equator and pole may be: they turn with
+the body and the path, a few times a second."""
 
 
 def summary_table(
@@ -74,9 +75,12 @@ def _row(
     if way_sd_mm is not None and t[-1] > t[0]:
         steady = way_sd_mm[3] / (t[-1] - t[0])
     row["s_slip_mm_s"] = float(np.hypot(steady, _mean(noise)))
-    row |= _zigzag(t, mine, up)
-    low = _ABOVE_ZIGZAG * row.get("zigzag_hz", 0.0)
-    shape = dominant_oscillation(t, np.log(mine[["aspect"]].to_numpy(float)), low)
+    swing = zigzag(t, _across(mine, "v{}_mm_s", up))
+    if swing is not None:
+        row["zigzag_hz"], row["s_zigzag_hz"] = swing.frequency_hz, swing.s_frequency_hz
+        row["zigzag_mm"], row["s_zigzag_mm"] = swing.major, swing.s_major
+        row["zigzag_minor_mm"], row["s_zigzag_minor_mm"] = swing.minor, swing.s_minor
+    shape = _shape_oscillation(t, mine, up, _ABOVE_ZIGZAG * row.get("zigzag_hz", 0.0), lasting)
     if shape is not None:
         row["shape_hz"], row["s_shape_hz"] = shape.frequency_hz, shape.s_frequency_hz
         row["shape_amplitude"], row["s_shape_amplitude"] = shape.major, shape.s_major
@@ -93,6 +97,12 @@ def _along(mine: pd.DataFrame, pattern: str, direction: Array) -> Array:
     return np.asarray(
         np.stack([mine[pattern.format(a)].to_numpy(float) for a in AXES], -1) @ direction
     )
+
+
+def _across(mine: pd.DataFrame, pattern: str, up: Array) -> Array:
+    """Return the components (N, 2) perpendicular to the vertical."""
+    horizontal = np.linalg.svd(np.atleast_2d(up))[2][1:]
+    return np.stack([_along(mine, pattern, direction) for direction in horizontal], -1)
 
 
 def _mean_rise(
@@ -122,26 +132,37 @@ def _along_variance(mine: pd.DataFrame, pattern: str, direction: Array) -> Array
     return np.asarray(sd**2 @ direction**2)
 
 
-def _zigzag(t: Array, mine: pd.DataFrame, up: Array) -> dict[str, float]:
-    """Return the strongest oscillation of the lateral velocity, as a displacement.
+def _shape_oscillation(
+    t: Array, mine: pd.DataFrame, up: Array, low_hz: float, lasting: Lasting
+) -> Oscillation | None:
+    """Return the strongest oscillation of the log aspect ratio above a frequency.
 
-    The velocity's noise is white where a wandering path's is red, so that a slow drift is not taken
-    for a zigzag.
+    What is not seen of the shape swings with it, and causes errors of the aspect ratio near the
+    same frequency, with the spectrum of what is seen of it, ``stretch``. None if the equator or the
+    pole swing by more at half the frequency, or at half its alias: the aspect ratio follows the
+    square of these swings, and shows twice the frequency of the shape.
     """
-    across = np.linalg.svd(np.atleast_2d(up))[2][1:]
-    velocity = np.stack([_along(mine, "v{}_mm_s", direction) for direction in across], -1)
-    found: Oscillation | None = dominant_oscillation(t, velocity, significant=_ZIGZAG)
+    log_aspect = np.log(mine["aspect"].to_numpy(float))
+    stretch = mine["stretch"].to_numpy(float)
+    noise, _, _, unseen = parts_of_body(mine, "aspect") / mine["aspect"].to_numpy(float) ** 2
+    seen = np.isfinite(log_aspect)
+    if not seen.any():
+        return None
+    white, slow = np.sqrt([noise[seen].mean(), unseen[seen].mean()])
+    alike = np.nan_to_num(stretch)[:, None] * slow / (2 * lasting.triaxial)
+    found = dominant_oscillation(t, log_aspect[:, None], low_hz, noise=white, alike=alike)
     if found is None:
-        return {}
-    f, s_f = found.frequency_hz, found.s_frequency_hz
-    out = {"zigzag_hz": f, "s_zigzag_hz": s_f}
-    for name, value, sd in (
-        ("zigzag_mm", found.major, found.s_major),
-        ("zigzag_minor_mm", found.minor, found.s_minor),
-    ):
-        out[name] = value / (2 * np.pi * f)
-        out[f"s_{name}"] = float(np.hypot(sd / (2 * np.pi * f), out[name] * s_f / f))
-    return out
+        return None
+    lean = log_aspect[:, None] * _across(mine, "pole_{}", up)
+    rate = 1 / float(np.median(np.diff(t[seen])))
+    for half in (found.frequency_hz / 2, (rate - found.frequency_hz) / 2):
+        if abs(half - found.frequency_hz) < 2 * _TURNING_HZ:
+            continue
+        for series in (stretch[:, None] / 2, lean):
+            swing = dominant_oscillation(t, series, half - _TURNING_HZ, half + _TURNING_HZ)
+            if swing is not None and swing.major > found.major:
+                return None
+    return found
 
 
 def _numbers(row: dict[str, Any], mine: pd.DataFrame, liquid: Liquid | None) -> dict[str, float]:

@@ -321,6 +321,7 @@ def _accelerations(solution: Solution) -> dict[str, Any]:
         "inertia_s": max(found.inertia.time_s),
         "inertia_by_axis_s": dict(zip(AXES, found.inertia.time_s, strict=True)),
         "force_intensity": dict(zip(AXES, found.inertia.forces, strict=True)),
+        "swing_damping": dict(zip(AXES, found.inertia.swings, strict=True)),
         "white_noise": dict(zip(("along", "across"), found.inertia.noise, strict=True)),
         "along_path": _along_path(solution, found),
     }
@@ -328,11 +329,14 @@ def _accelerations(solution: Solution) -> dict[str, Any]:
 
 def _along_path(solution: Solution, found: Accelerations) -> dict[str, float]:
     """Return the variances of velocity and acceleration along the paths, divided by those of errors
-    that are independent along the axes."""
+    that are independent along the axes.
+
+    Both are those of the middle of a track, where most frames are; near its ends both are larger.
+    """
     square = solution.velocities_mm_s**2
     share = square / np.maximum(square.sum(-1, keepdims=True), 1e-18)
     speed = solution.velocity_variances() + considered_variance(solution)[1]
-    totals = [(share * v).sum(-1).mean() for v in (speed, found.sd_mm_s2**2)]
+    totals = [np.median((share * v).sum(-1)) for v in (speed, found.sd_mm_s2**2)]
     left = 1 - np.divide(found.inertia.cancelled, totals)
     return dict(zip(("velocity", "acceleration"), left.clip(_LEAST_LEFT, 1).tolist(), strict=True))
 

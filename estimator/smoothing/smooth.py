@@ -78,6 +78,7 @@ from telerig.estimator.smoothing.result import (
 from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.results_file import StoredTables, Tables, results_file
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
+from telerig.factors.bubble_motion import INERTIA_S, Inertia
 from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
@@ -630,6 +631,10 @@ def _adapted_solution(
     where nothing else is.
     """
     guessed, part, last = guessed_modes(model) and not given, problem, None
+    learned = model.bubble.inertia is None and options.covariances
+    if learned:
+        expected = Inertia((INERTIA_S.median,) * 3)
+        model = replace(model, bubble=replace(model.bubble, inertia=expected))
     frames = max(_SIZED_FRAMES, int(LEARNED_ROWS / max(_mean_in_sight(problem), 1e-9)))
     if model.broad_bands and not given:
         if problem.accelerometers:
@@ -646,7 +651,7 @@ def _adapted_solution(
             break
         model = better
     assert last is not None
-    if model.bubble.inertia is None and options.covariances:
+    if learned:
         model = replace(model, bubble=replace(model.bubble, inertia=learned_inertia(last)))
     if model == last.graph.model and part is problem:
         return last

@@ -198,7 +198,7 @@ class TrackingStream:
             "frames_without_bubbles": self.linking.frames_without,
             "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
             "pairs": with_change(self.linking.pairs, change, self.calibration, misplaced),
-            "shapes": asdict(self.linking.shapes) | {"lasting_share": self._lasting.found()},
+            "shapes": asdict(self.linking.shapes) | self._lasting.found(),
             "covariance": "Of the measurement."
             + known
             * " The calibration's share, common to all points, is in calibration_sx_mm, "

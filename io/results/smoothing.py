@@ -39,10 +39,6 @@ of the shake's RMS is then left in the paths, and at most half of it.
 """
 
 
-ZIGZAG_HZ = (3.0, 12.0)
-"""Frequencies (Hz) of a path's spectrum that count as its zigzag, in `Use`."""
-
-
 class Flag(StrEnum):
     """Name a condition under which a verdict has to be read with care.
 
@@ -259,9 +255,10 @@ class SmoothingFile(Record):
     rig_change : movement of the cameras relative to each other; None where it was not tested.
     acceleration_bandwidth_hz : by axis, the frequency up to which accelerations are followed by at
         least half; {} without accelerations.
-    inertia_s, inertia_by_axis_s, force_intensity : time constant of the low-pass filter through
-        which forces move a bubble, the longest and by axis, and the intensity of the forces by
-        axis, divided by that in the model; None and {} without accelerations.
+    inertia_s, inertia_by_axis_s, force_intensity, swing_damping : time constant of the low-pass
+        filter through which forces move a bubble, the longest and by axis, and by axis the
+        intensity of the path's forces and the damping of the zigzags, divided by those in the
+        model; None and {} without accelerations.
     white_noise : standard deviation of the pixels' white noise "along" the rise and "across" it,
         divided by the stated one.
     along_path : variances of "velocity" and "acceleration" along the bubbles' paths, divided by
@@ -318,6 +315,7 @@ class SmoothingFile(Record):
     inertia_s: float | None = None
     inertia_by_axis_s: dict[str, float] = Field(default_factory=dict)
     force_intensity: dict[str, float] = Field(default_factory=dict)
+    swing_damping: dict[str, float] = Field(default_factory=dict)
     white_noise: dict[str, float] = Field(default_factory=dict)
     along_path: dict[str, float] = Field(default_factory=dict)
     rig_change: RigChange | None = None

@@ -11,7 +11,6 @@ from typing import NamedTuple
 from telerig.io.results.smoothing import (
     RESOLVED_ETA,
     RESOLVED_Q,
-    ZIGZAG_HZ,
     AxisVerdict,
     Contradiction,
     Disagreement,
@@ -268,15 +267,14 @@ def consequence_words(file: SmoothingFile) -> str:
     return text
 
 
-_BAND = "{:g} to {:g} Hz".format(*ZIGZAG_HZ)
 QUANTITY_WORDS = {
     Quantity.MEAN_VELOCITY: "mean velocity",
     Quantity.VELOCITY: "velocity in a frame",
     Quantity.ACCELERATION: "acceleration in a frame",
     Quantity.PATH: "path about a line",
     Quantity.PLACE: "place in the laboratory",
-    Quantity.ZIGZAG_AMPLITUDE: f"zigzag amplitude, {_BAND}",
-    Quantity.ZIGZAG_FREQUENCY: f"zigzag frequency, mean of {_BAND}",
+    Quantity.ZIGZAG_AMPLITUDE: "zigzag amplitude",
+    Quantity.ZIGZAG_FREQUENCY: "zigzag frequency",
 }
 
 

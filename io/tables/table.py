@@ -192,10 +192,10 @@ OF_SHAPE = (
          "of freedom for two views, 5 for three"),
     *may("noise_eq_mm", "mm", "part of sd_eq_mm by the noise of the outlines, which is independent "
          "from frame to frame"),
-    *may("fixed_eq_mm", "mm", "part of sd_eq_mm that all frames of the bubble share: modes on the "
-         "rims, second-order terms of the unseen shape"),
+    *may("fixed_eq_mm", "mm", "part of sd_eq_mm by modes on the rims and by the mean square of the "
+         "unseen shape"),
     *may("noise_aspect", "", "part of s_aspect by the noise of the outlines"),
-    *may("fixed_aspect", "", "part of s_aspect that all frames of the bubble share"),
+    *may("fixed_aspect", "", "part of s_aspect by the mean square of the unseen shape"),
     *may("stretch", "", "difference of the logarithms of two horizontal extents beyond those of a "
          "spheroid (across the first camera's line of sight, minus along it)"),
     *may("noise_stretch", "", "part of its standard deviation by the noise of the outlines"),

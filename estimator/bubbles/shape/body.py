@@ -40,8 +40,8 @@ class Bodies(Rows):
         horizontal axes of the rig, beyond those of a spheroid.
     noise : (B, 3) part of the variances of log size, log aspect ratio and stretch by the outlines'
         own noise, independent from frame to frame.
-    fixed : (B, 2) part of the variances of log size and log aspect ratio that all frames of a
-        bubble share.
+    fixed : (B, 2) part of the variances of log size and log aspect ratio by the rims' excess (of
+        the size alone) and by the mean square of what is not seen of the shape.
     chi2 : (B,) misfit of a spheroid with t = 0, with 3 n - 4 degrees of freedom of n views.
     entire : (B,) whether nothing of any of the outlines is missing.
     zonal_probability : (B,) posterior probability of the axisymmetric model of degree 3.

@@ -13,6 +13,9 @@ from telerig.estimator.bubbles.shape.shapes import DEFAULT_SHAPES
 
 _PRIOR_FRAMES = 10.0
 """Weight, in frames of one bubble, of a stretch that never changes."""
+_PRIOR_SQUARE = 0.5
+"""Share of the variance of its square that is left in a mean where a run does not tell it, with the
+weight of one bubble: that of a body that turns, which shows both numbers t in turn."""
 
 
 @dataclass
@@ -41,11 +44,29 @@ class LastingShare:
         for particle, mine in zip(tracks_of_rows.tolist(), sums):
             self.sums[particle] = self.sums.get(particle, 0.0) + mine
 
-    def found(self) -> float:
-        """Return the share of the variance that is left in a mean over a bubble's frames, 0 to 1.
+    def found(self) -> dict[str, float]:
+        """Return ``lasting_share`` and ``lasting_square``, 0 to 1.
 
-        Products of different frames have no part of the outlines' noise. Without bubbles that are
-        seen in two frames, or without any stretch beyond the noise, the share is 1.
+        They are the shares of the variances of the stretch and of its square that are left in a
+        mean over a bubble's frames.
+        """
+        return {"lasting_share": self._share(), "lasting_square": self._square()}
+
+    def _square(self) -> float:
+        """Return the variance between the bubbles' mean squares, over that of a normal variable's
+        square."""
+        count, _, squares, noise = np.reshape([*self.sums.values()], (-1, 4)).T
+        whole = float((squares - noise).sum())
+        if not whole > 0:
+            return _PRIOR_SQUARE
+        each = (squares - noise) / count / (whole / count.sum())
+        bubbles = len(count)
+        scatter = bubbles * float(count @ (each - 1) ** 2 / count.sum())
+        return float(np.clip((scatter / 2 + _PRIOR_SQUARE) / bubbles, 0.0, 1.0))
+
+    def _share(self) -> float:
+        """Products of different frames have no part of the outlines' noise. Without bubbles that
+        are seen in two frames, or without any stretch beyond the noise, the share is 1.
         """
         left = every = _PRIOR_FRAMES * (2 * DEFAULT_SHAPES.triaxial) ** 2
         for count, total, squares, noise in self.sums.values():

@@ -41,6 +41,12 @@ _LOOSE = np.array([0.0, 0.25, 1.0, 1.0])
 """Prior precision of a single body's log size, log aspect ratio and pole."""
 _STEPS, _SMALL_STEP = 15, 1e-4
 
+UNSEEN_SQUARE = (2 / 3, 1.0)
+"""How much larger log size and log aspect ratio are, over the mean square of the unseen t."""
+_REPULSION = 1.5
+"""How much larger a log aspect ratio is found, over itself times the variance of the pole's lean:
+errors across the pole push the eigenvalues apart (second-order perturbation theory), the pole's by
+the whole of this product, the mean of the equator's two by half of it."""
 _RIM_EXCESS = {3: 15.3, 4: 37.4}
 """How much larger than the volume's the outlines' size is, over the variance of the coefficients
 of a degree: a rim is where the body reaches farthest (decision 037)."""
@@ -54,8 +60,8 @@ class Shape:
     frame : (B, 3, 3).  value : (B, 4) log size, log aspect ratio, t.  covariance : (B, 6, 6).
     cost : (B,) twice the negative logarithm of the posterior.  chi2 : (B,) see `Bodies`.
     noise : (B, 6, 6) part of the covariance by the outlines' own noise.
-    fixed : (B, 2) part of the variances of log size and log aspect ratio by what is the same in all
-        frames of a bubble. Both are 0 before `best_shape`.
+    fixed : (B, 2) part of the variances of log size and log aspect ratio by the rims' excess and by
+        the mean square of the unseen t. Both are 0 before `best_shape`.
     """
 
     frame: Array
@@ -109,13 +115,13 @@ def best_shape(views: Views, shapes: Shapes, up: Array) -> Shape:
     covariance[:, 0, 0] += np.where(alone, _ONE_OUTLINE_SD**2, 0.0)
     # what t is left open makes the expected moments of the equator larger than those at its mean
     unseen = np.trace(chosen.covariance[:, 4:, 4:], axis1=1, axis2=2)
-    wider = np.array([2 / 3, 1.0]) * unseen[:, None]
+    wider = np.array(UNSEEN_SQUARE) * unseen[:, None]
     covariance[:, :2, :2] += 2 * wider[:, :, None] * wider[:, None, :]
-    # a body that turns shows both numbers t in turn: the mean of their squares
-    # has half the variance
     fixed = wider**2
     fixed[:, 0] += excess**2
-    moved = np.stack([excess + wider[:, 0], wider[:, 1], 0 * excess, 0 * excess], -1)
+    lean2 = np.trace(chosen.covariance[:, 2:4, 2:4], axis1=1, axis2=2)
+    apart = _REPULSION * (1 - blur) * chosen.value[:, 1] * lean2
+    moved = np.stack([excess + wider[:, 0], wider[:, 1] + apart, 0 * excess, 0 * excess], -1)
     chi2, _ = misfit(views, chosen, weight)
     return replace(
         chosen, value=chosen.value - moved, covariance=covariance, chi2=chi2, noise=noise,

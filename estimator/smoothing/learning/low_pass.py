@@ -3,10 +3,11 @@
 The stated covariance of a pixel contains what the bubble's unknown shape adds. That part changes
 slowly: it belongs to a position, not to a velocity. So the white noise is learned, too.
 
-Along the rise and across it, the time of the low-pass, the intensity of the forces and the noise
-maximise the expectation of the log-likelihood of triangulated positions over draws of the rig's
-errors, as a step of expectation maximisation does. A Kalman filter gives the likelihood
-(Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, eq. 3.4.5).
+Along the rise and across it, the time of the low-pass, the intensity of the path's forces, the
+damping of the zigzags and the noise maximise the expectation of the log-likelihood of triangulated
+positions over draws of the rig's errors, as a step of expectation maximisation does. A Kalman
+filter gives the likelihood (Harvey, Forecasting, Structural Time Series Models and the Kalman
+Filter, 1989, eq. 3.4.5).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from telerig.factors.bubble_motion import (
     FORCES,
     INERTIA_S,
     NOISE,
+    SWINGS,
     BubbleModel,
     Inertia,
     Prior,
@@ -64,7 +66,7 @@ class Series(NamedTuple):
 
 
 def learned_inertia(solution: Solution) -> Inertia | None:
-    """Return the most probable low-pass with its intensity of the forces and white noise.
+    """Return the most probable low-pass with the intensities of the forces and the white noise.
 
     The shorter a low-pass is, the more velocity it allows that no image shows. What the shortest
     one that is not excluded would add is stated with it, so that a velocity is never stated too
@@ -84,13 +86,17 @@ def learned_inertia(solution: Solution) -> Inertia | None:
     ends = np.cumsum([len(p) for p in pieces])[:-1]
 
     def paths(
-        directions: Array, bubble: BubbleModel = bubble, inertia: Prior = INERTIA_S
+        directions: Array,
+        bubble: BubbleModel = bubble,
+        inertia: Prior = INERTIA_S,
+        modelled: Array | None = None,
     ) -> _Paths:
         every = []
         for direction in np.broadcast_to(directions, (len(directions), len(place), 3)):
             cut = (np.split(x, ends) for x in (direction, place, _variance(direction, information)))
             every.append([_series(*part) for part in zip(steps, *cut, strict=True)])
-        return _Paths(bubble, directions[:, 0], dt_s, every, inertia)
+        as_along = directions[:, 0] if modelled is None else modelled
+        return _Paths(bubble, as_along, dt_s, every, inertia)
 
     across = paths(np.linalg.svd(up[None])[2][1:, None]).learned()
     # swings show the low-pass; along the vertical there may be none that shows it
@@ -103,9 +109,10 @@ def learned_inertia(solution: Solution) -> Inertia | None:
     path = solution.state.bubbles[np.concatenate(pieces)] @ graph.bubble.velocity.T
     path = path / np.maximum(np.linalg.norm(path, axis=-1, keepdims=True), _STILL_MM_S)
     share = (path**2).mean(0)
-    plain, time_s = _without_swing(bubble, share), float(share @ probable.time_s)
-    force = float(paths(path[None], plain).best(np.array([time_s]))[1])
-    along = inertial_bubble_path(plain, up, Inertia((time_s,) * 3, (force,) * 3))
+    # the speed swings as the rise does, twice in a zigzag
+    speed, time_s = _of_speed(bubble, share), np.array([share @ probable.time_s])
+    found = paths(path[None], speed, modelled=up[None]).best(time_s)
+    along = inertial_bubble_path(speed, up, _everywhere(found))
     every = np.diagonal(np.linalg.inv(information[seen]), axis1=1, axis2=2)
     stated = 2 * float(np.median(dt_s[step])) * np.median(every, axis=0)
     used, other = (_Filtered.of(bubble, one, up, stated) for one in (probable, shortest))
@@ -162,23 +169,29 @@ def _integral(density: Array, derivative: int) -> Array:
     return np.asarray(np.trapezoid(weight * density, _FREQUENCY_HZ, axis=-1))
 
 
-def _without_swing(bubble: BubbleModel, share: Array) -> BubbleModel:
+def _of_speed(bubble: BubbleModel, share: Array) -> BubbleModel:
     """Return the model of a speed that wanders, driven as strongly as the axes are on average.
 
-    share : (3,) of each axis. The speed along a path does not swing as its components do.
+    share : (3,) of each axis.
     """
     driven = [
         part * sum((p.component.noise[1] ** 2).sum() for p in bubble_processes(bubble, axis))
         for part, axis in zip(share, np.eye(3), strict=True)
     ]
     sigma = float(np.sqrt(sum(driven) * bubble.velocity_tau_s / 2))
-    return replace(bubble, zigzags=(), velocity_sigma_mm_s=sigma)
+    return replace(bubble, velocity_sigma_mm_s=sigma)
 
 
 def _by_axis(along: Array, across: Array, up: Array) -> Inertia:
     each = across[:, None] + (along - across)[:, None] * np.square(up)
-    time_s, forces = ((float(x), float(y), float(z)) for x, y, z in each[:2])
-    return Inertia(time_s, forces, (float(along[2]), float(across[2])))
+    time_s, forces, swings = ((float(x), float(y), float(z)) for x, y, z in each[:3])
+    return Inertia(time_s, forces, swings, (float(along[3]), float(across[3])))
+
+
+def _everywhere(values: Array) -> Inertia:
+    """Return values (4,) of `_Paths.learned`, or the first three, for all directions."""
+    time_s, forces, swings = values[:3].tolist()
+    return Inertia((time_s,) * 3, (forces,) * 3, (swings,) * 3)
 
 
 def _pieces(graph: GraphLayout) -> list[Ints]:
@@ -245,8 +258,9 @@ def _series(step: Ints, direction: Array, place: Array, variance: Array) -> Seri
 
 @dataclass(frozen=True)
 class _Paths:
-    """Series of all bubbles along each of some directions (k, 3); dt_s : (U,) lengths of steps.
+    """Series of all bubbles along each of some directions.
 
+    directions : (k, 3) along which the model moves them.  dt_s : (U,) lengths of steps.
     inertia : prior of the low-pass's time.
     """
 
@@ -257,8 +271,9 @@ class _Paths:
     inertia: Prior
 
     def learned(self) -> Array:
-        """Return (2, 3): time of the low-pass in s, intensity of the forces and noise over the
-        stated one, of the most probable and of the shortest low-pass."""
+        """Return (2, 4): time of the low-pass in s, intensity of the path's forces and damping of
+        the zigzags over the model's, and noise over the stated one, of the most probable and of the
+        shortest low-pass."""
         probable = self.best()
         least = self.log_likelihood(probable) - _EXCLUDED
         low, high = np.log(_SHORTEST_S), np.log(probable[0])
@@ -272,10 +287,10 @@ class _Paths:
         return np.array([probable, shortest])
 
     def best(self, held: Array = _NONE, start: Array | None = None) -> Array:
-        """Return the most probable values (3,) of `learned`, the first ones held."""
+        """Return the most probable values (4,) of `learned`, the first ones held."""
         from scipy.optimize import minimize
 
-        priors = [self.inertia, FORCES, NOISE]
+        priors = [self.inertia, FORCES, SWINGS, NOISE]
         free = priors[len(held) :]
         begin = np.array([p.median for p in free]) if start is None else start[len(held) :]
 
@@ -297,14 +312,11 @@ class _Paths:
         return values_at(best.x)
 
     def log_likelihood(self, values: Array) -> float:
-        """Return it for the values (3,) of `learned`."""
-        time_s, forces, noise = values.tolist()
-        total = 0.0
+        """Return it for the values (4,) of `learned`."""
+        total, inertia = 0.0, _everywhere(values)
         for direction, series in zip(self.directions, self.series, strict=True):
-            moves = _moves_of(
-                self.bubble, tuple(direction.tolist()), time_s, forces, self.dt_s.tobytes()
-            )
-            total += log_likelihood(moves, series, noise)
+            moves = _moves_of(self.bubble, tuple(direction.tolist()), inertia, self.dt_s.tobytes())
+            total += log_likelihood(moves, series, float(values[3]))
         return total
 
 
@@ -321,12 +333,9 @@ class Moves(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _moves_of(
-    bubble: BubbleModel, direction: Triple, time_s: float, forces: float, dt_s: bytes
-) -> Moves:
-    """Return the moves along a direction. The optimiser changes the noise alone in every third or
-    fourth call, which changes none of them."""
-    inertia = Inertia((time_s,) * 3, (forces,) * 3)
+def _moves_of(bubble: BubbleModel, direction: Triple, inertia: Inertia, dt_s: bytes) -> Moves:
+    """Return the moves along a direction. The optimiser changes the noise alone in every fourth or
+    fifth call, which changes none of them."""
     process = inertial_bubble_path(bubble, np.array(direction), inertia)
     return moves_of(process, bubble.mean_sigma_mm_s, np.frombuffer(dt_s))
 

@@ -7,23 +7,24 @@ and amplitudes come from draws of the posterior, which contain its correlation i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array
+from telerig.estimator.physics.oscillation import zigzag
 from telerig.estimator.smoothing.graph.draws import DRAWS, Draws
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance, offset_sigma
-from telerig.io.results.smoothing import ZIGZAG_HZ, Grade, Quantity, Use
+from telerig.io.results.smoothing import Grade, Quantity, Use
 from telerig.io.tables.smoothing import AXES
 
 GOOD, LIMITED = 10.0, 3.0
 """Signal over standard deviation from which a quantity is called good, or limited."""
+_UPRIGHT = 0.5
+"""Cosine to the vertical from which a rig axis has no zigzag."""
 _MOST_BUBBLES, _LEAST_FRAMES = 5, 20
 _CLEAR_POWER = 9.0
-_LEAST_PERIODS = 3.0
-_LEAST_SHARE = 0.3
 
 
 def uses(
@@ -60,8 +61,8 @@ def uses(
 
 
 class _Path:
-    """One bubble: times (n,), positions and velocities (n, 3), and K draws of their errors (n, 3,
-    K).
+    """One bubble: times (n,), positions and velocities (n, 3), K draws of the positions' errors (n,
+    3, K), and its zigzag across the vertical.
     """
 
     def __init__(self, solution: Solution, errors: Array, bubble: int, widen: Array) -> None:
@@ -78,7 +79,8 @@ class _Path:
         self.t_s = graph.problem.t_s[graph.frame_of_row[rows]]
         place, speed = (v[rows] for v in considered_variance(solution))
         row = graph.bubble.position
-        error = np.einsum("id,ndk->nik", row, graph.bubble_basis(rows) @ errors[rows])
+        drawn = graph.bubble_basis(rows) @ errors[rows]
+        error = np.einsum("id,ndk->nik", row, drawn)
         variance = np.einsum("id,nde,ie->ni", row, found.bubbles[rows], row, optimize=True)
         scale = np.sqrt(variance.mean(0) / (error**2).mean((0, 2)).clip(1e-300))
         self.errors = error * (scale * widen)[None, :, None]
@@ -87,6 +89,12 @@ class _Path:
         self.speed = solution.velocities_mm_s[rows]
         self.speed_sd = np.sqrt(solution.velocity_variances()[rows] + speed) * widen
         self.mean_speed_variance = speed.mean(0) * widen**2
+        self.lateral = np.flatnonzero(np.abs(graph.problem.up) <= _UPRIGHT)
+        turned = np.einsum("id,ndk->nik", graph.bubble.velocity, drawn) * widen[:, None]
+        self.zigzag = zigzag(
+            self.t_s, self.speed[:, self.lateral],
+            turned[:, self.lateral].reshape(len(rows), -1),
+        )  # fmt: skip
 
     @property
     def span_s(self) -> float:
@@ -136,15 +144,15 @@ def _of_axis(solution: Solution, paths: Sequence[_Path], axis: int) -> Iterator[
     yield path.model_copy(update={"below_hz": below or None})
     each = [(_band_rms(p, axis, 0.0)[0], _rms(p.place_sd[:, axis])) for p in paths]
     yield use(Quantity.PLACE, each, "mm")
-    if abs(float(problem.up[axis])) > 0.5:
-        return
-    for quantity, unit, of in (
-        (Quantity.ZIGZAG_AMPLITUDE, "mm", 1),
-        (Quantity.ZIGZAG_FREQUENCY, "Hz", 0),
-    ):
-        found = [z[of] for p in paths if (z := _zigzag(p, axis)) is not None]
-        if found:
-            yield use(quantity, found, unit)
+    swings = [
+        (z.frequency_hz, z.s_frequency_hz, float(z.amplitudes[p.lateral == axis][0]), z.s_major)
+        for p in paths
+        if (z := p.zigzag) is not None and axis in p.lateral
+    ]
+    if swings:
+        hz, hz_sd, mm, mm_sd = zip(*swings, strict=True)
+        yield use(Quantity.ZIGZAG_AMPLITUDE, list(zip(mm, mm_sd)), "mm")
+        yield use(Quantity.ZIGZAG_FREQUENCY, list(zip(hz, hz_sd)), "Hz")
 
 
 def grade_of(value: float, sd: float) -> Grade:
@@ -182,32 +190,3 @@ def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
     noise = path.spectrum(path.errors[:, axis])[1].mean(-1)
     band = frequency <= (below_hz or np.inf)
     return float(np.sqrt(power[band].sum())), float(np.sqrt(noise[band].sum()))
-
-
-def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Return frequency (Hz) and amplitude (mm) of the zigzag with their sd, or None."""
-    if path.span_s * ZIGZAG_HZ[0] < _LEAST_PERIODS:
-        return None
-    place, error = path.place[:, axis], path.errors[:, axis]
-    frequency, power = path.spectrum(place)
-    band = (frequency >= ZIGZAG_HZ[0]) & (frequency <= ZIGZAG_HZ[1])
-    if not band.any() or power[band].sum() < _LEAST_SHARE * power.sum():
-        return None
-    measure = _swing(frequency, band)
-    drawn = np.array([measure(p) for p in path.spectrum(place[:, None] + error)[1].T])
-    value, sd = measure(power), np.sqrt(np.mean((drawn - measure(power)) ** 2, axis=0))
-    width = 1 / (np.sqrt(12) * path.span_s)
-    return (
-        (float(value[0]), float(np.hypot(sd[0], width))),
-        (float(value[1]), float(sd[1])),
-    )
-
-
-def _swing(frequency: Array, band: Bools) -> Callable[[Array], Array]:
-    """Return a function that computes mean frequency and amplitude of a spectrum in a band."""
-
-    def measure(power: Array) -> Array:
-        total = power[band].sum()
-        return np.array([(frequency[band] * power[band]).sum() / total, np.sqrt(2 * total)])
-
-    return measure

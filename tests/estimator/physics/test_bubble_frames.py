@@ -149,23 +149,25 @@ def test_bodies_of_a_table_without_outlines_are_diameters() -> None:
 
 
 def test_the_mean_of_a_body_states_its_error() -> None:
-    """Noise averages out, what is fixed stays, and of the rest the learned share is left."""
+    """Noise averages out, rims stay, and of the rest and of squares the learned shares are left."""
     rng, frames, runs = np.random.default_rng(2), 100, 400
-    noise, fixed, rest, share, scale = 0.05, 0.004, 0.02, 0.2, 0.001
+    noise, rims, unseen, rest, share, scale = 0.05, 0.004, 0.006, 0.02, 0.2, 0.001
+    half = rims**2 + unseen**2 / 2
     rows = body(frames).assign(
-        sd_eq_mm=np.sqrt(noise**2 + fixed**2 + rest**2), noise_eq_mm=noise, fixed_eq_mm=fixed
-    )
+        sd_eq_mm=np.sqrt(noise**2 + half + unseen**2 / 2 + rest**2), noise_eq_mm=noise,
+        fixed_eq_mm=np.sqrt(half), noise_aspect=0.01, fixed_aspect=1.6 / 2 * unseen / 2**0.5,
+    )  # fmt: skip
     swing = np.sqrt(2) * np.cos(2 * np.pi * np.arange(frames) / 10)
     off = []
     for _ in range(runs):
-        common = fixed, 3 * scale, rest * np.sqrt(share)
-        error = common @ rng.standard_normal(3) + rest * np.sqrt(1 - share) * swing
+        common = rims, 0.5 * unseen, 3 * scale, rest * np.sqrt(share)
+        error = common @ rng.standard_normal(4) + rest * np.sqrt(1 - share) * swing
         error = error + noise * rng.standard_normal(frames)
-        lasting = Lasting(share, scale)
+        lasting = Lasting(share, 0.25, scale)
         mean, sd = mean_of_body(rows.assign(d_eq_mm=3.0 + error), "d_eq_mm", lasting)
         off.append((mean - 3.0) / sd)
     assert np.mean(np.square(off)) == pytest.approx(1.0, abs=0.2)
-    assert mean_of_body(body(9), "aspect", Lasting(0.1, scale))[1] == pytest.approx(0.05)
+    assert mean_of_body(body(9), "aspect", Lasting(0.1, 0.2, scale))[1] == pytest.approx(0.05)
     assert np.isnan(mean_of_body(body(3).assign(aspect=np.nan), "aspect", Lasting())[0])
 
 
@@ -221,6 +223,50 @@ def test_few_wrong_fringes_of_a_gap_of_half_the_record_are_believed() -> None:
         if found is not None:
             off.append((found.frequency_hz - f) / found.s_frequency_hz)
     assert len(off) > 70 and np.mean(np.abs(off) > 6) < 0.05
+
+
+def test_errors_that_oscillate_with_a_series_widen_its_line() -> None:
+    """Two spectral lines closer than the record resolves, of which the second one is an error."""
+    rng, off = np.random.default_rng(13), []
+    t = np.arange(250) / 500
+    for _ in range(80):
+        f, phase = rng.uniform(40, 100), rng.uniform(0, 2 * np.pi, 3)
+        f_error = f + rng.uniform(-1.5, 1.5)
+        error = 0.1 * np.cos(2 * np.pi * f_error * t + phase[1])
+        values = np.cos(2 * np.pi * f * t + phase[0]) + error + 0.02 * rng.standard_normal(250)
+        seen = 0.1 * np.cos(2 * np.pi * f_error * t + phase[2])
+        found = dominant_oscillation(t, values[:, None], alike=seen[:, None])
+        alone = dominant_oscillation(t, values[:, None])
+        assert found is not None and alone is not None
+        assert found.frequency_hz == alone.frequency_hz
+        off.append([(one.frequency_hz - f) / one.s_frequency_hz for one in (found, alone)])
+    nees = np.mean(np.square(off), 0)
+    assert 0.6 < nees[0] < 1.5 and nees[1] > 5
+
+
+def test_a_line_is_not_believed_below_the_stated_noise() -> None:
+    rng, t = np.random.default_rng(14), np.arange(250) / 500
+    found, known = 0, 0
+    for _ in range(300):
+        values = 0.1 * rng.standard_normal((250, 1))
+        found += dominant_oscillation(t, values, 15.0, significant=4.5) is not None
+        known += dominant_oscillation(t, values, 15.0, significant=4.5, noise=0.1) is not None
+    assert known <= 2 < found
+
+
+@pytest.mark.parametrize(("swing", "hz"), [(0.0, 60.0), (0.1, np.nan)])
+def test_twice_the_frequency_of_a_pole_that_swings_is_not_the_shapes(
+    swing: float, hz: float
+) -> None:
+    rng, t = np.random.default_rng(15), np.arange(250) / 500
+    pole = swing * np.cos(2 * np.pi * 32 * t) + 0.01 * rng.standard_normal(250)
+    shaped = body(250).assign(
+        aspect=1.6 * np.exp(0.01 * np.cos(2 * np.pi * 60 * t) + 1e-3 * rng.standard_normal(250)),
+        s_aspect=0.0017, noise_aspect=0.0016, fixed_aspect=1e-5, stretch=0.0, noise_stretch=1e-3,
+        noise_eq_mm=0.03, fixed_eq_mm=1e-5, pole_x=pole, pole_z=0.0,
+    )  # fmt: skip
+    row = summary_table(frames_table(motion(250), shaped, UP, G, WATER), UP).iloc[0]
+    np.testing.assert_allclose(row["shape_hz"], hz, atol=0.05)
 
 
 def test_an_oscillation_at_unequal_times() -> None:

@@ -24,6 +24,7 @@ from telerig.estimator.bubbles.flat_field import (
     normalised,
     nothing_to_see,
 )
+from telerig.estimator.bubbles.lighting import NOT_BACKLIT, on_bright_spots
 from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
@@ -94,6 +95,8 @@ class Bubbles:
     reason : why there are no bubbles, in words; empty if there are some.
     field : (rows, columns) where bubbles were looked for; None for the whole image.
     clusters : outlines (n, 2) in px of dark regions that are no bubble and could not be divided.
+    bright_spots : how many outlines were left out as dark hearts of bright spots, in a scene that
+        is not backlit.
     covered : share of the image, or of its field, that bubbles and clusters cover; where they
         overlap it is counted twice.
     """
@@ -105,6 +108,7 @@ class Bubbles:
     field: Bools | None = None
     clusters: list[Array] = dataclass_field(default_factory=list)
     covered: float = 0.0
+    bright_spots: int = 0
 
     @property
     def rejected(self) -> pd.DataFrame:
@@ -158,7 +162,8 @@ def find_bubbles(
     Dark regions that are single bubbles, or that could be divided into bubbles, need no more. The
     rims of bubbles are looked for around the others, among them those within a bright heart, and in
     the whole image if bubbles cover more than 15 % of it; this takes some 2 s for a megapixel.
-    Without a background the covariances allow for light that shadows of other bubbles make uneven.
+    Without a background the covariances allow for light that shadows of other bubbles make uneven,
+    and dark hearts of bright spots are left out in scenes that are not backlit.
 
     The other arguments and the errors are those of :func:`detect_bubbles`.
     """
@@ -180,6 +185,8 @@ def find_bubbles(
         outside = np.minimum(background, image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
     found = _found(image, background, field, min_diameter_px, min_contrast, shadows)
+    if shadows:
+        found = _without_bright_spots(found, image, field)
     merged = (
         found.accepted["flags"].astype(str).str.contains("merged")
     )  # of which clusters are part
@@ -281,6 +288,27 @@ def _found(
     kept_columns = {name: values[kept] for name, values in columns.items()}
     reason = "" if np.any(kept) else "no shadow has a bubble's outline"
     return replace(_bubbles(kept_columns, rejected, sigma, reason), clusters=clusters)
+
+
+def _without_bright_spots(found: Bubbles, image: NDArray[Any], field: Bools | None) -> Bubbles:
+    """Return the bubbles without the dark hearts of bright spots, if the scene is not backlit."""
+    table = found.accepted
+    ellipse = table[["u_px", "v_px", "a_px", "b_px", "angle_rad"]].to_numpy(float)
+    bright, share = on_bright_spots(image, field, ellipse, found.clusters)
+    if share <= NOT_BACKLIT:
+        return found
+    places = table.loc[bright, ["u_px", "v_px", "d_eq_px"]].to_numpy(float).tolist()
+    hearts = [Rejected(u, v, d / 2.0, "dark heart of a bright spot") for u, v, d in places]
+    kept = table[~bright].reset_index(drop=True)
+    reason = found.reason if len(kept) else "the scene is not backlit"
+    kept.attrs |= table.attrs | {"reason": reason}
+    return replace(
+        found,
+        accepted=kept,
+        shadows=found.shadows + hearts,
+        reason=reason,
+        bright_spots=len(hearts),
+    )
 
 
 def load_compiled_loops() -> None:

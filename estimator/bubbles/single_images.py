@@ -107,6 +107,12 @@ def _found(name: str, bubbles: Bubbles) -> Found:
             f"; warning: bubbles cover {bubbles.covered:.0%} of the image, and beyond "
             f"{COVERED_LIMIT_EVERYWHERE:.0%} more than one in five is missed"
         )
+    if bubbles.bright_spots:
+        words += (
+            f"; warning: {_count(bubbles.bright_spots, 'outline')} left out as dark "
+            "hearts of bright spots: the scene is not backlit, and bubbles are looked for as "
+            "shadows on a lit screen; put the light behind the bubbles"
+        )
     if bubbles.field is not None:
         words += f"; {bubbles.field.mean():.0%} of the image was searched"
     return Found(single[["image", *DETECTION_COLUMNS]], table, words)

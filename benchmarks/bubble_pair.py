@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from telerig.estimator.bubbles.detect import detect_bubbles
-from telerig.estimator.bubbles.pairing.groups import Matches, compared, views_of
+from telerig.estimator.bubbles.pairing.groups import Groups, compared, views_of
 from telerig.estimator.bubbles.pairing.learning import default_model, learn_rig
 from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 from telerig.io.images.read import read_image
@@ -140,7 +140,7 @@ def agreement(found: list[pd.DataFrame], known: list[Array]) -> list[str]:
     return lines
 
 
-def details(found: list[pd.DataFrame], known: list[Array], pairs: Matches) -> list[str]:
+def details(found: list[pd.DataFrame], known: list[Array], pairs: Groups) -> list[str]:
     lines = ["| pair | first (u, v) | second (u, v) | list's rows | confidence |",
              "|---|---|---|---|---|"]  # fmt: skip
     mine = [rows_of_list(t, k) for t, k in zip(found, known)]
@@ -148,14 +148,14 @@ def details(found: list[pd.DataFrame], known: list[Array], pairs: Matches) -> li
         one, two = found[0].iloc[i], found[1].iloc[j]
         lines.append(
             f"| {k + 1} | {one.u_px:.1f}, {one.v_px:.1f} | {two.u_px:.1f}, {two.v_px:.1f} | "
-            f"{mine[0][i]}, {mine[1][j]} | {pairs.confidence[k]:.4f}"
+            f"{mine[0][i]}, {mine[1][j]} | {pairs.probability[k]:.4f}"
             f"{' ambiguous' if pairs.ambiguous[k] else ''} |"
         )
     return lines
 
 
 def draw(
-    images: list[NDArray[np.uint16]], found: list[pd.DataFrame], pairs: Matches, path: Path
+    images: list[NDArray[np.uint16]], found: list[pd.DataFrame], pairs: Groups, path: Path
 ) -> None:
     """Both views with outlines; a pair has one number and one colour, what is alone is grey."""
     pictures = []
@@ -201,7 +201,7 @@ def random_scenes(frames: int) -> list[str]:
         )
         made, good = sum(len(m) for m in matches), sum(int(h.sum()) for h in hits)
         unsure = sum(int(m.ambiguous.sum()) for m in matches)
-        confidence += [m.confidence for m in matches]
+        confidence += [m.probability for m in matches]
         right += hits
         lines.append(
             f"| {name} | {good / there:.4f} | {good / made:.4f} | {unsure / made:.4f} | "
@@ -211,7 +211,7 @@ def random_scenes(frames: int) -> list[str]:
     return [*lines, "", *calibration(np.concatenate(confidence), np.concatenate(right))]
 
 
-def _right(first: pd.DataFrame, second: pd.DataFrame, pairs: Matches) -> NDArray[np.bool_]:
+def _right(first: pd.DataFrame, second: pd.DataFrame, pairs: Groups) -> NDArray[np.bool_]:
     who = first.bubble.to_numpy()[pairs.rows[:, 0]]
     return np.asarray((who >= 0) & (who == second.bubble.to_numpy()[pairs.rows[:, 1]]))
 

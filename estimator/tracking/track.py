@@ -519,8 +519,8 @@ def _shapes(sample: list[Tables], model: RigModel, up: Array) -> Shapes:
     tables, counts, found = candidates_of(sample, model)
     starts = np.cumsum(counts, axis=0) - counts
     seen = []
-    for first, one in zip(starts, found):
-        rows = one.groups.rows[one.probability > _RELIABLE]
+    for first, (groups, _) in zip(starts, found):
+        rows = groups.rows[groups.probability > _RELIABLE]
         seen.append(np.where(rows >= 0, rows + first, -1))
     sightings = [sightings_from_table(t, c, model.cameras) for c, t in enumerate(tables)]
     many = counts.sum(0)

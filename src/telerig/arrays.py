@@ -23,6 +23,9 @@ class Rows:
     A field may be such a structure itself.
     """
 
+    def __len__(self) -> int:
+        return len(getattr(self, next(iter(cast(Any, self).__dataclass_fields__))))
+
     def take(self, rows: Any) -> Self:
         """Return some rows, in the shape of ``rows``: (B, n) indices give arrays (B, n, ...)."""
         values = [getattr(self, name) for name in cast(Any, self).__dataclass_fields__]

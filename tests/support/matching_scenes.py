@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from telerig.estimator.bubbles.pairing.evidence import Prediction
 from telerig.estimator.bubbles.pairing.groups import (
     Groups,
-    Matches,
     View,
     candidates_of,
     compared,
@@ -62,10 +61,10 @@ def geometry(first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, C
 
 def match_tables(
     tables: Sequence[pd.DataFrame], model: RigModel, predicted: Prediction | None = None
-) -> Matches:
+) -> Groups:
     """The groups of one frame, from the tables of all cameras."""
-    _, _, (found,) = candidates_of([tables], model)
-    return match(found, model, predicted)
+    _, _, ((groups, rays),) = candidates_of([tables], model)
+    return match(groups, rays, model, predicted)[1]
 
 
 def groups_of(tables: Sequence[pd.DataFrame], model: RigModel, rows: NDArray[np.int64]) -> Groups:

@@ -40,9 +40,6 @@ class Outlines(Rows):
     parameters: Array
     shown: Array
 
-    def __len__(self) -> int:
-        return len(self.parameters)
-
     @property
     def ellipse(self) -> Array:
         """(B, 5) ellipses."""

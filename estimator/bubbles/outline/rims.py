@@ -75,9 +75,6 @@ class Rims(Rows):
     outer: Array
     blur_px: Array
 
-    def __len__(self) -> int:
-        return int(self.ellipse.shape[0])
-
     def moved(self, u_px: float, v_px: float) -> Rims:
         """Return the same candidates as they are in an image of which this one is a part."""
         by = np.array([u_px, v_px])

@@ -107,6 +107,9 @@ _SAME_AXIS = 0.1
 
 Cameras = tuple[Camera, Camera]
 
+Rays = tuple[tuple[Array, Array, Array], ...]
+"""The detections of each camera by themselves, as `on_rays` returns them."""
+
 
 @dataclass(frozen=True)
 class View(Rows):
@@ -378,6 +381,7 @@ class Groups(Rows):
         its covariance by that of the detections.
     scatter_px2 : (G, D, D) the same by the scatter of the model.
     constant : (G,) logarithm of a density of innovations of images anywhere; without its sign.
+    probability : (G,) posterior probabilities; NaN if unknown.
     """
 
     rows: Ints
@@ -391,9 +395,13 @@ class Groups(Rows):
     noise_px2: Array
     scatter_px2: Array
     constant: Array
+    probability: Array
 
-    def __len__(self) -> int:
-        return len(self.rows)
+    @property
+    def ambiguous(self) -> Bools:
+        """Whether the posterior log odds are below ``SAFE_LOG_ODDS`` (G,)."""
+        odds = np.exp(SAFE_LOG_ODDS)
+        return np.asarray(self.probability < (1 - self.probability) * odds)
 
     @property
     def free(self) -> Ints:
@@ -444,7 +452,7 @@ class Groups(Rows):
         return Groups(
             rows, blank, blank + np.nan, found.points_mm, found.covariance_mm2, uv - expected,
             axes, (left @ axes)[:, 0], own.sum(1) + none,
-            (each.mT @ (each * factor[:, :, None, None])).sum(1), constant,
+            (each.mT @ (each * factor[:, :, None, None])).sum(1), constant, blank + np.nan,
         )  # fmt: skip
 
 
@@ -516,45 +524,9 @@ def _summed(values: Array, frame: Ints, many: int) -> Array:
     return out
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """The possible groups of one frame, and all its detections by camera.
-
-    rays : the detections of each camera by themselves, as `on_rays` returns them.
-    groups : their log odds hold everything but the tracks.
-    probability : (G,) posterior probabilities of the groups without tracks.
-    """
-
-    rays: tuple[tuple[Array, Array, Array], ...]
-    groups: Groups
-    probability: Array
-
-    def __len__(self) -> int:
-        return len(self.groups)
-
-
-@dataclass(frozen=True)
-class Matches:
-    """Hold the M groups of one frame that are more probable than not; they are disjoint.
-
-    candidate : (M,) positions of the groups among the frame's `Candidates`.
-    rows : (M, C) row in the table of each camera, -1 for none.
-    confidence : (M,) posterior probability of the group.
-    ambiguous : (M,) whether the group's posterior log odds are below ``SAFE_LOG_ODDS``.
-    """
-
-    candidate: Ints
-    rows: Ints
-    confidence: Array
-    ambiguous: Bools
-
-    def __len__(self) -> int:
-        return len(self.candidate)
-
-
 def candidates_of(
     frames: Sequence[Sequence[pd.DataFrame]], model: RigModel
-) -> tuple[list[pd.DataFrame], Ints, list[Candidates]]:
+) -> tuple[list[pd.DataFrame], Ints, list[tuple[Groups, Rays]]]:
     """Return the detections of all frames by camera, their numbers (F, C), and `candidates`.
 
     frames : for each frame the tables of `detect_bubbles` for all cameras.
@@ -568,14 +540,15 @@ def candidates_of(
 
 def candidates(
     views: Sequence[View], counts: Ints, model: RigModel, given: Sequence[Ints] | None = None
-) -> list[Candidates]:
-    """Return the possible groups of F frames, each with the shift that its groups share.
+) -> list[tuple[Groups, Rays]]:
+    """Return for each of F frames the possible groups, with log odds and probabilities of all but
+    the tracks, and the detections by themselves.
 
     The arguments are those of `possible_groups`.
     """
     groups, frame = possible_groups(views, counts, model, given)
     total, _, probability = with_innovations(groups, groups.log_odds, frame, counts, model)
-    groups = replace(groups, log_odds=total)
+    groups = replace(groups, log_odds=total, probability=probability)
     cuts = np.searchsorted(frame, np.arange(len(counts) + 1)).tolist()
     rays = [on_rays(c, v.uv_px, v.covariance_px2) for c, v in zip(model.cameras, views)]
     ends = np.cumsum(counts, axis=0)
@@ -583,10 +556,7 @@ def candidates(
         tuple((x[i:j], p[i:j], by[i:j]) for (x, p, by), i, j in zip(rays, first, last))
         for first, last in zip((ends - counts).tolist(), ends.tolist())
     ]
-    return [
-        Candidates(own, groups.take(slice(*ends)), probability[slice(*ends)])
-        for own, ends in zip(of_frame, pairwise(cuts))
-    ]
+    return [(groups.take(slice(*ends)), own) for own, ends in zip(of_frame, pairwise(cuts))]
 
 
 def possible_groups(
@@ -755,46 +725,47 @@ def prior_log_odds(groups: Groups, counts: Ints, model: RigModel) -> Array:
     return np.asarray(out)
 
 
-def match(found: Candidates, model: RigModel, predicted: Prediction | None = None) -> Matches:
-    """Find the groups of a frame that are more probable than not.
+def match(
+    groups: Groups, rays: Rays, model: RigModel, predicted: Prediction | None = None
+) -> tuple[Ints, Groups]:
+    """Return those M groups of a frame that are more probable than not, which are disjoint: their
+    positions (M,), and the groups with their posterior probabilities.
 
+    groups, rays : as `candidates` returns them.
     predicted : where tracks are expected; None if there are no tracks.
     """
     from telerig.estimator.bubbles.pairing import kernels
 
-    rows, probability = found.groups.rows, found.probability
-    if predicted is not None and len(predicted.ids) and len(found):
-        odds = found.groups.log_odds + track_log_odds(found, model, predicted)
-        counts = np.array([len(points) for points, *_ in found.rays])
-        probability = kernels.marginals(odds, rows, counts, NEGLIGIBLE)
+    probability = groups.probability
+    if predicted is not None and len(predicted) and len(groups):
+        odds = groups.log_odds + track_log_odds(groups, rays, model, predicted)
+        counts = np.array([len(points) for points, *_ in rays])
+        probability = kernels.marginals(odds, groups.rows, counts, NEGLIGIBLE)
     chosen = np.flatnonzero(probability > 0.5)
-    confidence = probability[chosen]
-    ambiguous = confidence < (1 - confidence) * np.exp(SAFE_LOG_ODDS)
-    return Matches(chosen, rows[chosen], confidence, ambiguous)
+    return chosen, replace(groups.take(chosen), probability=probability[chosen])
 
 
-def track_log_odds(found: Candidates, model: RigModel, predicted: Prediction) -> Array:
+def track_log_odds(groups: Groups, rays: Rays, model: RigModel, predicted: Prediction) -> Array:
     """Return the log odds (G,) that the predicted tracks add.
 
     Without tracks groups lie anywhere in the volume that the cameras see. With them most lie where
     a track is expected, and so do the detections of bubbles that only one camera found; one track
     cannot be the unmatched detection of two cameras.
     """
-    groups = found.groups
-    rays = [
+    wider = [
         (points, covariances + common * by_pixel @ by_pixel.mT)
-        for common, (points, covariances, by_pixel) in zip(model.apart_px2, found.rays)
+        for common, (points, covariances, by_pixel) in zip(model.apart_px2, rays)
     ]
     scales = np.array([camera["scale_px_per_mm"] for camera in model.cameras])
     blur_px2 = model.mean("scatter_px") ** 2 + model.mean("frame_px") ** 2
     blurred = groups.covariance_mm2 + blur_px2 / np.mean(scales) ** 2 * np.eye(3)
-    ends = np.cumsum([len(groups), *(len(points) for points, _ in rays)])
+    ends = np.cumsum([len(groups), *(len(points) for points, _ in wider)])
     sizes = np.full(ends[-1], np.nan)
     sizes[: len(groups)] = 2 * np.exp(groups.log_radius)
     near = evidence(
         predicted,
-        np.concatenate([groups.points_mm, *(points for points, _ in rays)]),
-        np.concatenate([blurred, *(covariances for _, covariances in rays)]),
+        np.concatenate([groups.points_mm, *(points for points, _ in wider)]),
+        np.concatenate([blurred, *(covariances for _, covariances in wider)]),
         sizes,
         size_sd=_SILHOUETTE_SIZE_SD,
     )

@@ -79,9 +79,6 @@ class Bodies(Rows):
             nan(3, 3), nan(6, 6), nan(), nan(3), nan(2), nan(), np.zeros(count, bool), nan(),
         )  # fmt: skip
 
-    def __len__(self) -> int:
-        return len(self.used)
-
     @property
     def sd_eq_mm(self) -> Array:
         """Standard deviation (B,) of d_eq_mm."""

@@ -59,9 +59,6 @@ class Sightings(Rows):
     entire: Bools
     whole: Bools
 
-    def __len__(self) -> int:
-        return len(self.camera)
-
     @property
     def all_whole(self) -> Bools:
         """Whether the outlines of (..., n) views are all whole (...)."""

@@ -321,9 +321,6 @@ class States(Rows):
             np.full(many, scan.t_s), np.ones(many, np.int64),
         )  # fmt: skip
 
-    def __len__(self) -> int:
-        return len(self.x)
-
     @property
     def points_mm(self) -> Array:
         """Positions (K, 3) in the rig frame."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints, Rows
 from telerig.estimator.bubbles.outline.ellipse_geometry import columns, flag_words
-from telerig.estimator.bubbles.pairing.groups import Candidates, View
+from telerig.estimator.bubbles.pairing.groups import Groups, Rays, View
 from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.bubbles.shape.sightings import Sightings, sightings_from_table
 from telerig.rig.camera import Camera
@@ -52,9 +52,6 @@ class Seen(Rows):
             sightings_from_table(table, camera, cameras), centre,
             view.covariance_px2[:, 0, 0] - centre[:, 2], a, d_eq, given_ids(table), flags,
         )  # fmt: skip
-
-    def __len__(self) -> int:
-        return len(self.given)
 
 
 def given_ids(table: pd.DataFrame) -> Ints:
@@ -108,9 +105,6 @@ class Bubbles(Rows):
             points_mm, covariance_mm2, d_eq_mm, none, none.copy(),
         )  # fmt: skip
 
-    def __len__(self) -> int:
-        return len(self.rows)
-
     @property
     def alone(self) -> Bools:
         """Whether one camera alone sees the bubble (M,)."""
@@ -119,30 +113,31 @@ class Bubbles(Rows):
 
 @dataclass(frozen=True)
 class Sight:
-    """Hold what one frame shows: its detections, their possible groups (G), and the bodies (G) of
-    those that are likely without tracks, or chosen."""
+    """Hold what one frame shows: its detections, together and by themselves, their possible groups
+    (G), and the bodies (G) of those that are likely without tracks, or chosen."""
 
     seen: Seen
-    candidates: Candidates
+    rays: Rays
+    groups: Groups
     bodies: Bodies
 
-    def groups(self, chosen: Ints) -> Bubbles:
-        """Return some of the groups as bubbles."""
-        found = self.candidates.groups
-        first = np.searchsorted(self.seen.sightings.camera, np.arange(found.rows.shape[1]))
-        rows = moved(found.rows[chosen], first)
+    def together(self, chosen: Ints, groups: Groups) -> Bubbles:
+        """Return M groups as bubbles. chosen : (M,) their positions among all."""
+        first = np.searchsorted(self.seen.sightings.camera, np.arange(groups.rows.shape[1]))
+        rows = moved(groups.rows, first)
         given = np.append(self.seen.given, NO_PARTICLE)[rows].max(1)
         sizes = self.bodies.d_eq_mm[chosen]
-        points, covariances = found.points_mm[chosen], found.covariance_mm2[chosen]
-        return replace(Bubbles.of(rows, points, covariances, given, sizes), body=chosen)
+        bubbles = Bubbles.of(rows, groups.points_mm, groups.covariance_mm2, given, sizes)
+        sure, unsure = groups.probability, groups.ambiguous
+        return replace(bubbles, body=chosen, confidence=sure, ambiguous=unsure)
 
-    def rays(self, offset_px: Array) -> Bubbles:
+    def alone(self, offset_px: Array) -> Bubbles:
         """Return each detection as a bubble that no other camera sees: a point of unknown depth.
 
         offset_px : (C, 2) shift of all detections of each camera.
         """
         camera = self.seen.sightings.camera
-        points, covariances, by_pixel = map(np.concatenate, zip(*self.candidates.rays))
+        points, covariances, by_pixel = map(np.concatenate, zip(*self.rays))
         points = points - (by_pixel @ offset_px[camera, :, None])[..., 0]
         mm_per_px = np.linalg.det(by_pixel.mT @ by_pixel) ** 0.25
         rows = np.full((len(camera), len(offset_px)), -1)
@@ -183,7 +178,7 @@ class Frame:
 
     tables : its detections in each camera. seen : the same as arrays.
     offset_px : (C, 2) for each camera the shift of all detections, because the cameras shake.
-    rays : each detection by itself, as `Sight.rays` returns them.
+    rays : each detection by itself, as `Sight.alone` returns them.
     bubbles : those that several cameras see, and those that one camera alone sees.
     bodies : the bodies of some of the bubbles.
     motion : motion of all bubbles since the frame before; None for the first frame.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -96,16 +96,16 @@ class RowMaker:
         seen = Seen.concat(every).take(np.argsort(frame, kind="stable"))
         of_camera, start = np.cumsum(counts, axis=1) - counts, np.cumsum([0, *counts.sum(1)])
         rows = np.concatenate([
-            moved(one.groups.rows, first + begin)
-            for one, first, begin in zip(found, of_camera, start)
+            moved(groups.rows, first + begin)
+            for (groups, _), first, begin in zip(found, of_camera, start)
         ])  # fmt: skip
-        likely = np.flatnonzero(np.concatenate([f.probability for f in found]) > _LIKELY)
+        likely = np.flatnonzero(np.concatenate([g.probability for g, _ in found]) > _LIKELY)
         bodies = Bodies.none(*rows.shape)
         self._fit(bodies, likely, seen, rows[likely])
-        ends = np.cumsum([0, *map(len, found)])
+        ends = np.cumsum([0, *(len(groups) for groups, _ in found)])
         return [
-            Sight(seen.take(slice(*own)), one, bodies.take(slice(*groups)))
-            for own, one, groups in zip(pairwise(start), found, pairwise(ends))
+            Sight(seen.take(slice(*own)), rays, groups, bodies.take(slice(*these)))
+            for own, (groups, rays), these in zip(pairwise(start), found, pairwise(ends))
         ]
 
     def add(
@@ -234,14 +234,13 @@ def grouped_frame(
     the bubbles that all cameras see; 0 if there are fewer than three. It is taken off what fewer
     cameras see, so that their points agree with those of the others.
     """
-    found = match(sight.candidates, model, predicted)
-    groups = sight.groups(found.candidate)
-    bubbles = replace(groups, confidence=found.confidence, ambiguous=found.ambiguous)
+    chosen, groups = match(sight.groups, sight.rays, model, predicted)
+    bubbles = sight.together(chosen, groups)
     part = (bubbles.rows < 0).any(1)
     offset = np.zeros((len(model.cameras), 2))
     if np.sum(~part) >= _LEAST_FOR_OFFSET:
-        offset = np.median(sight.candidates.groups.left_px[found.candidate][~part], axis=0)
-    rays = sight.rays(offset)
+        offset = np.median(groups.left_px[~part], axis=0)
+    rays = sight.alone(offset)
     for k in np.flatnonzero(part) if offset.any() else ():
         own = bubbles.rows[k, bubbles.rows[k] >= 0]
         bubbles.points_mm[k] = fused(rays.points_mm[own], rays.covariance_mm2[own])[0]

@@ -49,7 +49,7 @@ def test_confidence_comes_true_and_history_helps_where_all_look_alike() -> None:
     frames = [m[0] for m in made]
     model = learn_rig(frames, rig())
     pairs = [match_tables((a, b), model) for a, b in frames]
-    confidence = np.concatenate([p.confidence for p in pairs])
+    confidence = np.concatenate([p.probability for p in pairs])
     right = np.concatenate([truth(f, p) for f, p in zip(frames, pairs)])
     unsure = confidence < 0.95
     assert unsure.sum() > 20, "the scene must be hard for this test to mean something"
@@ -126,13 +126,13 @@ def test_two_alike_at_one_height_are_never_a_guess() -> None:
     tables = [table(c.project(points)) for c in cameras]
     pairs = match_tables(tables, default_model(cameras))
     assert pairs.rows.tolist() == [[2, 2]], "each pair of the two is as probable as not"
-    assert pairs.confidence[0] > 0.95 and not pairs.ambiguous[0]
+    assert pairs.probability[0] > 0.95 and not pairs.ambiguous[0]
     track = Prediction(
         np.array([7, 8]), points[:2], np.tile(0.04 * np.eye(3), (2, 1, 1)), np.full(2, 1.6)
     )
     known = match_tables(tables, default_model(cameras), predicted=track)
     np.testing.assert_array_equal(known.rows[:, 0], known.rows[:, 1])
-    assert (known.confidence > 0.95).all() and not known.ambiguous.any()
+    assert (known.probability > 0.95).all() and not known.ambiguous.any()
 
 
 def test_size_and_contrast_decide_where_the_gap_cannot() -> None:
@@ -166,7 +166,7 @@ def test_the_order_of_rows_does_not_matter() -> None:
     order = rng.permutation(len(second))
     two = match_tables((first, second.iloc[order]), model)
     np.testing.assert_array_equal(order[two.rows[:, 1]], one.rows[:, 1])
-    np.testing.assert_allclose(two.confidence, one.confidence, rtol=1e-9)
+    np.testing.assert_allclose(two.probability, one.probability, rtol=1e-9)
 
 
 # Bad input

@@ -24,8 +24,7 @@ class Bodies(Rows):
 
     points_mm, covariance_mm2 : (B, 3), (B, 3, 3) centre of volume; the covariance includes the part
         of the shape that the outlines do not determine.
-    silhouette_points_mm, silhouette_covariance_mm2 : (B, 3), (B, 3, 3) triangulated centres of the
-        outlines, with the covariance of the outlines' noise alone.
+    silhouette_points_mm : (B, 3) triangulated centres of the outlines.
     used : (B,) "volume": points_mm is corrected for the shape. "silhouettes": it is not, because
         harmonics are unknown, an outline is incomplete, or the rays pass farther apart than the
         bubble is large. "none": fewer than two centres are known, and the row is NaN.
@@ -44,13 +43,11 @@ class Bodies(Rows):
         the size alone) and by the mean square of what is not seen of the shape.
     chi2 : (B,) misfit of a spheroid with t = 0, with 3 n - 4 degrees of freedom of n views.
     entire : (B,) whether nothing of any of the outlines is missing.
-    zonal_probability : (B,) posterior probability of the axisymmetric model of degree 3.
     """
 
     points_mm: Array
     covariance_mm2: Array
     silhouette_points_mm: Array
-    silhouette_covariance_mm2: Array
     used: NDArray[np.str_]
     shift_px: Array
     shift_covariance_px2: Array
@@ -64,7 +61,6 @@ class Bodies(Rows):
     fixed: Array
     chi2: Array
     entire: Bools
-    zonal_probability: Array
 
     @staticmethod
     def none(count: int, cameras: int) -> Bodies:
@@ -74,9 +70,9 @@ class Bodies(Rows):
             return np.full((count, *shape), np.nan)
 
         return Bodies(
-            nan(3), nan(3, 3), nan(3), nan(3, 3), np.full(count, "none", "<U11"),
+            nan(3), nan(3, 3), nan(3), np.full(count, "none", "<U11"),
             np.zeros((count, cameras, 2)), np.zeros((count, cameras, 2, 2)), nan(), nan(), nan(),
-            nan(3, 3), nan(6, 6), nan(), nan(3), nan(2), nan(), np.zeros(count, bool), nan(),
+            nan(3, 3), nan(6, 6), nan(), nan(3), nan(2), nan(), np.zeros(count, bool),
         )  # fmt: skip
 
     @property
@@ -123,7 +119,7 @@ def fit_bodies(
         points, noise, miss = views.triangulated
         bodies._put(
             rows, points_mm=points, covariance_mm2=noise, silhouette_points_mm=points,
-            silhouette_covariance_mm2=noise, used="silhouettes", ray_miss_mm=miss,
+            used="silhouettes", ray_miss_mm=miss,
         )  # fmt: skip
         shaped = views.inside() & views.sightings.shaped.any(-1)
         if not shaped.any():
@@ -137,7 +133,7 @@ def fit_bodies(
         bodies._put(
             rows, points_mm=points[shaped] + np.where(known[:, None], centre.step_mm, 0.0),
             covariance_mm2=centre.covariance_mm2,
-            used=np.where(known, "volume", "silhouettes"), zonal_probability=centre.zonal,
+            used=np.where(known, "volume", "silhouettes"),
             d_eq_mm=2 * np.exp(shape.value[:, 0]), aspect=np.exp(shape.value[:, 1]),
             frame=shape.frame, shape_covariance=shape.covariance, chi2=shape.chi2,
             stretch=stretch, noise=np.column_stack([noise, own]), fixed=shape.fixed,

@@ -35,14 +35,12 @@ class Centre:
     covariance_mm2 : (B, 3, 3) of the step.
     shift_px, shift_covariance_px2 : (B, n, 2), (B, n, 2, 2) projected centre of volume minus the
         outline's centre, and its covariance.
-    zonal : (B,) probability of the axisymmetric model.
     """
 
     step_mm: Array
     covariance_mm2: Array
     shift_px: Array
     shift_covariance_px2: Array
-    zonal: Array
 
 
 def volume_centre(views: Views, shape: Shape, shapes: Shapes, gap_sigma_px: float) -> Centre:
@@ -78,7 +76,7 @@ def volume_centre(views: Views, shape: Shape, shapes: Shapes, gap_sigma_px: floa
     each = np.arange(n)
     blocks = spread[:, : 2 * n, : 2 * n].reshape(count, n, 2, n, 2)[:, each, :, each]
     shift = (conversion - effect_px[:, : 2 * n]).reshape(count, n, 2)
-    return Centre(step, covariance, shift, np.moveaxis(blocks, 0, 1), weight[1])
+    return Centre(step, covariance, shift, np.moveaxis(blocks, 0, 1))
 
 
 def _mixed(

@@ -16,6 +16,7 @@ from places import ROOT
 from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre
 
+from telerig.estimator.bubbles.outline.ellipse_geometry import centre_covariances
 from telerig.estimator.bubbles.shape.body import Bodies
 from telerig.estimator.bubbles.shape.learning import learn_shapes
 from telerig.estimator.bubbles.shape.shapes import DEFAULT_SHAPES, Shapes
@@ -26,6 +27,7 @@ from telerig.rig.pose import Pose
 from telerig.rig.triangulation import triangulate
 
 Array = NDArray[np.float64]
+BARE = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 
 
 def _load_benchmark() -> ModuleType:
@@ -196,7 +198,7 @@ def test_one_bad_row_harms_no_other(measured: tuple[pd.DataFrame, pd.DataFrame, 
     assert np.isnan(found.points_mm[[2, 4, 5]]).all()
     spread, noise = (
         np.trace(c[[0, 1, 6]], axis1=1, axis2=2)
-        for c in (found.covariance_mm2, found.silhouette_covariance_mm2)
+        for c in (found.covariance_mm2, fit(spoilt[BARE], second[BARE]).covariance_mm2)
     )
     assert np.all(spread > 3 * noise)
 
@@ -258,10 +260,13 @@ def test_no_pairs_and_bare_positions(measured: tuple[pd.DataFrame, pd.DataFrame,
     first, second, _ = measured
     empty = fit(first[:0], second[:0])
     assert empty.points_mm.shape == (0, 3) and empty.used.shape == (0,)
-    bare = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
-    found = fit(first[bare], second[bare])
+    found = fit(first[BARE], second[BARE])
     assert set(found.used) == {"silhouettes"}
-    assert np.array_equal(found.covariance_mm2, found.silhouette_covariance_mm2)
+    pixels = [table[["u_px", "v_px"]].to_numpy() for table in (first, second)]
+    spread = [centre_covariances(t) + 1e-6 * np.eye(2) for t in (first, second)]  # the least
+    plain = triangulate(bodies.rig(), (pixels[0], pixels[1]), (spread[0], spread[1]))
+    off = np.abs(found.covariance_mm2 - plain.covariance_mm2)
+    assert off.max() < 1e-6 * plain.covariance_mm2.max()
     assert np.isnan(found.d_eq_mm).all()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.bubbles.background.screen import screen_level
 from telerig.estimator.bubbles.field import lit_field
 from telerig.estimator.bubbles.flat_field import (
@@ -169,7 +169,7 @@ def find_bubbles(
     """
     image = checked_image(image, min_diameter_px, min_contrast)
     shadows = background is None
-    reason = nothing_to_see(image)
+    reason, gain = nothing_to_see(image), 1.0
     if reason:
         return _bubbles({}, [], np.nan, reason)
     if background is not None:
@@ -177,14 +177,14 @@ def find_bubbles(
         gain = brightness(image, background, field)
         if not gain > LEAST_BRIGHTNESS:
             return _bubbles({}, [], np.nan, f"the screen has {gain:.0%} of its usual brightness")
-        background = background * np.float32(gain)
     elif field is None:
         field = lit_field(image)
     if field is not None:
         background = screen_level(image, field) if background is None else background
-        outside = np.minimum(background, image.max())
+        outside = np.minimum(background * np.float32(gain), image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
-    found = _found(image, background, field, min_diameter_px, min_contrast, shadows)
+    ratio, clipped = normalised(image, background, gain)
+    found = _found(ratio, clipped, field, min_diameter_px, min_contrast, shadows)
     if shadows:
         found = _without_bright_spots(found, image, field)
     merged = (
@@ -197,14 +197,13 @@ def find_bubbles(
 
 
 def _found(
-    image: NDArray[Any],
-    background: NDArray[Any] | None,
+    ratio: Float32,
+    clipped: bool,
     field: Bools | None,
     min_diameter_px: float,
     min_contrast: float,
     shadows: bool,
 ) -> Bubbles:
-    ratio, clipped = normalised(image, background)
     noise = noise_shares(ratio, field)
     sigma = float(noise[0])
     blobs, rejected = find_blobs(
@@ -212,16 +211,19 @@ def _found(
     )
     hearts = [blob for blob in blobs if blob.within]
     blobs = [blob for blob in blobs if not blob.within]
-    parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
+    parts = split_blobs(blobs, ratio.shape, min_diameter_px=min_diameter_px)
     parts, slender = _without_slender(parts)
     rejected += slender
     clusters: list[Array] = []
     fitted = partial(fit_outlines, ratio, noise=noise, shadows=shadows)
-    parts, outlines = _divided(
-        blobs, parts, fitted(_start(parts, blobs)), fitted, ratio.shape, min_diameter_px
-    )
     start = _start(parts, blobs)
-    merged = _merged(outlines, parts)
+    outlines = fitted(start)
+    odd, bent = implausible_outlines(outlines)
+    again = _divided(blobs, parts, outlines, odd, fitted, ratio.shape, min_diameter_px)
+    if again is not None:
+        parts, outlines = again
+        start, (odd, bent) = _start(parts, blobs), implausible_outlines(outlines)
+    merged = _merged(odd, outlines, parts)
     known = ~merged & np.isfinite(outlines.ellipse).all(axis=1)
     known &= outlines.coverage > _KNOWN_COVERAGE
     seen = ratio.size if field is None else np.count_nonzero(field)
@@ -258,11 +260,15 @@ def _found(
         start = Outlines.concat([start.take(kept), own_start])
         outlines = Outlines.concat([outlines.take(kept), settled(fit, every)])
         # In a crowd it is rather a neighbour in front that bends an outline than a second bubble.
-        new = implausible_outlines(outlines)[0][-len(fit) :] & (not whole)
-        merged = np.concatenate([merged[kept], new])
+        odd, bent = implausible_outlines(outlines)
+        merged = np.concatenate([merged[kept], odd[-len(fit) :] & (not whole)])
     elif whole:
-        start, outlines = start.take(kept), outlines.take(kept)
-        merged = merged[kept]
+        start, outlines, merged, bent = (
+            start.take(kept),
+            outlines.take(kept),
+            merged[kept],
+            bent[kept],
+        )
     if not len(start):
         nothing = _bubbles({}, rejected, sigma, "no shadow dark and large enough")
         return replace(nothing, clusters=clusters)
@@ -270,12 +276,10 @@ def _found(
     # that is known of a bubble of a merged outline is that it is somewhere in it.
     inside = radius_px(outlines)[:, None, None] ** 2 / 4.0 * np.eye(2)
     covariance = inside @ np.linalg.inv(outlines.covariance_px2 + inside) @ outlines.covariance_px2
-    bent = implausible_outlines(outlines)[1][:, None, None] * np.eye(2)
-    within = np.where(merged[:, None, None], inside, bent)
+    within = np.where(merged[:, None, None], inside, bent[:, None, None] * np.eye(2))
     outlines = outlines.changed(covariance_px2=covariance + within)
-    defocused = _defocused(outlines)
-    judged = {"defocus": defocused, "merged": merged}
-    columns = _columns(outlines, judged, image.shape, field, clipped)
+    columns = _columns(outlines)
+    columns["flags"] = _flags(outlines, merged, ratio.shape, field, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])
     rejected += [
@@ -385,39 +389,38 @@ def _divided(
     blobs: list[Blob],
     parts: list[Part],
     outlines: Outlines,
+    odd: Bools,
     fitted: Callable[..., Outlines],
     shape: tuple[int, ...],
     min_diameter_px: float,
-) -> tuple[list[Part], Outlines]:
-    """Return the parts of an image and their outlines; those along a whole dark region that no
-    single bubble has are divided where several fit and are seen well."""
-    unlike = implausible_outlines(outlines)[0] | fits_badly(outlines)
+) -> tuple[list[Part], Outlines] | None:
+    """Return the parts of an image and their outlines, those along a whole dark region that no
+    single bubble has divided where several fit and are seen well; None if there are none such.
+
+    odd : (B,) which outlines are implausible.
+    """
     again = [
         new
-        for part, odd in zip(parts, unlike.tolist(), strict=True)
-        if odd and not (part.merged or part.shared or blobs[part.blob].touches_border)
+        for part, unlike in zip(parts, (odd | fits_badly(outlines)).tolist(), strict=True)
+        if unlike and not (part.merged or part.shared or blobs[part.blob].touches_border)
         for new in split_where_flat(blobs[part.blob], part.blob, shape, min_diameter_px)
     ]
     if not again:
-        return parts, outlines
+        return None
     one, several = (np.array([part.blob for part in some]) for some in (parts, again))
     others = outlines.take(~np.isin(one, several))
     fit = fitted(_start(again, blobs), beside=others)
     bad = implausible_outlines(Outlines.concat([others, fit]))[0][len(others) :]
     bad |= fits_badly(fit) | ~(fit.coverage > _KNOWN_COVERAGE)
     sound = ~np.isin(several, several[bad])
+    if not np.any(sound):
+        return None
     kept = np.concatenate([~np.isin(one, several[sound]), sound])
     parts = [part for part, good in zip([*parts, *again], kept.tolist(), strict=True) if good]
     return parts, Outlines.concat([outlines, fit]).take(kept)
 
 
-def _columns(
-    outlines: Outlines,
-    judged: dict[str, Bools],
-    shape: tuple[int, ...],
-    field: Bools | None,
-    clipped: bool,
-) -> dict[str, Any]:
+def _columns(outlines: Outlines) -> dict[str, Any]:
     ellipse, covariance = outlines.ellipse, outlines.covariance_px2
     area, _ = outline_moments(ellipse, outlines.harmonics)
     columns: dict[str, Any] = {
@@ -435,7 +438,6 @@ def _columns(
         "edge_px": blur_px(outlines),
         "chi2_dof": outlines.chi2_dof,
         "sigma_outline_px": outlines.sigma_outline_px,
-        "flags": _flags(outlines, judged, shape, field, clipped),
     }
     # A half turn of the axes changes the sign of the odd orders.
     turned = np.cos(ellipse[:, 4] - columns["angle_rad"]) < 0.0
@@ -449,7 +451,7 @@ def _columns(
 
 def _flags(
     outlines: Outlines,
-    judged: dict[str, Bools],
+    merged: Bools,
     shape: tuple[int, ...],
     field: Bools | None,
     clipped: bool,
@@ -473,9 +475,9 @@ def _flags(
     hidden[other[np.any(gap < 0.0, axis=1)]] = True
     words = {
         "border": border,
-        "defocus": judged["defocus"],
+        "defocus": _defocused(outlines),
         "overlap": hidden,
-        "merged": judged["merged"],
+        "merged": merged,
         "small": ellipse[:, 3] < _SMALL_EDGES * np.hypot(blur, 0.29),
         "saturated": np.full(len(ellipse), clipped),
     }
@@ -483,14 +485,13 @@ def _flags(
     return np.array(flags, dtype=object)
 
 
-def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
+def _merged(odd: Bools, outlines: Outlines, parts: list[Part]) -> Bools:
     """Return (B,) whether each outline belongs to merged bubbles.
 
     This is so for blobs that could not be split and for implausible outlines. If one part of a blob
     is implausible, then so are all parts of it of which less than 60 % of the outline is visible.
     """
-    merged: Bools = np.array([part.merged for part in parts], np.bool_)
-    merged = merged | implausible_outlines(outlines)[0]
+    merged: Bools = odd | np.array([part.merged for part in parts], np.bool_)
     own = np.array([part.blob for part in parts], np.intp)
     return np.asarray(merged | (np.isin(own, own[merged]) & (outlines.coverage < _MOSTLY_SEEN)))
 

@@ -84,12 +84,19 @@ def full_scale(image: NDArray[Any]) -> float:
     return next((float(2**bits - 1) for bits in (10, 12, 14) if high <= 2**bits - 1), 65535.0)
 
 
-def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Float32, bool]:
-    """Return the image divided by its background, and whether the screen is clipped (saturated)."""
+def normalised(
+    image: NDArray[Any], background: NDArray[Any] | None, gain: float = 1.0
+) -> tuple[Float32, bool]:
+    """Return the image divided by its background, and whether the screen is clipped (saturated).
+
+    gain : brightness of the lit screen relative to the background.
+    """
     screen = screen_level(image) if background is None else background
-    floor = np.float32(1e-6 * float(image.max()) + 1e-12)
-    screen = np.maximum(screen.astype(np.float32, copy=False), floor)
-    ratio = np.asarray(cv2.divide(_divisible(image), screen, dtype=cv2.CV_32F), np.float32)
+    screen, floor = screen.astype(np.float32, copy=False), 1e-6 * float(image.max()) + 1e-12
+    if float(screen.min()) < floor:
+        screen = np.maximum(screen, np.float32(floor))
+    quotient = cv2.divide(_divisible(image), screen, scale=1.0 / gain, dtype=cv2.CV_32F)
+    ratio = np.asarray(quotient, np.float32)
     sample = image[::8, ::8]
     clipped = bool(
         image.dtype.kind in "ui"

@@ -253,14 +253,14 @@ def notch_arcs(contour: Array) -> list[Array]:
         return []
     sense = _sense(contour[inside])
     if np.all(inside):
-        return _cut_closed(contour, sense)
+        return _cut(contour, sense, closed=True)
     turn = int(np.argmin(inside))
     contour, inside = np.roll(contour, -turn, axis=0), np.roll(inside, -turn)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
     return [
         arc
         for low, high in zip(edges[::2], edges[1::2], strict=True)
-        for arc in _cut_open(contour[low:high], sense)
+        for arc in _cut(contour[low:high], sense, closed=False)
     ]
 
 
@@ -295,7 +295,7 @@ def _turning(points: Array, arm: int) -> Array:
     return np.asarray(np.arctan2(cross, np.sum(back * ahead, axis=1)))
 
 
-def _notches(turn: Array, arm: int, most_rad: float = _TURN_RAD) -> list[int]:
+def _notches(turn: Array, arm: int, most_rad: float) -> list[int]:
     """Return where an outline turns by less than ``most_rad``; of places nearer than ``arm`` the
     one that turns least."""
     found, near = [], np.zeros(turn.size, np.bool_)
@@ -308,31 +308,24 @@ def _notches(turn: Array, arm: int, most_rad: float = _TURN_RAD) -> list[int]:
     return sorted(found)
 
 
-def _cut_closed(contour: Array, sense: float, *, flat: bool = False) -> list[Array]:
-    """Cut a closed outline at its notches, or wherever it is flat."""
-    points = _spaced(contour, closed=True)
-    arm = _arm(points)
-    if len(points) < 4 * arm:
-        return [points]
-    most_rad = _FLAT * 2.0 * np.pi * arm / len(points) if flat else _TURN_RAD
-    notches = _notches(sense * _turning(points, arm), arm, most_rad)
-    if not notches:
-        return [points]
-    points = np.roll(points, -notches[0], axis=0)
-    bounds = [k - notches[0] for k in notches] + [len(points)]
-    return _trimmed(points, bounds)
-
-
-def _cut_open(contour: Array, sense: float) -> list[Array]:
+def _cut(contour: Array, sense: float, *, closed: bool, flat: bool = False) -> list[Array]:
+    """Cut an outline at its notches, or wherever it is flat."""
     if len(contour) < _SHORTEST_ARC:
         return []
-    points = _spaced(contour, closed=False)
+    points = _spaced(contour, closed=closed)
     arm = _arm(points)
     if len(points) < 4 * arm:
         return [points]
     turn = sense * _turning(points, arm)
-    turn[:arm] = turn[-arm:] = 0.0
-    return _trimmed(points, [0, *_notches(turn, arm), len(points)])
+    if not closed:
+        turn[:arm] = turn[-arm:] = np.inf
+    notches = _notches(turn, arm, _FLAT * 2.0 * np.pi * arm / len(points) if flat else _TURN_RAD)
+    if closed and not notches:
+        return [points]
+    if closed:
+        points = np.roll(points, -notches[0], axis=0)
+        notches = [k - notches[0] for k in notches[1:]]
+    return _trimmed(points, [0, *notches, len(points)])
 
 
 def _trimmed(points: Array, bounds: list[int]) -> list[Array]:
@@ -408,7 +401,7 @@ def split_where_flat(
     index : of the region. Returns its bubbles, one for each arc; [] if they do not explain it.
     """
     contour = _in_image(blob)
-    arcs = _cut_closed(contour, _sense(contour), flat=True)
+    arcs = _cut(contour, _sense(contour), closed=True, flat=True)
     good = _explained(arcs, contour, shape, min_diameter_px) if len(arcs) <= _MAX_ARCS else []
     return [Part(ellipse, index, shared=True) for ellipse in good] if len(good) > 1 else []
 

@@ -228,8 +228,9 @@ def implausible_outlines(outlines: Outlines) -> tuple[Bools, Array]:
     odd = np.max(power / (spread**2 + own2), axis=1) > _ODD**2
     bad = fits_badly(outlines)
     beyond = 2.0 * np.sum(np.maximum(power - spread**2, 0.0), axis=1) * radius2
-    merged = (odd | _concave(outlines)) & bad
-    return merged | missed_rims(outlines), np.where(bad, beyond, 0.0)
+    if np.any(bad):
+        odd[bad] |= _concave(outlines.take(bad))
+    return (odd & bad) | missed_rims(outlines), np.where(bad, beyond, 0.0)
 
 
 def _concave(outlines: Outlines) -> Bools:

@@ -71,6 +71,9 @@ class Disagreement(StrEnum):
     BIAS = "bias"
     DELAY = "delay"
     SPEED = "speed"
+    SHIFT = "shift"
+    TURN = "turn"
+    GROWTH = "growth"
 
 
 class Quantity(StrEnum):
@@ -156,6 +159,9 @@ class Contradiction(Part):
     statistic : how many times larger than expected the disagreement is, in standard deviations.
     test : the test that showed the disagreement; None in files of other programs.
     against : the sources with which this one disagrees; () if they are not known.
+    camera : the camera in whose images it shows; "" if not in those of one alone.
+    hz : frequency of a motion that the images of this camera share; None for one from ``from_s``
+        on, and for other tests.
     """
 
     source: str
@@ -165,6 +171,8 @@ class Contradiction(Part):
     statistic: float
     test: Disagreement | None = None
     against: tuple[str, ...] = ()
+    camera: str = ""
+    hz: float | None = None
 
 
 class Use(Part):

@@ -193,6 +193,13 @@ _WORDS_OF_TEST = {
     "be wrong",
     Disagreement.DELAY: "the delay is {factor} standard deviations from the stated one",
     Disagreement.SPEED: "the bubbles' mean speed is {factor} times the highest possible one",
+    Disagreement.SHIFT: "their images in camera {camera} shift together{hz} against the rest, "
+    "{factor} standard deviations more than noise; was a camera touched, or does what it looks "
+    "through move?",
+    Disagreement.TURN: "their images in camera {camera} turn together{hz}, {factor} standard "
+    "deviations more than noise; did the camera roll?",
+    Disagreement.GROWTH: "their images in camera {camera} grow or shrink together{hz}, {factor} "
+    "standard deviations more than noise; was the camera refocused or moved?",
 }
 
 
@@ -205,7 +212,9 @@ def words_of_contradiction(one: Contradiction) -> str:
     why = ""
     if one.test is not None:
         factor = f"{one.statistic:.2g}" if one.statistic < 100 else f"{one.statistic:.0f}"
-        why = f" ({one.source}: {_WORDS_OF_TEST[one.test].format(factor=factor)})"
+        hz = "" if one.hz is None else f" at {one.hz:.3g} Hz"
+        text = _WORDS_OF_TEST[one.test].format(factor=factor, camera=one.camera, hz=hz)
+        why = f" ({one.source}: {text})"
     return f"{who}{axis} from {one.from_s:.3g} s to {one.to_s:.3g} s{why}."
 
 

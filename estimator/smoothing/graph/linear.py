@@ -183,6 +183,14 @@ def white_noise(graph: GraphLayout, most: float = np.inf) -> Array:
     return out
 
 
+def pixel_whiteners(graph: GraphLayout, covariance_px2: Array, noise: Array) -> Array:
+    """Return the matrices (n, 2, 2) that whiten pixels with stated covariances (n, 2, 2).
+
+    noise : (n or none, 2, 2) factor from the stated noise to that which is white.
+    """
+    return whitener_of(noise @ covariance_px2 @ noise) / graph.model.pixel_inflation
+
+
 def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
     """Return the factors of the bubbles' M pixels.
 
@@ -281,8 +289,7 @@ def _one_camera(
 ) -> LinearFactors:  # fmt: skip
     """Return factors of some pixels of one camera; at_frames : (F, D) states of the shake."""
     problem, layout, frame = graph.problem, graph.shake, obs.frame[mine]
-    white = moving.noise @ obs.covariance_px2[mine] @ moving.noise
-    w = whitener_of(white) / graph.model.pixel_inflation
+    w = pixel_whiteners(graph, obs.covariance_px2[mine], moving.noise)
     shake = at_frames[frame]
     gain = 1 / (1 + state.encoder_scale(graph))
     position = gain * (shake @ layout.position)

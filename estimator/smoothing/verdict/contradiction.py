@@ -2,9 +2,10 @@
 
 If they do, no standard deviation of the result can be right. Tested are the squared residuals
 against those expected from the model (`graph.draws`), by source, axis and time window; biases and
-delays against their priors; and the bubbles' speed against a limit. If a test fails, the run is
-solved again with each source left out in turn. The source whose removal resolves the contradiction
-is named, and the standard deviations are enlarged to cover the difference of the two results.
+delays against their priors; the bubbles' speed against a limit; and what the residuals of one
+camera share (`shared`). If a test fails, the run is solved again with each source left out in turn.
+The source whose removal resolves the contradiction is named, and the standard deviations are
+enlarged to cover the difference of the two results.
 
 Only the residuals of pixels and encoder readings are tested. Bubbles that are livelier than their
 prior (20 instead of 10 mm/s) raise the squared residuals of the motion prior to 2.3 times the
@@ -73,6 +74,7 @@ def _of_one(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
     yield from _constants(solution, evidence)
     yield from _speeds(solution, evidence)
     yield from residual_contradictions(evidence)
+    yield from _shared(evidence)
 
 
 def _outliers(evidence: Evidence) -> Iterator[Contradiction]:
@@ -119,6 +121,15 @@ def _speeds(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
             source=BUBBLES if problem.stage is None else ENCODER, axis=AXES[axis],
             from_s=evidence.times_s[0], to_s=evidence.times_s[1],
             statistic=float(abs(speed[axis]) / HIGHEST_SPEED_MM_S), test=Disagreement.SPEED,
+        )  # fmt: skip
+
+
+def _shared(evidence: Evidence) -> Iterator[Contradiction]:
+    """Yield what the residuals of one camera share."""
+    for source, one in evidence.shared.items():
+        yield Contradiction(
+            source=source, camera=one.camera, from_s=one.from_s, to_s=one.to_s, hz=one.hz,
+            statistic=one.sigmas, test=Disagreement(one.motion),
         )  # fmt: skip
 
 
@@ -221,6 +232,7 @@ def _blamed(
             continue
         sums = Evidence.of(other, drawn(other))
         misfit = [*_outliers(sums), *_constants(other, sums), *residual_contradictions(sums)]
+        misfit += _shared(sums)
         off = sum(f.statistic for f in misfit)
         if off < best[0]:
             best = off, names, other

@@ -18,6 +18,7 @@ from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.linear import encoder, white_noise
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
+from telerig.estimator.smoothing.verdict.shared import Shared, shared_motion
 from telerig.estimator.smoothing.verdict.whiteness import Lagged, lagged
 
 AXES = ("x", "y", "z")
@@ -205,6 +206,7 @@ class Evidence:
     shake : None without a shake in the model.
     nodes : number of times at which the shake is estimated.
     passes : number of iterations of the solver.
+    shared : motions that the residuals of one camera share, by source.
     """
 
     times_s: tuple[float, float]
@@ -217,6 +219,7 @@ class Evidence:
     shake: Shake | None
     nodes: int
     passes: int
+    shared: Mapping[str, Shared]
 
     @classmethod
     def of(cls, solution: Solution, draws: Draws, span: Span | None = None) -> Evidence:
@@ -227,13 +230,19 @@ class Evidence:
         """
         span = span or Span.whole(solution)
         tallies = {(t.source, t.axis): t for t in _tallies(solution, draws, span)}
-        nodes = solution.graph.nodes
+        nodes, pieces = solution.graph.nodes, len(span.t_s) / max(len(span.own), 1)
+        shared = {
+            source: found
+            for source, drawn in ((BUBBLES, draws.pixels), (MARKS, draws.marks))
+            if (found := shared_motion(solution, source, drawn, span.own, pieces)) is not None
+        }
         return cls(
             (float(span.t_s[0]), float(span.t_s[-1])), span.window_s, tallies,
             _pixels(solution, span),
             lagged(solution, draws, span.holds(solution.graph.problem.observations.frame)),
             _lost(solution, span), _means(solution, span),
             shake_of(solution, span), int(np.count_nonzero(span.spans(nodes.t_s))), solution.passes,
+            shared,
         )  # fmt: skip
 
     def __add__(self, other: Evidence) -> Evidence:
@@ -242,6 +251,10 @@ class Evidence:
             if particle not in means or mean.frames > means[particle].frames:
                 means[particle] = mean
         shake = [s for s in (self.shake, other.shake) if s is not None]
+        shared = dict(self.shared)
+        for source, found in other.shared.items():
+            if source not in shared or found.sigmas > shared[source].sigmas:
+                shared[source] = found
         return replace(
             self,
             tallies=_added(self.tallies, other.tallies),
@@ -252,6 +265,7 @@ class Evidence:
             shake=reduce(Shake.__add__, shake) if shake else None,
             nodes=self.nodes + other.nodes,
             passes=max(self.passes, other.passes),
+            shared=shared,
         )
 
     @property

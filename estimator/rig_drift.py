@@ -762,17 +762,22 @@ class PairCollector:
 
         Of more than two cameras it is that of the pair which contradicts the calibration most.
         """
-        import pandas as pd
-
-        filled = [p for p in self.parts if len(p)]
-        table = pd.concat(filled, ignore_index=True) if filled else None
-        changes = {} if table is None else rig_changes(table, self.calibration)
+        changes = self.changes()
         if not changes:
             return None
         least = min((change for change, _ in changes.values()), key=lambda change: change.chance)
         alone = culprit(changes, len(self.calibration.cameras))
         name = "" if alone is None else self.calibration.cameras[alone].name
         return replace(least, culprit=name)
+
+    def changes(self, prior: DriftPrior | None = None) -> Changes:
+        """Return `rig_changes` of all collected rows."""
+        import pandas as pd
+
+        filled = [p for p in self.parts if len(p)]
+        if not filled:
+            return {}
+        return rig_changes(pd.concat(filled, ignore_index=True), self.calibration, prior)
 
 
 Changes = dict[tuple[int, int], "tuple[RigChange, Noise]"]

@@ -8,8 +8,9 @@ centres belongs to the model, else it would count as a movement.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,18 +21,20 @@ from telerig.estimator.rig_drift import (
     POSE,
     DriftPrior,
     Movement,
+    PairCollector,
     RigChange,
     culprit,
     drift_posterior,
     moved_pose,
     rig_change_from,
-    rig_changes,
     with_drift,
 )
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from telerig.estimator.calibration.result.calibration import Calibration
 
 
@@ -54,9 +57,11 @@ class Refinement:
 
 
 def refinement_of(
-    tracks: Any, calibration: Calibration, wanted: bool | DriftPrior
+    tables: Iterable[pd.DataFrame], calibration: Calibration, wanted: bool | DriftPrior
 ) -> Refinement | None:
     """Return what `Refinement` holds for a run; None if it is not wanted.
+
+    tables : the tracks, or parts of them in the order of time.
 
     Of more than two cameras it is the one that the ray misses of all its pairs accuse, or that of
     the pair which contradicts the calibration most. Raises InputError if several have moved, or
@@ -66,7 +71,10 @@ def refinement_of(
         return None
     cameras = calibration.cameras
     prior = wanted if isinstance(wanted, DriftPrior) else DriftPrior()
-    changes = {} if tracks is None else rig_changes(tracks, calibration, prior)
+    pairs = PairCollector(calibration)
+    for table in tables:
+        pairs.add(table)
+    changes = pairs.changes(prior)
     if not changes:
         raise InputError(
             f"the rig cannot be refined from fewer than {LEAST_PAIRS} pairs of two cameras",

@@ -54,6 +54,7 @@ from telerig.estimator.smoothing.problem.tables import (
     calibration_share,
     frames_between,
     near_frames,
+    parts_of,
     read_tracks,
     references_of,
     stage_of,
@@ -189,8 +190,8 @@ def smooth(
         calibration = of_run(calibration, _cameras_of(table, calibration, stage, rig))
         refinement = None
         if refine_rig:
-            some = table if hasattr(table, "assign") else table.between(0, _MOST_ALIGNED)
-            refinement = refinement_of(some, calibration, refine_rig)
+            tables = (part for part, _ in parts_of(tracks) if part is not None)
+            refinement = refinement_of(tables, calibration, refine_rig)
         problem, tracked, encoder_sigma, findings = problem_of(
             tracks, calibration, stage=stage, accelerometers=accelerometers,
             references=references, rig=rig, t_s=t_s,

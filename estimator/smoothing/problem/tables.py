@@ -286,7 +286,7 @@ def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | N
     """
     ends: dict[int, tuple[int, int]] = {}
     corrected, samples, times_of = {c.name: False for c in cameras}, [], []
-    for table, _ in _parts(tracks):
+    for table, _ in parts_of(tracks):
         _check(table, cameras)
         spans = table.groupby("particle")["frame"].agg(["min", "max"])
         for particle, low, high in zip(spans.index, spans["min"], spans["max"]):
@@ -309,7 +309,7 @@ def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | N
     places = [(ends[p][0], np.full((ends[p][1] - ends[p][0] + 1, 3), np.nan)) for p in particles]
     files = None if _in_memory(tracks) else (TemporaryFile(), TemporaryFile())  # noqa: SIM115
     store = _Store(files)
-    for table, detections in _parts(tracks):
+    for table, detections in parts_of(tracks):
         _place(table, number, places)
         parts = [_paired(table, c, camera.name, number) for c, camera in enumerate(cameras)]
         if detections is not None and "particle" in detections:
@@ -326,7 +326,7 @@ def _in_memory(tracks: Any) -> bool:
     return not hasattr(tracks, "between")
 
 
-def _parts(tracks: Any) -> Iterator[tuple[pd.DataFrame, pd.DataFrame | None]]:
+def parts_of(tracks: Any) -> Iterator[tuple[pd.DataFrame, pd.DataFrame | None]]:
     """Yield tables of tracks and of detections: one pair, or one for each part of stored tracks."""
     if _in_memory(tracks):
         yield getattr(tracks, "table", tracks), getattr(tracks, "detections", None)

@@ -33,6 +33,7 @@ from telerig.estimator.rig_drift import (
     with_change,
 )
 from telerig.estimator.smoothing.problem.problem import RigMode, ShakeModel
+from telerig.estimator.smoothing.refined_pose import refinement_of
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
@@ -460,6 +461,21 @@ def test_the_graph_refines_the_rig_with_the_shake() -> None:
     true = moved(cameras, tangent)[1].camera_from_rig.inverse().translation_mm
     was = cameras[1].camera_from_rig.inverse().translation_mm
     assert np.linalg.norm(pose - true) < 0.3 * np.linalg.norm(was - true)
+
+
+def test_tracks_on_disk_are_refined_by_all_their_parts() -> None:
+    """The movement is in the last part; of long runs on disk only the first part was looked at."""
+    cameras, rng = rig(), np.random.default_rng(12)
+    now = moved(cameras, along_perpendicular(cameras, 0.06, 3e-5, 4e-5))
+    still = Run(frames=75).tracks(cameras, cameras, rng)
+    later = Run(frames=150).tracks(cameras, now, rng).query("frame >= 75")
+    known = calibration(cameras)
+    whole = refinement_of([pd.concat([still, later], ignore_index=True)], known, True)
+    parts = refinement_of([still, later], known, True)
+    first = refinement_of([still], known, True)
+    assert whole is not None and parts is not None and first is not None
+    assert parts.tangent == pytest.approx(whole.tangent, rel=0.05, abs=1e-5)
+    assert np.abs(parts.tangent).max() > 5 * np.abs(first.tangent).max()
 
 
 @pytest.mark.parametrize("samples", [40, 41])

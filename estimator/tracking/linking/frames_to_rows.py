@@ -36,6 +36,7 @@ from telerig.estimator.tracking.linking.frames import (
     moved,
     starts,
 )
+from telerig.estimator.tracking.linking.lifetimes import Lifetimes
 from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.rig.camera import Camera
 
@@ -79,6 +80,7 @@ class RowMaker:
     _closed: list[Frame] = field(default_factory=list)
     _before: list[Frame] = field(default_factory=list)
     _waiting: int = 0
+    _lifetimes: Lifetimes = field(default_factory=Lifetimes)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -143,7 +145,9 @@ class RowMaker:
         result = self.tracker.finish()
         if result is not None:
             self._take_final(result)
-        return self._flush(0) if self._closed else None
+        rows = self._flush(0) if self._closed else None
+        self.events[:] = self._lifetimes.corrected(self.events)
+        return rows
 
     def _take_final(self, result: FrameResult) -> None:
         self.events.extend(result.events)
@@ -160,6 +164,8 @@ class RowMaker:
         window = [*self._before, *done, *self._closed]
         tracks = SmoothedTracks(window, self.cameras, self.tracker.settings)
         follow_back(tracks, {f.number for f in (*done, *self._closed)})
+        for frame in done:
+            self.events += self._lifetimes.add(frame.number, frame.t_s, frame.bubbles.particle)
         place_hidden(tracks, slice(len(self._before), len(self._before) + len(done)))
         self._before = [*self._before, *done][-FRAMES_BEFORE:]
         return Linked(self._tracks(done), _detections(done))

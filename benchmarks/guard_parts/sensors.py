@@ -16,11 +16,13 @@ from sensor_fault_judging import Score, judged, score
 from sensor_fault_kinds import ARMS, FAULTS, copied, inputs_of
 from shake_scenarios import hash_of
 from shake_scene import Run, cases, simulate
+from sound_runs import drawn
 
 import telerig
 from guard_parts.inputs import digest
 from guard_parts.metrics import Metric, error, nees, word
 from guard_parts.smoothing import verdict_words
+from telerig.errors import TelerigError
 
 FRAMES, AROUND_S = 300, 10.0
 PLANTED = {
@@ -35,6 +37,8 @@ PLANTED = {
 }
 SOUND = (("S1", "frames"), ("S2", "unknown"), ("S3", "frames"), ("S6", "unknown"),
          ("stick-slip", "frames"), ("ring-down", "unknown"))  # fmt: skip
+CARRIAGE = (("servo hunts", 5250), ("pump", 5048))
+"""Numbers of `sound_runs` whose only accelerometer is on the carriage."""
 
 
 @cache
@@ -86,7 +90,27 @@ def sound(scenario: str, clock: str) -> list[Metric]:
     ]
 
 
+def carriage_alone(number: int) -> list[Metric]:
+    """No alarm either where the arms have no sensor, and standard deviations that hold."""
+    one = drawn(number)
+    try:
+        result = telerig.smooth(**one.inputs)
+    except TelerigError as refusal:
+        return [word("alarms", f"refused: {refusal}")]
+    found = score(one.run, result.trajectories)
+    said = [str(c["source"]) for c in result.verdict.get("contradictions", ())]
+    return [
+        word("alarms", ", ".join(said) or "none"),
+        word("verdict", verdict_words(result.verdict)),
+        error("3-D error", found.total_um, "µm"),
+        nees([found.total_nees]),
+        nees([found.nees[1]], "NEES along the travel"),
+        word("inputs", digest(one.run.tracks, one.run.stage)),
+    ]
+
+
 TASKS: dict[str, Callable[[], list[Metric]]] = {
     **{f"fault: {name}": partial(planted, name, where) for name, where in PLANTED.items()},
     **{f"sound: {where}, clock {clock}": partial(sound, where, clock) for where, clock in SOUND},
+    **{f"sensor on the carriage, {name}": partial(carriage_alone, n) for name, n in CARRIAGE},
 }

@@ -40,6 +40,7 @@ from telerig.estimator.smoothing.pieces import (
     with_clock_numbers,
 )
 from telerig.estimator.smoothing.problem.problem import (
+    ARMS,
     Bubble,
     Observations,
     ShakeModel,
@@ -103,8 +104,9 @@ _LEAST_LEARNED_S = 0.2
 """Shortest time of a bubble for which shake is learned. In less time a slow shake shows no period,
 and learning would find no shake.
 """
-_SIZED_FRAMES, _SIZING_PASSES = 600, 3
-"""Frames in the middle of a run that set the RMS of guessed modes, and passes over them."""
+_SIZED_FRAMES, _SIZING_PASSES, _ARM_PASSES = 600, 3, 8
+"""Frames in the middle of a run that set the RMS of guessed modes, and passes over them; passes
+over a run with an arm that has no sensor, each of which halves what its motion's size is off."""
 
 
 @showing_progress
@@ -627,9 +629,10 @@ def _adapted_solution(
     """Return the solution whose hyper-parameters have been set from a first solution.
 
     These are noise, RMS and delays, unless the model is given, and the low-pass of the bubbles'
-    forces. With broad bands the first solution uses few samples of the sensors. The RMS of guessed
-    modes is set by frames in which much is seen, in the middle if possible, and so is the low-pass
-    where nothing else is.
+    forces. With broad bands the first solutions use few samples of the sensors. If an arm has no
+    sensor, they hold the delays, which priors that do not fit yet can put wrong by a period of the
+    shake. The RMS of guessed modes is set by frames in which much is seen, in the middle if
+    possible, and so is the low-pass where nothing else is.
     """
     guessed, part, last = guessed_modes(model) and not given, problem, None
     learned = model.bubble.inertia is None and options.covariances
@@ -644,14 +647,18 @@ def _adapted_solution(
     elif frames < len(problem.t_s):
         begin = first_of_most_seen(problem, frames)
         part = all_of(problem, begin, begin + frames).problem
-    for _ in range(_SIZING_PASSES if guessed else 1):
+    first, unfelt = model, not given and any(b.camera == ARMS for b in model.broad_bands)
+    if unfelt:
+        model = replace(model, accelerometer_delay_sigma_s=0.0)
+    for _ in range(_SIZING_PASSES if guessed else _ARM_PASSES if unfelt else 1):
         bare = None if last is None else replace(last, covariances=None, draws=None)
         last = solve(part, model, options, progress, start=bare)
-        better = None if given else adapted(last)
+        better = None if given else adapted(last, first)
         if better is None:
             break
         model = better
     assert last is not None
+    model = replace(model, accelerometer_delay_sigma_s=first.accelerometer_delay_sigma_s)
     if learned:
         model = replace(model, bubble=replace(model.bubble, inertia=learned_inertia(last)))
     if model == last.graph.model and part is problem:

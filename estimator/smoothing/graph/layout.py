@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.problem.problem import (
+    ARMS,
     CARRIAGE,
     BroadBand,
     RigMode,
@@ -38,6 +39,9 @@ from telerig.factors.state_space import (
     slow_ou,
 )
 from telerig.rig.camera import Camera
+
+BROAD_BAND = "broad band"
+"""Label of the processes of the broad bands."""
 
 _SAME = 0.05
 _NEAR, _NEAR_S = 0.6, 1e-3
@@ -162,6 +166,8 @@ def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
             block = np.einsum("rn,i->rin", np.array(rows), p.direction)
             if p.camera == CARRIAGE:
                 offset[..., columns] += block[:, None]
+            elif p.camera == ARMS:
+                offset[:, :-1, :, columns] += block[:, None]
             else:
                 offset[:, p.camera, :, columns] += block
         at += c.size
@@ -191,27 +197,27 @@ def _carriage(problem: SmoothingProblem, model: ShakeModel) -> list[_Placed]:
 def _offsets(cameras: Sequence[Camera], model: ShakeModel) -> list[_Placed]:
     placed: list[_Placed] = []
     for mode in model.modes:
-        for direction, rms in _directed(mode.rms_mm, mode.camera, cameras):
+        for direction, rms in directed(mode.rms_mm, mode.camera, cameras):
             where, label = mode.camera, f"mode {mode.frequency_hz:.4g} Hz"
             part = resonance(rms, mode.frequency_hz, mode.damping, mode.force_hz)
             placed.append(_Placed(part, label, direction, where))
     for band in model.broad_bands:
-        for direction, rms in _directed(band.rms_mm, band.camera, cameras):
+        for direction, rms in directed(band.rms_mm, band.camera, cameras):
             part = broad_band(
                 rms, low_hz=band.low_hz, high_hz=band.high_hz, floor=band.floor, tail=band.tail
             )
-            placed.append(_Placed(part, "broad band", direction, band.camera))
+            placed.append(_Placed(part, BROAD_BAND, direction, band.camera))
             if band.slow_rms_mm > 0:
                 slow = slow_ou(band.slow_rms_mm, band.slow_tau_s)
                 placed.append(_Placed(slow, "slow", direction, band.camera))
     return placed
 
 
-def _directed(
+def directed(
     rms_mm: Sequence[float], camera: int, cameras: Sequence[Camera]
 ) -> list[tuple[Array, float]]:
     """Directions that some camera sees, with the RMS along them; none where the RMS is 0."""
-    directions = np.eye(3) if camera == CARRIAGE else seen_directions(cameras[camera])
+    directions = np.eye(3) if camera < 0 else seen_directions(cameras[camera])
     rms = np.sqrt((directions * np.asarray(rms_mm)) ** 2 @ np.ones(3))
     return [(d, float(r)) for d, r in zip(directions, rms) if r > 0]
 
@@ -220,7 +226,7 @@ def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
     out = np.zeros((len(cameras), 3, 3))
     parts: list[RigMode | BroadBand] = [*model.modes, *model.broad_bands]
     for own in parts:
-        if own.camera != CARRIAGE:
+        if own.camera >= 0:
             depth = cameras[own.camera].camera_from_rig.rotation[2]
             variance = float(((depth * np.asarray(own.rms_mm)) ** 2).sum())
             out[own.camera] += variance * np.outer(depth, depth)

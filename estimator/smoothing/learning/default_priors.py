@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.estimator.smoothing.graph.layout import BROAD_BAND, directed
 from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
+    ARMS,
     CARRIAGE,
     DELAY_SIGMA_S,
     FEWEST_BUBBLES,
+    Accelerometer,
     BroadBand,
     CarriageModel,
     RigMode,
@@ -24,8 +27,13 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.factors.state_space import broad_band_density, forced_mass
+from telerig.statistics import robust_sd
 
 SHAKE_RMS_MM = 0.2
+_ARM_RMS_MM, _LEAST_RMS_MM = 0.07, 1e-3
+"""Of arms without a sensor against the carriage, and of any shake that sensors bound."""
+_DEFAULT_SAMPLES = 2.0
+"""A default RMS is as sure as that of two independent offsets: within a factor of 1.6."""
 _ZIGZAG_HZ = (3.0, 12.0)
 _ZIGZAG_GUESS_HZ = 6.5
 _ZIGZAG_RMS_MM = 0.5
@@ -46,20 +54,15 @@ DEFAULT_FLOOR = 0.12
 def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
     """Return default priors for a problem.
 
-    If marks or accelerometers on the arms measure the shake, its prior is a broad band; otherwise
-    it consists of a few guessed modes.
+    With marks or accelerometers the prior of the shake is a broad band; otherwise it consists of a
+    few guessed modes.
 
     encoder_sigma_mm : standard deviation of an encoder reading.
     """
-    bands: tuple[BroadBand, ...] = ()
-    modes: tuple[RigMode, ...] = ()
-    cameras = range(len(problem.cameras))
-    if problem.measures_shake:
-        bands = tuple(_band(j) for j in cameras)
-    elif problem.accelerometers:
-        bands = (_band(CARRIAGE), *(replace(_band(j), rms_mm=(0.07,) * 3) for j in cameras))
-    else:
+    bands, modes = _default_bands(problem), tuple[RigMode, ...]()
+    if not bands:
         modes = (RigMode(12.0, 0.2, (0.1,) * 3, force_hz=None),)
+        cameras = range(len(problem.cameras))
         modes += tuple(RigMode(19.0, 0.2, (0.05,) * 3, j, None) for j in cameras)
     return ShakeModel(
         bubble=default_bubble(problem),
@@ -79,39 +82,57 @@ def _scale_sigma(problem: SmoothingProblem) -> float:
     return default_scale_sigma(problem.travel) if marked else 0.0
 
 
-def _band(camera: int) -> BroadBand:
-    return BroadBand((SHAKE_RMS_MM,) * 3, camera, floor=DEFAULT_FLOOR)
+def _default_bands(problem: SmoothingProblem) -> tuple[BroadBand, ...]:
+    """Return the broad bands of a run with marks or accelerometers; none for any other.
 
-
-def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeModel:
-    """Return the broad-band priors adapted to an estimated RMS and dominant frequency.
-
-    This is the maximisation step of expectation maximisation. The ratio of common-mode to
-    differential shake stays.
-
-    rms_mm : (C, 3) of each camera's offset, posterior variance included.
-    frequency_hz : the dominant frequency.
+    Where an arm has no sensor, there is one of the common shake, which the sensors feel, one of
+    what all arms do alike along the travel, and one of each arm by itself. None is larger than
+    twice the shake that a sensor could feel so: a carriage at rest carries no arms that shake.
     """
-    own = [b for b in model.broad_bands if b.camera != CARRIAGE]
-    common = [b for b in model.broad_bands if b.camera == CARRIAGE]
-    before = np.zeros_like(rms_mm)
-    for band in common:
-        before += np.square(band.rms_mm)
-    for band in own:
-        before[band.camera] += np.square(band.rms_mm)
-    factor = rms_mm / np.sqrt(np.where(before > 0, before, 1.0))
-    factor = np.clip(factor, 0.05, 20.0)
-    by_camera = {CARRIAGE: factor.mean(0), **dict(enumerate(factor))}
+    cameras = range(len(problem.cameras))
+    if problem.measures_shake:
+        return tuple(_band(j, SHAKE_RMS_MM) for j in cameras)
+    if not problem.accelerometers:
+        return ()
+    felt = max(map(_felt_mm_s2, problem.accelerometers))
+    most = max(2 * felt / (2 * np.pi * BroadBand.low_hz) ** 2, _LEAST_RMS_MM)
+    common, arm = min(SHAKE_RMS_MM, most), min(_ARM_RMS_MM, most)
+    alike = replace(_band(ARMS, arm), rms_mm=_triple(arm * np.abs(problem.axis)))
+    return (_band(CARRIAGE, common), alike, *(_band(j, arm) for j in cameras))
+
+
+def _felt_mm_s2(sensor: Accelerometer) -> float:
+    """Return the standard deviation of a sensor's readings, of all its axes together."""
+    moving = sensor.reading_mm_s2 - np.median(sensor.reading_mm_s2, axis=0)
+    return float(np.linalg.norm(robust_sd(moving, axis=0)))
+
+
+def _band(camera: int, rms_mm: float) -> BroadBand:
+    return BroadBand((rms_mm,) * 3, camera, floor=DEFAULT_FLOOR)
+
+
+def rescaled(model: ShakeModel, factor: Array, frequency_hz: float) -> ShakeModel:
+    """Return the broad-band priors with another RMS and dominant frequency.
+
+    factor : (bands, 3) on the RMS.
+    frequency_hz : the dominant frequency of the offsets.
+    """
+    rms_mm = factor * [b.rms_mm for b in model.broad_bands]
     frequency = float(np.clip(frequency_hz, *_SHAKE_HZ))
-    strong = float(rms_mm.max()) * (2 * np.pi * frequency) ** 2 > STRONG_MM_S2
+    offset = _largest_offset(model.broad_bands, rms_mm)
+    strong = offset * (2 * np.pi * frequency) ** 2 > STRONG_MM_S2
     shape: dict[str, Any] = {"low_hz": frequency, "high_hz": max(60.0, 1.25 * frequency)}
     if strong:
         shape = {"low_hz": frequency, "high_hz": max(60.0, 2.0 * frequency), "tail": 3}
-    bands = [
-        replace(b, rms_mm=_triple(b.rms_mm * by_camera[b.camera]), **shape)
-        for b in model.broad_bands
-    ]
+    bands = [replace(b, rms_mm=_triple(r), **shape) for b, r in zip(model.broad_bands, rms_mm)]
     return replace(model, broad_bands=tuple(bands))
+
+
+def _largest_offset(bands: Sequence[BroadBand], rms_mm: Array) -> float:
+    """Return the largest RMS of a camera's offset along an axis, of common and own bands."""
+    common = np.array([b.camera < 0 for b in bands])
+    shared = np.square(rms_mm[common]).sum(0)
+    return float(np.sqrt((np.square(rms_mm[~common]) + shared).max()))
 
 
 def default_bubble(problem: SmoothingProblem) -> BubbleModel:
@@ -247,7 +268,7 @@ def acceleration_rms(stage: Stage, sigma_mm: float) -> float:
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
-_LEAST_REDUCTION, _PRIOR_SAMPLES, _SCALED = 0.05, 1.0, (0.1, 10.0)
+_LEAST_REDUCTION, _PRIOR_SAMPLES, _SCALED = 0.05, 1.0, (0.05, 20.0)
 _LEAST_SPARE = 0.2
 _LEAST_PIXELS = 60
 _SD_OF_MEDIAN = 1.16
@@ -261,8 +282,10 @@ _INDEPENDENT = 0.5
 """Share of independent bins: a tapered spectrum's neighbours, and cameras, are correlated."""
 
 
-def adapted(solution: Solution) -> ShakeModel | None:
-    """Return the priors adapted to a first solution, or None if nothing changes.
+def adapted(solution: Solution, start: ShakeModel | None = None) -> ShakeModel | None:
+    """Return the priors adapted to a solution, or None if nothing changes.
+
+    start : the model before any adaptation; None for that of the solution.
 
     Adapted are the pixel noise, the RMS displacement of broad-band shake and of modes whose
     frequency is a default, and the prior standard deviation of the encoder's scale. Modes that were
@@ -277,13 +300,11 @@ def adapted(solution: Solution) -> ShakeModel | None:
     if inflation > 1:
         better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
     if model.broad_bands:
-        fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
-        ratio = [
-            np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)
-        ]
+        factor = _size_of_bands(solution, (start or model).broad_bands)
+        fresh = rescaled(better, factor, _dominant_hz(solution))
         floor = fitted_floor(solution.graph.problem.t_s, _offsets(solution), fresh.broad_bands)
         moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
-        if max(np.max(np.abs(np.log(ratio))), moved) > _RESCALE_BEYOND:
+        if max(np.max(np.abs(np.log(factor))), moved) > _RESCALE_BEYOND:
             better = _with_floor(fresh, floor)
     elif guessed_modes(model):
         factor, faster = _size_of_offsets(solution), _faster(solution)
@@ -368,7 +389,7 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
     Returns None for a short run, and if a band is common to the cameras or steep.
     """
     t = np.asarray(t_s, float)
-    if any(b.camera == CARRIAGE or b.tail > 2 for b in bands) or not bands[0].floor or len(t) < 2:
+    if any(b.camera < 0 or b.tail > 2 for b in bands) or not bands[0].floor or len(t) < 2:
         return None
     step = float(np.median(np.diff(t)))
     even = np.arange(t[0], t[-1] + step / 2, step)
@@ -406,18 +427,56 @@ def _offsets(solution: Solution) -> Array:
     return np.asarray(np.einsum("cid,fd->fci", solution.graph.shake.offset[:-1], states))
 
 
-def _offset_rms(solution: Solution) -> Array:
-    """Return the RMS (C, 3) of the cameras' offsets, uncertainty included; the mean along unseen
-    axes.
+def _size_of_bands(solution: Solution, defaults: Sequence[BroadBand]) -> Array:
+    """Return factors (bands, 3) on the RMS of every broad band, by its own share of the offsets;
+    the mean along unseen axes.
+
+    defaults : the bands before any adaptation.
     """
-    rows, found = solution.graph.shake.offset[:-1], solution.covariances
-    square = _offsets(solution) ** 2
-    if found is not None:
-        square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
-    mean = square.mean(0)
-    unseen = mean < 1e-12
-    each = np.where(unseen, np.nan, mean)
-    return np.asarray(np.sqrt(np.where(unseen, np.nanmean(each, 1, keepdims=True), mean)))
+    graph, found, at = solution.graph, solution.covariances, 0
+    states, layout = graph.shake_at_frames(solution.state.shake), graph.shake
+    shown = list[tuple[float, float]]()  # mean squares and posterior variances
+    for part, label in zip(layout.components, layout.labels):
+        mine, row = slice(at, at + part.size), part.position
+        at += part.size
+        if label == BROAD_BAND:
+            left = 0.0 if found is None else row @ found.shake[:, mine, mine].mean(0) @ row
+            shown.append((float(np.mean((states[:, mine] @ row) ** 2)), float(left)))
+    out, t, cameras = list[Array](), graph.problem.t_s, graph.problem.cameras
+    for band, default in zip(graph.model.broad_bands, defaults, strict=True):
+        ways = directed(band.rms_mm, band.camera, cameras)
+        own, shown = shown[: len(ways)], shown[len(ways) :]
+        if not ways:
+            out.append(np.ones(3))
+            continue
+        prior, first = (
+            np.array([rms**2 for _, rms in directed(b.rms_mm, b.camera, cameras)])
+            for b in (band, default)
+        )
+        samples = 2 * (t[-1] - t[0]) * band.low_hz
+        square, left_over = np.array(own).T
+        larger = fitted_variance(square, left_over, prior, first, samples) / prior
+        shares = np.square([way * band.rms_mm for way, _ in ways]) / prior[:, None]
+        out.append(larger.mean() + np.linalg.pinv(shares) @ (larger - larger.mean()))
+    return np.sqrt(np.clip(out, *np.square(_SCALED)))
+
+
+def fitted_variance(
+    square: Array, left: Array, prior: Array, default: Array, samples: float
+) -> Array:
+    """Return the variances of shake that a solution shows.
+
+    The expected square of an estimated offset is the prior variance minus the posterior variance,
+    so that the prior has to be larger by their ratio (MacKay, Neural Computation 4:415, 1992). What
+    the data leave undetermined counts as two samples of the default.
+
+    square, left : mean squares of the estimated offsets, and their posterior variances.
+    prior, default : variances of the solution's model, and before any adaptation.
+    samples : number of independent offsets.
+    """
+    known = (1 - left / prior).clip(0.0)
+    few = _DEFAULT_SAMPLES * (1 - known)
+    return (samples * square + few * default) / (samples * known + few)
 
 
 def _dominant_hz(solution: Solution) -> float:

@@ -35,7 +35,7 @@ from telerig.estimator.smoothing.learning.parameters import (
     names_of_process,
     shake_processes,
 )
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
+from telerig.estimator.smoothing.problem.problem import ARMS, CARRIAGE, ShakeModel
 from telerig.factors.bubble_motion import Process
 from telerig.factors.motion import Motion, motion, start
 from telerig.factors.state_space import (
@@ -277,7 +277,7 @@ def _system(signal: Signal, model: ShakeModel) -> _System:
     offset = np.zeros((len(signal.cameras), size))
     at = 0
     for part, camera in shake:
-        which = slice(None) if camera == CARRIAGE else signal.cameras.index(camera)
+        which = slice(None) if camera in (CARRIAGE, ARMS) else signal.cameras.index(camera)
         offset[which, at : at + part.size] += part.position
         at += part.size
     width = sum(c.size for c in bubble)

@@ -17,7 +17,7 @@ import numpy as np
 
 from telerig.errors import InputError
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
+from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.factors.bubble_motion import (
     BUBBLE_PRIORS,
     Prior,
@@ -154,7 +154,7 @@ def shake_processes(signal: Signal, model: ShakeModel) -> list[Process]:
 
 
 def _along(signal: Signal, rms_mm: tuple[float, float, float], camera: int) -> float:
-    if camera != CARRIAGE and camera not in signal.cameras:
+    if camera >= 0 and camera not in signal.cameras:
         return 0.0
     return float(np.sqrt(np.sum(np.square(signal.direction * rms_mm))))
 

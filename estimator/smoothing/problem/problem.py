@@ -24,6 +24,10 @@ CARRIAGE = -1
 a vibration that is common to all cameras.
 """
 
+ARMS = -2
+"""In place of a camera's index: what all arms do alike, and a sensor on the carriage does not feel.
+"""
+
 DELAY_SIGMA_S = 0.002
 """Prior standard deviation of the delay of a record that is on the frames' clock."""
 
@@ -55,7 +59,7 @@ class BroadBand:
     """Prior of shake with unknown modes, of one camera or of all cameras.
 
     rms_mm : RMS displacement along x, y and z of the rig frame.
-    camera : index of the camera, or CARRIAGE for all cameras.
+    camera : index of the camera, or CARRIAGE or ARMS for all cameras.
     low_hz, high_hz, floor, tail : see `telerig.factors.state_space.broad_band`.
     slow_rms_mm, slow_tau_s : RMS and correlation time of an additional slow offset
         (Ornstein-Uhlenbeck process), which accelerometers do not measure.

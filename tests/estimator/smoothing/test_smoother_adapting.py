@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 from seeds import first_or_all
+from shake_cases import RISE_MM_S
 from shake_learning_data import SWING_HZ, run, with_comings_and_goings
 from shake_runs import run_of
+from shake_scene import Motions, cases, random_shake, simulate
 
 import telerig
 from telerig.estimator.smoothing.graph.solve import Options, solve
@@ -17,16 +19,20 @@ from telerig.estimator.smoothing.learning.default_priors import (
     adapted,
     default_model,
     fitted_floor,
+    fitted_variance,
     rescaled,
     zigzag,
 )
 from telerig.estimator.smoothing.problem.problem import (
+    ARMS,
     CARRIAGE,
     BroadBand,
     ShakeModel,
     SmoothingProblem,
     Stage,
 )
+from telerig.estimator.smoothing.problem.tables import thinned
+from telerig.estimator.smoothing.smooth import problem_of, with_sensors_aligned
 from telerig.factors.state_space import (
     broad_band,
     broad_band_density,
@@ -34,6 +40,7 @@ from telerig.factors.state_space import (
     exact_step,
     forced_mass,
 )
+from telerig.io.simulation.run.motion import Shake
 
 RATE_HZ, RMS_MM = 500.0, 0.3
 BAND = {"low_hz": 12.0, "high_hz": 60.0}
@@ -106,7 +113,7 @@ def test_uneven_times_are_evened_out():
 def test_strong_shake_has_a_steeper_tail(frequency_hz, tail, high_hz):
     """Accelerations of 2 and 19 m/s^2."""
     model = ShakeModel(broad_bands=_bands())
-    for band in rescaled(model, np.full((2, 3), RMS_MM), frequency_hz).broad_bands:
+    for band in rescaled(model, np.ones((2, 3)), frequency_hz).broad_bands:
         assert (band.tail, band.high_hz, band.low_hz) == (tail, high_hz, frequency_hz)
 
 
@@ -114,6 +121,42 @@ def test_the_floor_of_strong_shake_is_not_taken_from_what_the_prior_has_shrunk()
     strong = tuple(replace(b, tail=3) for b in _bands())
     assert fitted_floor(*_offsets(0.1, 4.0, 0), _bands()) is not None
     assert fitted_floor(*_offsets(0.1, 4.0, 0), strong) is None
+
+
+def test_a_size_is_that_of_the_data_where_they_show_it_and_the_default_where_not():
+    square, left = np.array([0.5, 0.5, 0.0]), np.array([0.0, 1.0, 2.0])
+    prior, default = np.full(3, 2.0), np.full(3, 3.0)
+    many, few = (fitted_variance(square, left, prior, default, n) for n in (1e9, 2.0))
+    assert many == pytest.approx([0.5, 1.0, 3.0], rel=1e-6)
+    assert few == pytest.approx([0.5, (2 * 0.5 + 3.0) / 2.0, 3.0])
+
+
+@pytest.mark.parametrize("seed", first_or_all(61, 62, 63))
+def test_a_sensor_on_the_carriage_alone_sizes_common_and_own_shake_apart(seed):
+    """Arms that shake like each other: the sensor does not feel them, and the images do."""
+    case, true = replace(cases()["S1"], bubbles=5), dict[str, np.ndarray]()
+    case = replace(case, scenario=replace(case.scenario, frames=250))
+
+    def motion(t: np.ndarray, rng: np.random.Generator) -> Motions:
+        common, own = random_shake(case, t, rng)
+        own = Shake(*(np.repeat(part[:1], 2, 0) for part in vars(own).values()))
+        true.update(common=common.offset_mm[0].std(0), own=own.offset_mm[0].std(0))
+        return RISE_MM_S * t, np.zeros_like(t), common, own
+
+    drawn = simulate(case, np.random.default_rng([seed, 4]), motion=motion)
+    inputs = drawn.inputs("carriage") | {"tracks": drawn.tracks}
+    problem, _, sigma_mm, findings = problem_of(**inputs)
+    problem, _ = with_sensors_aligned(problem, findings)
+    problem = replace(problem, accelerometers=thinned(problem.accelerometers, 2e-3))
+    start = replace(default_model(problem, sigma_mm), accelerometer_delay_sigma_s=0.0)
+    model = start
+    for _ in range(3):
+        model = adapted(solve(problem, model, Options(robust=False)), start) or model
+    size = {band.camera: np.array(band.rms_mm) for band in model.broad_bands}
+    assert size[CARRIAGE] == pytest.approx(true["common"], rel=0.5)
+    assert size[ARMS][[0, 2]] == pytest.approx(0.0)
+    arms = [np.hypot(size[ARMS][1], size[camera][1]) for camera in (0, 1)]
+    assert arms == pytest.approx([true["own"][1]] * 2, rel=0.5)
 
 
 def _short_tracks(seed: int, frames_each: int) -> tuple[SmoothingProblem, np.ndarray, np.ndarray]:

@@ -51,6 +51,7 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     implausible_outlines,
     radius_px,
     start_outlines,
+    usual_misfit,
 )
 from telerig.estimator.bubbles.outline.rims import Rims, rims_along
 from telerig.rig.outline import points_on
@@ -399,9 +400,10 @@ def _divided(
 
     odd : (B,) which outlines are implausible.
     """
+    usual = usual_misfit(outlines)
     again = [
         new
-        for part, unlike in zip(parts, (odd | fits_badly(outlines)).tolist(), strict=True)
+        for part, unlike in zip(parts, (odd | fits_badly(outlines, usual)).tolist(), strict=True)
         if unlike and not (part.merged or part.shared or blobs[part.blob].touches_border)
         for new in split_where_flat(blobs[part.blob], part.blob, shape, min_diameter_px)
     ]
@@ -411,7 +413,7 @@ def _divided(
     others = outlines.take(~np.isin(one, several))
     fit = fitted(_start(again, blobs), beside=others)
     bad = implausible_outlines(Outlines.concat([others, fit]))[0][len(others) :]
-    bad |= fits_badly(fit) | ~(fit.coverage > _KNOWN_COVERAGE)
+    bad |= fits_badly(fit, usual) | ~(fit.coverage > _KNOWN_COVERAGE)
     sound = ~np.isin(several, several[bad])
     if not np.any(sound):
         return None

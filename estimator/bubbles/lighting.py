@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
 import cv2
@@ -46,11 +45,9 @@ def on_bright_spots(
         known = outline[np.isfinite(outline).all(axis=1)]
         cv2.fillPoly(free, [np.rint(known).astype(np.int32)], 0)
     far = _light(image, free, ellipse, _AROUND)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # rings that lie outside of the image
-        edge = np.nanmax(np.nanmedian(_light(image, None, ellipse, _RINGS), -1), -1)
-        inside = np.nanmedian(_light(image, None, ellipse, np.array([_INSIDE])), (1, 2))
-        around = np.nanmedian(far, (1, 2))
+    edge = np.fmax.reduce(_median(_light(image, None, ellipse, _RINGS)), -1)
+    inside = _median(_light(image, None, ellipse, np.array([_INSIDE]))[:, 0])
+    around = _median(far.reshape(len(far), len(_AROUND) * far.shape[-1]))
     seen = np.isfinite(edge + inside) & (np.isfinite(far).mean((1, 2)) > _LEAST_AROUND)
     bright = seen & (edge - around > _BRIGHTER * (edge - inside))
     few = np.count_nonzero(seen) < FEWEST_OUTLINES
@@ -73,3 +70,12 @@ def _light(
     if free is not None:
         there &= free[v, u] > 0
     return np.where(there, image[v, u].astype(float), np.nan)
+
+
+def _median(values: Array) -> Array:
+    """Return the (lower) median along the last axis of what is not NaN; NaN where nothing is.
+
+    `numpy.nanmedian` of many short rows takes fifty times as long.
+    """
+    middle = np.maximum(np.isfinite(values).sum(-1, keepdims=True) - 1, 0) // 2
+    return np.take_along_axis(np.sort(values, -1), middle, -1)[..., 0]

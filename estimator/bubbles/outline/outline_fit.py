@@ -155,7 +155,7 @@ _WIDENED = 1.5
 """What is learnt from a few outlines holds for others within so much."""
 _MEDIAN_OF_TWO = 0.693
 """Median of the mean of two squares of unit variance."""
-_ENOUGH_WHOLE = 4
+_ENOUGH_WHOLE, _ENOUGH_OUTLINES = 4, 8
 _WHOLE = 0.9
 _FAR_SHIFT_PX = 0.25
 _STEPS = 3
@@ -249,9 +249,18 @@ def _concave(outlines: Outlines) -> Bools:
     return np.asarray(np.min(turn, axis=1) * radius_px(outlines) < -_BEYOND_CHANCE * sd)
 
 
-def fits_badly(outlines: Outlines) -> Bools:
-    """Return which outlines (B,) leave more than noise unexplained."""
-    return np.asarray(outlines.chi2_dof > _BAD_FIT)
+def fits_badly(outlines: Outlines, usual: float = 1.0) -> Bools:
+    """Return which outlines (B,) leave more than noise unexplained.
+
+    usual : chi-square per degree of freedom that most outlines of the image have at least.
+    """
+    return np.asarray(outlines.chi2_dof > _BAD_FIT * usual)
+
+
+def usual_misfit(outlines: Outlines) -> float:
+    """Return the median chi-square per degree of freedom, at least 1; 1 if outlines are few."""
+    many = len(outlines) >= _ENOUGH_OUTLINES
+    return max(float(np.median(outlines.chi2_dof)), 1.0) if many else 1.0
 
 
 def missed_rims(outlines: Outlines) -> Bools:

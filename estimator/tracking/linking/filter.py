@@ -349,11 +349,13 @@ class States(Rows):
         measured, seen, at = scan.measured, columns >= 0, columns[columns >= 0]
         x, p = self.x + shift, self.p.copy()
         gain = np.zeros((len(self), STATES, 3))
-        own, total = p[seen], p[seen, POSITION, POSITION] + measured.covariance_mm2[at]
-        gain[seen] = mine = own[..., POSITION] @ np.linalg.inv(total)
-        left = measured.points_mm[at] - x[seen, POSITION]
+        own, noise = p[seen], measured.covariance_mm2[at]
+        gain[seen] = mine = own[..., POSITION] @ np.linalg.inv(own[:, POSITION, POSITION] + noise)
+        left = measured.points_mm[at] - x[seen][:, POSITION]
         x[seen] += (mine @ left[..., None])[..., 0]
-        p[seen] = own - mine @ total @ mine.mT
+        kept = np.tile(np.eye(STATES), (len(own), 1, 1))
+        kept[..., POSITION] -= mine
+        p[seen] = kept @ own @ kept.mT + mine @ noise @ mine.mT  # Joseph's form: keeps it positive
         unequal = mean_gain - gain
         p += unequal @ common_mm2 @ unequal.mT
         size = np.full(len(self), np.nan)

@@ -8,10 +8,13 @@ from tracker_runs import SIGMA_MM, UP, Array, frame_of
 
 from telerig.estimator.tracking.linking.filter import (
     DRIFT,
+    Scan,
+    States,
     TrackerSettings,
     birth_covariance,
     transition,
 )
+from telerig.estimator.tracking.linking.frames import Bubbles
 from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.factors.state_space import exact_step
 
@@ -151,3 +154,28 @@ def test_predictions_are_as_good_as_they_say_at_irregular_times() -> None:
             tracker.update(i, t, frame_of([z], particle=[0]), 280 * t)
     many = len(distances)
     assert abs(np.mean(distances) - 3) < 4 * np.sqrt(6 / many)
+
+
+def test_covariances_stay_positive_through_many_sharp_measurements() -> None:
+    # 0.05 µm after an unknown depth, at 333 Hz: P - K S K' was indefinite after some tens of frames
+    sharp, settings = 2.5e-9 * np.eye(3), TrackerSettings()
+
+    def scan(frame: int) -> Scan:
+        one = np.ones((1, 2), int)
+        seen = Bubbles.of(one, np.zeros((1, 3)), sharp[None], -one[:, 0], np.ones(1))
+        return Scan(frame, frame / 333, seen, settings)
+
+    none, first = np.zeros(1, int), scan(0)
+    states = States.born(first, none, none, np.zeros(3), False)
+    deep = np.array([1e3, 1.0, -1e3])
+    states.p[:, :3, :3] += np.outer(deep, deep)
+    step = transition(settings, (0.0, -1.0, 0.0), 1 / 333, False)
+    for frame in range(1, 300):
+        states = states.predicted(step, np.zeros(3), np.zeros(12))
+        states = states.updated(
+            scan(frame), none, np.zeros((1, 12)), np.zeros((1, 3, 3)), np.zeros((12, 3))
+        )
+        p = states.p[0]
+        scale = np.sqrt(np.abs(np.diag(p)))
+        assert np.linalg.eigvalsh((p + p.T) / 2 / np.outer(scale, scale)).min() > 0, frame
+        assert np.abs(p - p.T).max() < 1e-9 * scale.max() ** 2

@@ -30,9 +30,9 @@ class Expected:
     values : (n,) acceleration in mm/s^2 along it.
     known : (n,) whether it is known.
     whole : whether it is the sensor's complete acceleration along the direction. For an arm that of
-        the stage or of another arm is not, nor for the stage
-        that of an arm: beyond its resonance an arm moves in the opposite direction. It only tells
-        which axes replace stated ones that gravity excludes.
+        the stage or of another arm is not, nor for the stage that of an arm: beyond its resonance
+        an arm moves in the opposite direction. It only tells which axes replace stated ones that
+        gravity excludes.
     """
 
     direction: Array

@@ -290,7 +290,7 @@ QUANTITY_WORDS = {
 def words_of_use(use: Use) -> str:
     """Return the name of a quantity, with the frequency up to which it counts."""
     words = QUANTITY_WORDS[use.quantity]
-    return words if use.below_hz is None else f"{words} below {use.below_hz:.2g} Hz"
+    return words if use.below_hz is None else f"{words} below {float(f'{use.below_hz:.2g}'):g} Hz"
 
 
 _LESS_NOISE = (

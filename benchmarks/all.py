@@ -97,7 +97,7 @@ STUDIES = (
     Study("rig_faults"),
     Study("plan"),
     Study("sensor_faults", "faults --scenarios S1 --configurations one,marks --clocks unknown"),
-    Study("sound_runs", "--out {work}/sound_runs.jsonl", writes=False),
+    Study("sound_runs", "--runs 1000 --seed 20000 --out {work}/sound_runs.jsonl", writes=False),
     Study("before_a_run", "--out {work}/before_a_run", writes=False),
     Study("smoothing_speed"),
     Study("smoothing_many"),

@@ -5,8 +5,8 @@ Usage: python benchmarks/sound_runs.py [--runs 60] [--seed 0] [--only hunting,..
 Every run is drawn from its number: the kind of rig in turn, frames, bubbles, sensors and what their
 clocks are stated to be. A run adds a line to --out; those that are there are not run again, so that
 an interrupted study goes on. --again runs those that were alarms, and writes no line. --checks ends
-before the solution, which finds what is refused but no contradiction, in some 3 s a run; whole runs
-take some 15 s. The end lists every alarm with its code and numbers.
+before the solution, which finds what is refused but no contradiction, in some 2 s a run; whole runs
+take some 5 s. The end lists every alarm with its code and numbers.
 """
 
 from __future__ import annotations

@@ -16,9 +16,8 @@ _SIGNIFICANT = 6.0
 _ZIGZAG = 4.5
 """Least amplitude of a zigzag over its standard deviation, lower than for a line anywhere in a
 spectrum."""
-_UNLIKE = 0.9
-"""Least chi-square between a sinusoid and its alias, over that of the least significant one. An
-alias of an uninterrupted record explains a few per cent of a sinusoid, so that no line is lost."""
+_ANOTHER = 0.01
+"""Probability of another fringe beside that of the best one, from which on no frequency is told."""
 _ROUNDING = 1e-9
 _NEAR_PERIODS, _FALL = 5.0, 2.5
 
@@ -92,8 +91,8 @@ def dominant_oscillation(
     noise of this density.
 
     Returns None if the record is shorter than 1.5 periods or 16 samples, if the amplitude is not
-    significant, or if the noise hides the difference from a sinusoid of another frequency (an
-    alias) at these times.
+    significant, or if a sinusoid of another frequency that is nearly alike at these times (another
+    fringe of a gap) has more than 1 % of the likelihood.
     """
     good = np.isfinite(values).all(-1)
     t, y = np.asarray(t_s, float)[good], np.asarray(values, float)[good]
@@ -110,7 +109,7 @@ def dominant_oscillation(
     start = _strongest(t, level, step, (low, high))
     if start is None:
         return None
-    f = _refined(t, y, start, 0.5 / duration)
+    f, more = _fringe(t, y, start, step, (lowest, highest))
     coefficients, left = _fitted(t, y, f)
     density = max(_density(t, left, f, duration), 2 * noise**2 * duration / len(t))
     if not density > (_ROUNDING * np.abs(y).max()) ** 2 * duration:
@@ -120,13 +119,8 @@ def dominant_oscillation(
     s_amplitude = float(np.sqrt(density / duration))
     if axes[0] < significant * s_amplitude or not low <= f <= high:
         return None
-    wave = y - left - line @ np.linalg.lstsq(line, y - left, rcond=None)[0]
-    other = _strongest(t, wave, step, (lowest, highest), but=(f, 1 / duration))
-    if other is not None:
-        alias = _refined(t, wave, other, 0.5 / duration)
-        difference = float((_fitted(t, wave, alias)[1] ** 2).sum())
-        if difference < _UNLIKE * significant**2 * density * len(t) / (2 * duration):
-            return None
+    if more * duration < -np.log(_ANOTHER) * density * len(t):
+        return None
     total = float((axes**2).sum())
     s_f = float(np.sqrt(density / (4 * np.pi**2 * total * duration * t.var())))
     if alike is not None:
@@ -143,10 +137,35 @@ def dominant_oscillation(
     )  # fmt: skip
 
 
-def _strongest(
-    t: Array, y: Array, step: float, band: tuple[float, float], but: tuple[float, float] = (0, -1)
-) -> float | None:
-    """Return the frequency of the highest windowed periodogram in a band, except near one of them.
+def _fringe(
+    t: Array, y: Array, f: float, step: float, band: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the frequency near f, or on another fringe, whose sinusoid leaves the least, and by
+    how much the squares that the next best fringe leaves are larger.
+
+    The window that finds f weights the samples about a gap in the middle most, between which a
+    fringe too many hardly shows.
+    """
+    line = np.stack([np.ones(len(t)), t - t[0]], -1)
+    period = (len(t) - 1) / ((t[-1] - t[0]) * len(t))
+    f = _refined(t, y, f, period / 2)
+    while True:
+        left = _fitted(t, y, f)[1]
+        wave = y - left - line @ np.linalg.lstsq(line, y - left, rcond=None)[0]
+        found = (
+            _strongest(t, wave, step, side)
+            for side in ((band[0], f - period), (f + period, band[1]))
+        )
+        others = [_refined(t, y, other, period / 2) for other in found if other is not None]
+        more = [float((_fitted(t, y, g)[1] ** 2).sum() - (left**2).sum()) for g in others]
+        least = min(more, default=np.inf)
+        if least >= 0:
+            return f, least
+        f = others[more.index(least)]
+
+
+def _strongest(t: Array, y: Array, step: float, band: tuple[float, float]) -> float | None:
+    """Return the frequency of the highest windowed periodogram in a band.
 
     The values stay at their times, to a fraction of the step: values interpolated over long steps
     would be those of a lower frequency.
@@ -157,8 +176,7 @@ def _strongest(
     grid = np.stack([np.bincount(place, column * window, length) for column in y.T], -1)
     power = (np.abs(np.fft.rfft(grid, _PADDING * length, axis=0)) ** 2).sum(-1)
     frequency = np.fft.rfftfreq(_PADDING * length, step / _FINER)
-    outside = (frequency < band[0]) | (frequency > band[1])
-    power[outside | (np.abs(frequency - but[0]) <= but[1])] = 0
+    power[(frequency < band[0]) | (frequency > band[1])] = 0
     return float(frequency[np.argmax(power)]) if power.any() else None
 
 

@@ -212,8 +212,8 @@ def test_noise_and_short_records_have_no_oscillation() -> None:
     assert dominant_oscillation(t, holes).frequency_hz == pytest.approx(6.0, abs=0.05)
 
 
-def test_few_wrong_fringes_of_a_gap_of_half_the_record_are_believed() -> None:
-    off, rng = [], np.random.default_rng(11)
+def test_no_wrong_fringe_of_a_gap_of_half_the_record_is_believed() -> None:
+    off, rng = [], np.random.default_rng(20)
     for _ in range(120):
         f = rng.uniform(5, 12)
         t, values = series(rng, f, 30.0, 10.0)
@@ -222,7 +222,7 @@ def test_few_wrong_fringes_of_a_gap_of_half_the_record_are_believed() -> None:
         found = dominant_oscillation(t[seen], values[seen], significant=4.5)
         if found is not None:
             off.append((found.frequency_hz - f) / found.s_frequency_hz)
-    assert len(off) > 70 and np.mean(np.abs(off) > 6) < 0.05
+    assert len(off) > 75 and np.max(np.abs(off)) < 6
 
 
 def test_errors_that_oscillate_with_a_series_widen_its_line() -> None:

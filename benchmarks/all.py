@@ -5,8 +5,9 @@ Usage: python benchmarks/all.py [--only NAME ...] [--real FOLDER] [--workers 2] 
 Each study is a command that prints its page or writes it; the page goes to `results/NAME.md` with
 the command, the state of the source and the processor time at its end, and is never edited by
 hand. `results/all.json` keeps these, so that a second call goes on with the studies whose page is
-of another source. Real images and records are not part of this repository: studies of them are left
-out, and said to be, where FOLDER is not there. Then `python benchmarks/readme.py --write`.
+of another source, and `results/work/` what an interrupted study had done. Real images and records
+are not part of this repository: studies of them are left out, and said to be, where FOLDER is not
+there. Then `python benchmarks/readme.py --write`.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -127,7 +128,8 @@ def main() -> int:
     for study in absent:
         print(f"{study.name}: left out, {options.real} is not there", flush=True)
     failed = 0
-    for study, record in run([s for s in stale if s not in absent], options):
+    work = RESULTS / "work" / source
+    for study, record in run([s for s in stale if s not in absent], options, work):
         failed += record["exit_code"] != 0
         cost = f"{record['cpu_s']} s of CPU"
         print(f"{study.name}: {cost}, exit code {record['exit_code']}", flush=True)
@@ -150,11 +152,11 @@ def arguments() -> argparse.Namespace:
 
 
 def run(
-    studies: list[Study], options: argparse.Namespace
+    studies: list[Study], options: argparse.Namespace, work: Path
 ) -> Iterator[tuple[Study, dict[str, Any]]]:
     """Yield each study and its record as it ends; its page is written then."""
-    with ThreadPoolExecutor(options.workers) as pool, tempfile.TemporaryDirectory() as work:
-        waiting = {pool.submit(page, s, options.real, Path(work)): s for s in studies}
+    with ThreadPoolExecutor(options.workers) as pool:
+        waiting = {pool.submit(page, s, options.real, work / s.name): s for s in studies}
         try:
             for future in as_completed(waiting):
                 yield waiting[future], future.result()
@@ -164,6 +166,7 @@ def run(
 
 def page(study: Study, real: Path, work: Path) -> dict[str, Any]:
     """Run a study; a page that it made takes the place of the one before, else that one stays."""
+    work.mkdir(parents=True, exist_ok=True)
     out, log = work / f"{study.name}.md", work / f"{study.name}.log"
     clock = time.perf_counter()
     with log.open("w", encoding="utf-8") as printed:
@@ -183,6 +186,7 @@ def page(study: Study, real: Path, work: Path) -> dict[str, Any]:
     else:
         last = log.read_text("utf-8")[-2000:]
         print(f"{study.name} ended with {code}:\n{last}", file=sys.stderr, flush=True)
+    shutil.rmtree(work)
     return {"exit_code": code, "cpu_s": cpu_s, "wall_s": round(time.perf_counter() - clock)}
 
 

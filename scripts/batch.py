@@ -82,7 +82,9 @@ def batch(
         )
     first, _, last = share.partition("/")
     if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
-        raise InputError(f"--share {share}", todo="give I/N with I from 1 to N, like 3/40")
+        raise InputError(
+            f"--share {share} names no part", todo="give I/N with I from 1 to N, like 3/40"
+        )
     index, of = int(first) - 1, int(last)
     calibrating, smoothing = shake_of_model(calibrating, smoothing, only or ())
     check_options(calibration, calibrating)

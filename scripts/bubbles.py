@@ -18,7 +18,7 @@ def bubbles(
     images: Annotated[
         list[Path], typer.Argument(help="Backlit grey images, or folders of such images.")
     ],
-    out: Annotated[Path, typer.Option(help="Results folder.")] = Path("bubbles"),
+    out: Annotated[Path, typer.Option(help="Results folder.", file_okay=False)] = Path("bubbles"),
     min_diameter: options.MinDiameter = TrackingOptions.min_diameter_px,
     min_contrast: options.MinContrast = TrackingOptions.min_contrast,
     region: Annotated[

@@ -141,8 +141,7 @@ def _earlier(path: Path, dataset: Path) -> Calibration:
     from telerig.estimator.calibration.result.calibration import load_calibration
     from telerig.io.dataset.dataset import load_dataset
 
-    kept = path / "results" / "calibration"
-    earlier = load_calibration(kept if (kept / "calibration.json").is_file() else path)
+    earlier = load_calibration(path)
     rig = load_dataset(dataset, need_views=False).rig
     check_same_rig(earlier.cameras, tuple(rig.cameras.values()))
     return earlier

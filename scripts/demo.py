@@ -27,7 +27,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder to create; it must be new or empty.")] = Path(
         "telerig-demo"
     ),
-    seed: Annotated[int, typer.Option(help="Seed of the simulated rig and its noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated rig and its noise.", min=0)] = 0,
     quiet: options.Quiet = False,
 ) -> None:
     """Simulate a rig with images, calibrate it, track a bubble, remove the shake, compare.

@@ -130,10 +130,11 @@ def accelerometer(
 
     What the file does not say is asked for by the name of the option that says it.
     """
+    from telerig.io.dataset.run import run_folder
     from telerig.io.exchange.importing.accelerometer import import_accelerations, layout_from
     from telerig.io.exchange.importing.records import merge_accelerations
 
-    _check_run(run)
+    run_folder(run)
     layout = layout_from(
         {
             "columns": columns, "time_unit": time_unit, "rate_hz": rate_hz, "start_s": start_s,
@@ -171,6 +172,7 @@ def records(
     ] = None,
 ) -> None:
     """Import cameras of other programs, and recordings of accelerometers; list and remove these."""
+    from telerig.io.dataset.run import run_folder
     from telerig.io.exchange.importing.records import imported_records, remove_accelerations
 
     if listed is None:
@@ -184,7 +186,7 @@ def records(
         raise InputError(
             f"--list and {context.invoked_subcommand} are given", todo="give only one of them"
         )
-    _check_run(listed)
+    run_folder(listed)
     file = listed / "accelerometer.csv"
     if remove is not None:
         say(f"removed: {remove_accelerations(remove, file)} readings of {remove}")
@@ -194,13 +196,6 @@ def records(
         say(_record_words(name, table, frames_t_s))
     if not found:
         say(f"{listed}: there are no recordings of accelerometers")
-
-
-def _check_run(run: Path) -> None:
-    from telerig.io.files.names import absent
-
-    if not run.is_dir():
-        raise absent(run, "run", "check the path")
 
 
 def _clock_of(run: Path, sensor: str, table: pd.DataFrame) -> str | None:

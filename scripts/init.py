@@ -73,11 +73,16 @@ def init(
         if pitch is None:
             missing = f"pitch_mm, which stands for {seen.pitch_px:.1f} px, and {missing}"
     else:
+        if pitch is not None:
+            raise InputError(
+                f"--pitch {pitch:g} is of a target in images",
+                todo="add --from-images, or write pitch_mm into rig.toml",
+            )
         names = options.split_names(cameras) or []
         todo = "give width x height, like 1280x800"
         width, height = options.numbers_of("--size", size, 2, "x", todo)
         if not (width.is_integer() and height.is_integer()):
-            raise InputError(f"--size {size}", todo=todo)
+            raise InputError(f"--size {size}: these are no whole numbers", todo=todo)
         rig = [NewCamera(name, (int(width), int(height)), scale) for name in names]
         made = new_dataset(dataset, rig, angle_deg=angle, target=PRACTICE_TARGET)
         first = f"put the images of the target into {dataset / 'calibration'}/CAMERA"

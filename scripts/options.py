@@ -18,13 +18,17 @@ Dataset = Annotated[
 Run = Annotated[Path, typer.Argument(help="Folder of the recording, DATASET/runs/NAME.")]
 Runs = Annotated[list[Path], typer.Argument(help="Folders of the recordings, DATASET/runs/NAME.")]
 CalibrationFolder = Annotated[
-    Path | None, typer.Option(help="Results folder [DATASET/results/calibration].")
+    Path | None,
+    typer.Option(help="Results folder [DATASET/results/calibration].", file_okay=False),
 ]
-RunFolder = Annotated[Path | None, typer.Option(help="Results folder [DATASET/results/NAME].")]
+RunFolder = Annotated[
+    Path | None, typer.Option(help="Results folder [DATASET/results/NAME].", file_okay=False)
+]
 CalibrationFiles = Annotated[
     list[Path] | None,
     typer.Option(
-        help="calibration.json, or the two OpenLPT camera files in the order of the cameras "
+        help="calibration.json, its folder or its dataset; or the OpenLPT camera files in the "
+        "order of the cameras, the option once for each "
         "[DATASET/results/calibration/calibration.json]."
     ),
 ]

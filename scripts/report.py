@@ -45,9 +45,11 @@ def report(
     from telerig.io.report.remake import remake_report, results_folders
     from telerig.io.results.stale import stale
 
+    if run and not film:
+        raise InputError(f"--run {run} is for films", todo="add --film, or leave it out")
     found = results_folders(folder)
     runs = [results for results in found if results.kind == "run"]
-    if (film or run) and not runs:
+    if film and not runs:
         raise InputError(
             "holds no tracked run, and films are made of runs", where=str(folder),
             todo="leave out --film, or name the results folder of a run",

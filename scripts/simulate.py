@@ -33,7 +33,8 @@ def simulate(
         Path | None, typer.Option(help="Folder to create; it must be new or empty.")
     ] = None,
     seed: Annotated[
-        int, typer.Option(help="Seed of the random numbers; the same seed gives the same files.")
+        int,
+        typer.Option(help="Seed of the random numbers; the same seed gives the same files.", min=0),
     ] = 0,
     images: Annotated[
         bool,
@@ -76,7 +77,8 @@ def simulate(
         ),
     ] = False,
     seconds: Annotated[
-        float | None, typer.Option(help="With --devices: duration in seconds [until Ctrl-C].")
+        float | None,
+        typer.Option(help="With --devices: duration in seconds [until Ctrl-C].", min=0.1),
     ] = None,
 ) -> None:
     """Simulate a calibration, or a run of bubbles with one: images, rig.toml, and the truth.
@@ -89,8 +91,14 @@ def simulate(
     import numpy as np
 
     if devices:
+        if preset is not None:
+            raise InputError(f"--devices and {preset} are given", todo="give only one of them")
         _simulate_devices(out, seconds, np.random.default_rng(seed))
         return
+    if seconds is not None:
+        raise InputError(
+            f"--seconds {seconds:g} is for --devices", todo="add it, or leave both out"
+        )
     if preset is None or out is None:
         missing = "the name of what to simulate" if preset is None else "--out"
         raise InputError(
@@ -159,7 +167,9 @@ def _with_strip(
     if not isinstance(settings, RunConfig):
         raise _needs_run(name, "references")
     if dots < 0:
-        raise InputError(f"--references {dots}", todo="give the number of dots in view, like 6")
+        raise InputError(
+            f"--references {dots} is below 0", todo="give the number of dots in view, like 6"
+        )
     strip = StripConfig(dots) if images and dots else None
     return replace(settings, table=replace(settings.table, references=dots), strip=strip)
 

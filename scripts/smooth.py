@@ -40,7 +40,8 @@ def smooth(
         Path | None,
         typer.Option(
             help="Results folder [DATASET/results/NAME]. For several runs: a folder in which each "
-            "run gets a folder."
+            "run gets a folder.",
+            file_okay=False,
         ),
     ] = None,
     report: options.Report = True,

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from telerig.command_options import ShakePriors
 from telerig.scripts import options
 from telerig.scripts.console import (
     EXIT_REJECTED,
@@ -26,10 +27,13 @@ def validate(
         int, typer.Option(min=1, help="Number of marks that are withheld, one after the other.")
     ] = 6,
     model: Annotated[
-        str, typer.Option(help="Priors of the shake, as of `telerig smooth`: auto or default.")
+        ShakePriors,
+        typer.Option(help="Priors of the shake, as of `telerig smooth`: auto or default."),
     ] = "auto",
     accept: options.AcceptedFaults = None,
-    seed: Annotated[int, typer.Option(help="Seed of the motions that the marks are given.")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the motions that the marks are given.", min=0)
+    ] = 0,
     report: Annotated[bool, typer.Option(help="Write validation.html.")] = True,
     quiet: options.Quiet = False,
 ) -> None:

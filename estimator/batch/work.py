@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from telerig.command_options import CalibrationOptions, SmoothingOptions, TrackingOptions
+from telerig.errors import InputError
 from telerig.estimator.batch.cluster import dask_executor
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import RunData, load_run
@@ -48,10 +49,8 @@ def load_with(
     """Return a run. One whose folder belongs to no dataset has the cameras of the calibration."""
     if (run.resolve().parent.parent / "rig.toml").is_file():
         return load_run(run, source=source)
-    return load_run(
-        run, source=source, cameras=[c.name for c in calibration.cameras[:2]],
-        image_sizes_px={c.name: c.image_size_px for c in calibration.cameras},
-    )  # fmt: skip
+    sizes = {c.name: c.image_size_px for c in calibration.cameras}
+    return load_run(run, source=source, image_sizes_px=sizes)
 
 
 def calibrate_dataset(
@@ -101,6 +100,12 @@ def track_run(
     if options.cluster is not None:
         run, folder = run.resolve(), folder.resolve()
     calibrated, files = calibration_for(run, calibration)
+    if folder.resolve() == run.resolve():
+        raise InputError(
+            "is the folder of the run, whose detections.csv is of the recording",
+            where=str(folder),
+            todo="choose another --out",
+        )
     count = options.first_frames
     record = {"command": "track", "options": options.record(), "inputs": files, "again": again}
     cluster = options.cluster

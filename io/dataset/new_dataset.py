@@ -122,4 +122,5 @@ def _check(cameras: Sequence[NewCamera], where: str) -> None:
             words = f"image size {size[0]} x {size[1]}"
             raise InputError(words, todo="give width x height in pixels")
         if not scale > 0:
-            raise InputError(f"scale {scale} px/mm", todo="give a positive number")
+            what = f"the scale is {scale} px/mm, not positive"
+            raise InputError(what, where="--scale", todo="give a positive number")

@@ -168,7 +168,7 @@ def load_run(
     source : "images" or "detections", from which bubbles are taken; None takes the only one that
         there is. It has to be given if the folder has both.
     cameras : names of the cameras; None takes those that `[tracking]` in rig.toml names, or all
-        that have images (rows in detections.csv).
+        of rig.toml (without one, of ``image_sizes_px``) that have images (rows in detections.csv).
     image_sizes_px : (width, height) by camera; they replace those of rig.toml.
     pair_by : how the images of several cameras are paired: "numbers", "order" or "auto", see
         `telerig.io.dataset.run.pair_frames`.
@@ -178,18 +178,18 @@ def load_run(
 
     Returns a `RunData`. Raises InputError, which names the file, the row or frame, and what to do.
     """
-    folder = _run_folder(Path(path))
+    folder = run_folder(Path(path))
     check_name(folder.resolve().name, str(folder), "run")
     above = folder.parent.parent / "rig.toml"
     if rig is None and above.is_file():
         rig = read_rig_toml(above)
-    names = list(cameras) if cameras else _cameras_of(rig, folder)
+    names = list(cameras) if cameras else _cameras_of(rig, image_sizes_px or {}, folder)
     every = list(rig.cameras) if rig and not set(names) - set(rig.cameras) else names
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()} if rig else {}
     sizes |= dict(image_sizes_px or {})
     notes: list[str] = []
     images = _choose_source(folder, names, source) == "images"
-    stated = bool(cameras) or rig is None or rig.tracking is not None
+    stated = bool(cameras) or (rig is not None and rig.tracking is not None)
     if images:
         names = _those_there(names, set(recordings(folder)), stated)
     detections = None
@@ -235,8 +235,12 @@ def load_run(
     return _with_ends_checked(run)
 
 
-def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
-    """Return the names of the tracking cameras."""
+def _cameras_of(
+    rig: RigDescription | None, sizes_px: Mapping[str, tuple[int, int]], folder: Path
+) -> list[str]:
+    """Return the names of the tracking cameras; without a rig, of those whose sizes are given."""
+    if rig is None and sizes_px:
+        return list(sizes_px)
     if rig is None or not rig.cameras:
         raise InputError(
             "there is no rig.toml two folders up, so the cameras are not known",
@@ -258,8 +262,8 @@ def _of(names: list[str], table: pd.DataFrame) -> pd.DataFrame:
     return table if mine.all() else table[mine].reset_index(drop=True)
 
 
-def _run_folder(path: Path) -> Path:
-    """Return the absolute path of the run's folder."""
+def run_folder(path: Path) -> Path:
+    """Return the absolute path of a run's folder. Raises InputError if it is none."""
     if path.is_dir():
         return path.resolve()
     if path.exists():
@@ -440,8 +444,16 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
     at = np.interp(t_s, t, position, left=np.nan, right=np.nan)
     outside = np.flatnonzero(np.isnan(at))
     if outside.size:
-        notes.append(_outside_record(t_s, outside) + "; their stage position is not known")
+        notes.append(
+            f"{_outside_record(t_s, outside)}, {t[0]:.6g} to {t[-1]:.6g} s; their stage position "
+            "is not known. Check that both files are in s and of one clock"
+        )
     step = np.diff(t)
+    if len(t_s) > 1 and np.median(step) > t_s[-1] - t_s[0]:
+        notes.append(
+            f"the readings of stage.csv are {np.median(step):.3g} s apart, more than the run's "
+            f"{t_s[-1] - t_s[0]:.3g} s. Check that t_s is in s"
+        )
     wide = np.flatnonzero(step > 10 * np.median(step))
     hit = [i for i in wide if np.any((t_s > t[i]) & (t_s < t[i + 1]))]
     if hit:
@@ -491,8 +503,7 @@ Pairing = Literal["auto", "numbers", "order"]
 
 _TODO = (
     "do one of these: add the missing images; give images of the same frame the same number in "
-    "their names; name the missing frames in the column `missing` of frames.csv; or pair the "
-    "images in order (--pair-by order)"
+    "their names; or name the missing frames in the column `missing` of frames.csv"
 )
 
 
@@ -528,7 +539,7 @@ def pair_frames(
         raise InputError(
             f"the names of the images of camera {silent} do not contain the number of the frame",
             where=where,
-            todo="name images like 000000.tif, 000001.tif, or pair them in order (--pair-by order)",
+            todo='name images like 000000.tif, 000001.tif, or pair them in order (pair_by="order")',
         )
     if len(set(counts.values())) > 1:
         counted = ", ".join(f"{name} {count}" for name, count in counts.items())
@@ -560,8 +571,8 @@ def _trustworthy(numbers: Mapping[str, Ints], where: str) -> bool:
             "the cameras have equal numbers of images, but the numbers in the images' names start "
             f"differently: {starts}",
             where=where,
-            todo="give --pair-by numbers if equal numbers mean the same frame (frames are then "
-            "missing at the ends), or --pair-by order if the first images belong together",
+            todo="write frames.csv with a column `missing`: blank if the first images belong "
+            "together; with the frames that a camera misses, if equal numbers mean the same frame",
         )
     return 2 * len(shared) >= min(map(len, sets))
 

@@ -151,7 +151,9 @@ def export_results(
 
     known = CAMERA_EXPORTS | RUN_EXPORTS
     if to not in known:
-        raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
+        raise InputError(
+            f"--to {to}: there is no such format", todo=f"use one of: {', '.join(known)}"
+        )
     _refuse_options_of_others(to, run=run, calibration=calibration, volume=volume)
     results = None
     if to in RUN_EXPORTS:

@@ -75,9 +75,11 @@ def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def staged_folder(final: Path) -> Iterator[Path]:
-    """Yield an empty temporary folder beside ``final``, and remove it at the end.
+    """Yield an empty temporary folder, and remove it at the end.
 
-    Raises InputError when the place cannot be written.
+    It lies beside ``final``, from where its files can be renamed, or in it where ``final`` is a
+    disk of its own or the folder above cannot be written. Raises InputError when the place cannot
+    be written.
     """
     if final.exists() and not final.is_dir():
         raise InputError(
@@ -86,13 +88,16 @@ def staged_folder(final: Path) -> Iterator[Path]:
             todo="choose another --out",
         )
     make_parent(final)
-    remove_leftovers(final.parent)
-    temporary = _beside(final, "")
+    alone = final.is_dir() and (
+        os.path.ismount(final) or not os.access(final.absolute().parent, os.W_OK)
+    )
+    temporary = _beside(final / "results" if alone else final, "")
+    remove_leftovers(temporary.parent)
     try:
         try:
             temporary.mkdir()
         except OSError as error:
-            raise unwritable(temporary, error) from error
+            raise unwritable(final, error) from error
         with _write_errors_in_words(final, temporary):
             yield temporary
     finally:
@@ -142,7 +147,8 @@ def plain(content: Any) -> Any:
 
 def _beside(final: Path, suffix: str) -> Path:
     mark = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
-    return final.with_name(f".{final.name}.{mark}.part{suffix}")
+    whole = Path(os.path.normpath(final.absolute()))  # "." and ".." have no name
+    return whole.parent / f".{whole.name}.{mark}.part{suffix}"
 
 
 @cache
@@ -225,8 +231,10 @@ def unwritable(path: Path, error: OSError) -> InputError:
     """Return the error that says that ``path`` cannot be written, why, and what to do."""
     if error.errno in _FULL:
         todo = "make room on the disk, then run the command again"
+    elif error.errno in (errno.EEXIST, errno.ENOTDIR):
+        todo = "a file has the name of a folder that is needed: choose another place"
     elif error.errno == errno.ENOENT or error.errno is None:
         todo = "the folder was removed meanwhile: run the command again"
     else:
-        todo = "choose a folder that can be written (--out), or change its permissions"
+        todo = "choose a folder that can be written, or change its permissions"
     return InputError(f"cannot be written: {error.strerror or error}", where=str(path), todo=todo)

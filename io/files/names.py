@@ -1,4 +1,4 @@
-"""The rule for names: of cameras, views, runs, sensors, marks and bubbles.
+"""The rule for names: of views, runs, sensors, marks and bubbles; `camera_names` has more of it.
 
 A name becomes a file name, a line of another program's script or a cell of a table, so it must be
 harmless in each of them. Letters of any language, digits, spaces and most signs are allowed.

@@ -31,7 +31,10 @@ EXTENSIONS = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 _FORMATS = "telerig reads TIFF, PNG, BMP and JPEG"
 MOST_BYTES = 400_000_000
 """The largest size of a decoded image: 400 million pixels of 8 bits, 200 million of 16 bits."""
-_COPY = "copy or record it again, or leave it out (in a run with skip_unreadable)"
+_COPY = (
+    "copy or record it again, or remove it; of a run telerig.load_run(skip_unreadable=True) leaves "
+    "it out"
+)
 _COLOUR = (
     "images are in colour: their green channel is used, of which a colour sensor has most pixels; "
     "a mono camera, or a mono mode, resolves better"

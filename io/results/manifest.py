@@ -290,7 +290,7 @@ def replaced_results(
     again : the command line that makes the files again.
     inputs : the fingerprints of the inputs by path relative to ``folder``, see `fingerprints`.
 
-    Raises InputError when the folder cannot be written.
+    Raises InputError when the folder cannot be written, and when a file would replace an input.
     """
     again = again if len(again) <= LONGEST_COMMAND else again[:LONGEST_COMMAND] + " ..."
     section = Section(again=again, telerig=VERSION, inputs=dict(inputs))
@@ -299,6 +299,8 @@ def replaced_results(
             **_old(folder).sections,
             command: section.model_copy(update={"unfinished": True}),
         }
+        if folder.is_dir() and staged.parent.samefile(folder):
+            sections = {name: _one_deeper(one) for name, one in sections.items()}
         Manifest.of_sections(sections).write(staged / NAME)
         yield staged
         (staged / NAME).unlink()
@@ -306,11 +308,23 @@ def replaced_results(
         files = {path.relative_to(staged).as_posix(): _entry(path) for path in paths}
         for name in (NAME, *files):
             _make_room(folder / name)
+            if name in inputs:
+                raise InputError(
+                    "would be written over, and these results are made from it",
+                    where=str(folder / name),
+                    todo="choose another --out",
+                )
         remove_leftovers(folder)
         done = datetime.now(UTC).isoformat(timespec="seconds")
         new = section.model_copy(update={"files": files, "finished": done})
         with _locked(folder, fcntl.LOCK_EX):
             _replace(staged, folder, command, new)
+
+
+def _one_deeper(section: Section) -> Section:
+    """Return a section whose inputs are named from a folder inside the one that it was made for."""
+    inputs = {(Path("..") / name).as_posix(): one for name, one in section.inputs.items()}
+    return section.model_copy(update={"inputs": inputs})
 
 
 def _old(folder: Path) -> Manifest:

@@ -34,7 +34,8 @@ def camera_name_faults(names: Sequence[str]) -> list[CameraNameFault]:
     found = []
     for i, name in enumerate(names):
         if not _NAME.fullmatch(name):
-            what, todo = "the name cannot be used for a folder", "use letters, digits, _ and - only"
+            what = "a camera's name has letters, digits, _ and - only, and does not begin with -"
+            todo = "it is a folder, a key and a part of columns' names: choose another one"
             found.append(CameraNameFault(name, what, todo))
         if name.lower() in _RESERVED:
             found.append(CameraNameFault(name, _RESERVED[name.lower()], _OTHER))

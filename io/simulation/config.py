@@ -399,6 +399,7 @@ class RunConfig:
             "d_eq_mm": (not self.bubble.d_eq_mm[0] > 0, "positive"),
             "blur_px": (not self.image.blur_px >= 0.2, "at least 0.2"),
             "dropped": (not 0 <= self.image.dropped < 1, "within 0 and 1"),
+            "encoder_scale": (not abs(self.stage.encoder_scale) < 1, "between -1 and 1"),
         }
         driven = self.motion.path == "forces"
         faults["fluid"] = (
@@ -406,7 +407,8 @@ class RunConfig:
             'given for the path "forces" and the aspect "wellek"',
         )
         faults["pairs"] = (driven and self.motion.pairs, 'False for the path "forces"')
-        values = vars(self.bubble) | vars(self.image) | vars(self.motion) | vars(self)
+        parts = (self.bubble, self.image, self.motion, self.stage, self)
+        values = {name: value for part in parts for name, value in vars(part).items()}
         _refuse(self.name, values, faults)
 
 

@@ -194,5 +194,7 @@ def frames_of(text: str | None) -> tuple[int, int] | None:
         return None
     first, colon, end = text.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal() and int(first) < int(end)):
-        raise InputError(f"--frames {text}", todo="give A:B with A below B, like 100:200")
+        raise InputError(
+            f"--frames {text} names no frames", todo="give A:B with A below B, like 100:200"
+        )
     return int(first), int(end)

@@ -233,3 +233,25 @@ def test_only_telerigs_own_command_line_is_taken(monkeypatch: pytest.MonkeyPatch
     for program in ("/lib/pytest/__main__.py", "/home/lab/nightly.py"):
         monkeypatch.setattr(sys, "argv", [program, *rest])
         assert console.typed_command() == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["report", "TANK", "--run", "x"], "add --film"),
+        (["init", "new", "--pitch", "7"], "add --from-images"),
+        (["simulate", "paper", "--out", "new", "--seconds", "5"], "is for --devices"),
+        (["simulate", "paper", "--out", "new", "--seed", "-1"], "--seed"),
+        (["simulate", "rise", "--out", "new", "--encoder-scale", "nan"], "encoder_scale is nan"),
+        (["export", "TANK", "--to", "csv"], "there is no such format"),
+        (["calibrate", "TANK", "--out", "TANK/rig.toml"], "is a file"),
+        (["track", "TANK"], "is not the folder of a run"),
+    ],
+)
+def test_options_without_effect_and_impossible_ones(
+    paper_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shown = run(*(word.replace("TANK", str(paper_images)) for word in words), code=2)
+    assert said in " ".join(shown.replace("│", " ").split())
+    assert not list(tmp_path.iterdir())

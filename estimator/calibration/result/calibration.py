@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from telerig.arrays import Array, as_points
 from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.result.summary import summary
+from telerig.io.dataset.run import run_folder
 from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
 from telerig.rig.camera import Camera
@@ -653,19 +654,23 @@ def of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
 def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:
     """Read the calibration for a run, either that of its dataset or the one in ``files``.
 
-    files : one calibration.json or its folder, or the two camera files of OpenLPT (.txt); None or
-    empty for that of the dataset.
+    files : one calibration.json, its folder or its dataset, or the camera files of OpenLPT (.txt)
+    in the order of the cameras; None or empty for that of the run's dataset.
     Returns the calibration and the files that were read. Raises InputError if there is no
     calibration, or if the files do not belong together.
     """
     if not files:
         default = run.resolve().parent.parent / "results" / "calibration" / "calibration.json"
+        run_folder(run)
         if not default.is_file():
+            inside = run.resolve().parent.name == "runs"
             raise InputError(
-                "there is no calibration",
-                where=str(default),
+                "there is no calibration" if inside else "is not the folder of a run in a dataset",
+                where=str(default if inside else run),
                 todo="run `telerig calibrate` on the dataset, or give a calibration with "
-                "--calibration",
+                "--calibration"
+                if inside
+                else "give DATASET/runs/NAME, or the run's calibration with --calibration",
             )
         return load_calibration(default), [default]
     if len(files) == 1 and files[0].suffix != ".txt":
@@ -673,14 +678,14 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
 
         found = load_calibration(files[0])
         return found, [CalibrationResults.at(files[0]).path]
-    if len(files) == 2 and all(p.suffix == ".txt" for p in files):
+    if all(p.suffix == ".txt" for p in files):
         from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 
         cameras, *_ = read_openlpt_cameras(list(files))
         return calibration_from_cameras(cameras, name="OpenLPT"), list(files)
     raise InputError(
         f"--calibration was given {len(files)} times: {', '.join(p.name for p in files)}",
-        todo="give one calibration.json, or two OpenLPT camera files (.txt)",
+        todo="give one calibration.json, or the OpenLPT camera files (.txt) of all cameras",
     )
 
 

@@ -59,10 +59,12 @@ def write_vtk(results: RunResults, out: str | PathLike[str]) -> None:
         for name, first, last in zip(names, bounds, bounds[1:]):
             rows = order[first:last]
             mine = {key: values[rows] for key, values in arrays.items()}
-            (place / name).write_text(_vtp(xyz[rows], mine, "Verts", np.ones(len(rows), np.int64)))
+            (place / name).write_text(
+                _vtp(xyz[rows], mine, "Verts", np.ones(len(rows), np.int64)), "utf-8"
+            )
         sizes = np.diff(np.flatnonzero(np.r_[True, np.diff(numbers) != 0, True]))
         along = {"particle": numbers, "t_s": points["t_s"].to_numpy(float)}
-        (place / PATHS).write_text(_vtp(xyz, along, "Lines", sizes))
+        (place / PATHS).write_text(_vtp(xyz, along, "Lines", sizes), "utf-8")
         (place / SERIES).write_text(_pvd(names, t_s, comment), encoding="utf-8")
     for old in (folder / _FRAMES).glob("bubbles_*.vtp"):
         if f"{_FRAMES}/{old.name}" not in names:

@@ -51,12 +51,15 @@ class CalibrationResults:
 
     @classmethod
     def at(cls, place: Path) -> Self:
-        """Return the results in a folder, or those whose calibration.json is given.
+        """Return the results in a folder or of a dataset, or those whose calibration.json is given.
 
         Raises InputError where nothing is there.
         """
         if not place.exists():
             raise absent(place, "calibration", f"run `{CalibrationFile.MAKE}` first")
+        own = place / "results" / "calibration"
+        if not (place / cls.name).is_file() and (own / cls.name).is_file():
+            return cls(own)
         return cls(place) if place.is_dir() else cls(place.parent, place.name)
 
     @property

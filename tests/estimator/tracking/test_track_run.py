@@ -382,8 +382,9 @@ def test_the_command_writes_what_the_contract_names(rise: Path, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["nowhere/runs/rise"], "there is no calibration"),
-        (["RUN", "--calibration", "a.txt"], "two OpenLPT camera files"),
+        (["nowhere/runs/rise"], "there is no such run"),
+        (["RUN", "--calibration", "a.txt", "--calibration", "b.json"], "the OpenLPT camera files"),
+        (["RUN", "--out", "RUN"], "choose another --out"),
         (["RUN", "--from", "video"], "'detections'"),
     ],
 )

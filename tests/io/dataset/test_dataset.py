@@ -305,7 +305,7 @@ def test_places_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "is a folder" in error_of(lambda: write_text_atomic(tmp_path, "x"))
     message = error_of(lambda: write_text_atomic(tmp_path / "file" / "a.txt", "x"))
-    assert "cannot be written" in message and "--out" in message
+    assert "cannot be written" in message and "choose another place" in message
 
     def stage_into_a_file() -> None:
         with atomic_folder(tmp_path / "file"):

@@ -130,3 +130,16 @@ def test_references(full_run: Path) -> None:
     error_of(full_run, "references.csv row 3, column mark", "'a' stands twice in frame 0")
     file.write_text(head + "6,left,a,3,4\n")
     error_of(full_run, "row 2, column frame", "is 6, but the last frame is 5")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [([0, 1, 2], "Check that t_s is in s"), ([0, 0.1, 0.2], "Check that both files are in s")],
+)
+def test_a_stage_record_in_milliseconds_is_noticed(
+    full_run: Path, seconds: list[float], said: str
+) -> None:
+    (full_run / "frames.csv").write_text(times(GOOD))
+    rows = "".join(f"{t},{i}\n" for i, t in enumerate(seconds))
+    (full_run / "stage.csv").write_text("t_s,position_mm\n" + rows)
+    assert said in " ".join(load_run(full_run).notes)

@@ -138,7 +138,7 @@ def test_counters_of_their_own(run_folder: Path) -> None:
 def test_counters_off_by_one_are_not_guessed(run_folder: Path) -> None:
     write_images(run_folder / "left", LEFT, range(6))
     write_images(run_folder / "right", RIGHT, range(1, 7))
-    error_of(run_folder, "start differently: left at 0 and right at 1", "--pair-by numbers")
+    error_of(run_folder, "start differently: left at 0 and right at 1", "column `missing`")
     assert load_run(run_folder, pair_by="order").frame_count == 6
     run = load_run(run_folder, pair_by="numbers")
     assert run.frame_count == 7 and run.image("right", 0) is None

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from places import REAL
 
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.batch.work import load_with
 from telerig.estimator.calibration.result.calibration import (
+    calibration_for,
     calibration_from_cameras,
     load_calibration,
 )
@@ -216,3 +218,24 @@ def test_imported_cameras_must_form_a_rig(tmp_path: Path) -> None:
         calibration_from_cameras([])
     with pytest.raises(CalibrationError, match="sigma_px"):
         calibration_from_cameras(cameras, sigma_px=0.0)
+
+
+def test_tracking_takes_the_files_of_all_cameras(tmp_path: Path) -> None:
+    """A run outside a dataset has the cameras of the calibration that have images."""
+    files = []
+    for i, angle in enumerate((0.0, 0.7, 1.4)):
+        rotation = cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
+        files.append(tmp_path / f"cam{i}.txt")
+        files[-1].write_text(text(rotation, np.array([0.0, 0.0, 1000.0])), encoding="utf-8")
+    run = tmp_path / "recorded"
+    for name in ("cam0", "cam2"):
+        (run / name).mkdir(parents=True)
+        for k in range(2):
+            cv2.imwrite(str(run / name / f"{k}.png"), np.zeros((800, 1280), np.uint8))
+    (run / "run.toml").write_text("frame_rate_hz = 500.0")
+    calibration, used = calibration_for(run, files)
+    assert [camera.name for camera in calibration.cameras] == ["cam0", "cam1", "cam2"]
+    assert used == files
+    assert load_with(run, calibration, None).cameras == ("cam0", "cam2")
+    with pytest.raises(InputError, match="OpenLPT camera files"):
+        calibration_for(run, [*files, tmp_path / "calibration.json"])

@@ -411,3 +411,30 @@ def test_leftovers_of_dead_commands_are_removed(tmp_path: Path, monkeypatch) -> 
     assert leftovers(folder) == sorted(
         [".notes.part", *(f".a.csv.{mark}.part.csv" for mark in kept)]
     )
+
+
+def test_results_never_replace_what_they_are_made_from(tmp_path: Path) -> None:
+    (tmp_path / "detections.csv").write_text("recorded")
+    with pytest.raises(InputError, match="would be written over"):
+        write(tmp_path, "track", {"d": tmp_path / "detections.csv"}, detections_csv="found")
+    assert (tmp_path / "detections.csv").read_text() == "recorded"
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_folder_that_is_a_disk_of_its_own_and_one_without_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alone: bool
+) -> None:
+    """Files can be renamed within a disk only; "." has no name beside which to write."""
+    (folder := tmp_path / "disk").mkdir()
+    monkeypatch.setattr(os.path, "ismount", lambda path: alone)
+    monkeypatch.chdir(folder)
+    (source := tmp_path / "rig.toml").write_text("a = 1")
+    inputs = fingerprints(Path(), [source])
+    with replaced_results(Path(), "track", again="telerig track X", inputs=inputs) as staged:
+        assert staged.parent == (folder if alone else tmp_path)
+        (staged / "tracks.csv").write_text("new")
+        assert not stale(staged)
+        source.write_text("a = 2")
+        assert "rig.toml has changed" in " ".join(stale(staged))
+    assert read(folder, "tracks.csv") == ["new"]
+    assert sorted(p.name for p in folder.iterdir()) == ["manifest.json", "tracks.csv"]

@@ -13,10 +13,8 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.io.rig_file.fluid import liquid_of, liquid_velocity
-from telerig.io.tables.smoothing import BODY_COLUMNS, BUBBLES, NUMBERS
+from telerig.io.tables.smoothing import AXES, BODY_COLUMNS, BUBBLES, NUMBERS
 from telerig.rig.bubble_physics import Liquid, added_mass, drag_coefficient
-
-AXES = ("x", "y", "z")
 
 _M = 1e-3
 

@@ -9,10 +9,9 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
-from telerig.estimator.physics.frames import AXES
 from telerig.estimator.physics.means import SD, Lasting, mean_of_body, parts_of_body
 from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillation, zigzag
-from telerig.io.tables.smoothing import SUMMARY
+from telerig.io.tables.smoothing import AXES, SUMMARY
 from telerig.rig.bubble_physics import Liquid
 
 _ABOVE_ZIGZAG = 2.6

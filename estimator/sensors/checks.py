@@ -148,7 +148,9 @@ def _encoder(stage: Any, frames: Array, where: str) -> tuple[Encoder | None, lis
     bad = np.flatnonzero(~(np.diff(t) > 0))
     if len(bad) or len(t) < 2:
         raise InputError(
-            f"times do not increase at row {int(bad[0]) + 1}" if len(bad) else "has one reading",
+            f"times do not increase at row {int(bad[0]) + 1}"
+            if len(bad)
+            else f"has {len(t)} readings",
             where=where,
             todo="sort the rows and remove duplicates; a stage that stands needs no encoder",
         )

@@ -207,7 +207,7 @@ def _sensor(
             todo=f"state {' and '.join(missing)} with the readings, or under "
             f"[accelerometers.{name}] in rig.toml",
         )
-    t, reading, unit, found = _samples(name, source, where)
+    t, reading, unit, found = _samples(source, where)
     t, reading, unordered = _in_order(t, reading, where)
     clock = fields.get("clock", clock)
     if clock not in get_args(Clock):
@@ -222,9 +222,7 @@ def _sensor(
     return sensor, found + unordered
 
 
-def _samples(
-    name: str, source: Mapping[str, Any], where: str
-) -> tuple[Array, Array, str, list[Finding]]:
+def _samples(source: Mapping[str, Any], where: str) -> tuple[Array, Array, str, list[Finding]]:
     """Return times (N,), readings (N, 3) in m/s^2, their unit, and what was assumed."""
     given = [key for key in ("a_m_s2", "a") if source.get(key) is not None]
     if len(given) != 1 or source.get("t_s") is None:
@@ -266,14 +264,14 @@ def _samples(
             )
         unit = "m/s^2"
     if unit is None:
-        unit, found = _inferred(reading, name, where)
+        unit, found = _inferred(reading, where)
     if unit not in ACCELERATION_UNITS:
         todo = _one_of(str(unit), list(ACCELERATION_UNITS))
         raise InputError(f"unit is {unit!r}", where=where, todo=todo)
     return t, reading * ACCELERATION_UNITS[unit], unit, found
 
 
-def _inferred(reading: Array, name: str, where: str) -> tuple[str, list[Finding]]:
+def _inferred(reading: Array, where: str) -> tuple[str, list[Finding]]:
     """Return the unit in which gravity has its size, and a warning that says so."""
     size = float(np.linalg.norm(np.median(reading, axis=0)))
     unit = unit_of_gravity(size)

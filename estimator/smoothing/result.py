@@ -27,6 +27,7 @@ from telerig.estimator.smoothing.verdict.evidence import BUBBLES, MARKS, Evidenc
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra
 from telerig.factors.bubble_motion import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
+from telerig.io.tables.smoothing import AXES
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 from telerig.short_text import ShortText, counted, first_of
 
@@ -379,11 +380,10 @@ def _travel(solution: Solution) -> dict[str, Any]:
     travel = solution.graph.problem.travel
     if travel is None or solution.graph.problem.stage is None:
         return {}
-    return {
-        "axis": travel.axis.tolist(),
-        "axis_from": "stage_axis" if travel.source == "stage_axis" else "rig.toml",
-        "axis_sd_deg": np.degrees(np.sqrt(np.diagonal(travel.covariance)[:2])).tolist(),
-    }
+    out = {"axis": travel.axis.tolist()}
+    if travel.source == "stage_axis":  # one that is stated counts as exact
+        out["axis_sd_deg"] = np.degrees(np.sqrt(np.diagonal(travel.covariance)[:2])).tolist()
+    return out
 
 
 def sensors_of(solution: Solution) -> dict[str, Any]:
@@ -500,7 +500,6 @@ def load_smoothing(folder: str | Path) -> Smoothing:
     return Smoothing(verdict, content, model, tables, name=place.resolve().name)
 
 
-AXES = ("x", "y", "z")
 _LEAST_LEFT = 0.1
 """The pixels' noise alone leaves about a sixth of an acceleration's variance."""
 LONGEST_RTS = 5000

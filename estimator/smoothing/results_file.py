@@ -15,9 +15,9 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.smoothing.verdict.evidence import AXES
 from telerig.io.files.csv_table import append_table, write_table
 from telerig.io.files.hdf5 import hdf5_file, read_arrays
+from telerig.io.tables.smoothing import AXES
 
 if TYPE_CHECKING:
     import h5py

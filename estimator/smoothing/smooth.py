@@ -98,8 +98,6 @@ Learn = Callable[[SmoothingProblem], ShakeModel]
 _COARSE_STEP_S = 2e-3
 _MOST_ALIGNED, _MOST_PIXELS = 20_000, 500_000
 _MOST_COMPARED, _BUBBLES_COMPARED = 1500, 3
-_ENCODER_SIGMA_MM = 0.005
-_LEAST_SAMPLES = 2
 _LEAST_LEARNED_S = 0.2
 """Shortest time of a bubble for which shake is learned. In less time a slow shake shows no period,
 and learning would find no shake.
@@ -278,7 +276,10 @@ class _Run:
         """Smooth it as a whole."""
         problem = self.problem
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
-            solution = self._solved(problem, step)
+            solution = _adapted_solution(problem, self.model, self.options, step, given=self.given)
+            if solution.graph.model.learned:
+                step("uncertainty of what was learned", 0.9)
+                solution = with_hyperparameter_uncertainty(solution)
         with self.phases.phase("verdict", "judging the result"):
             from telerig.estimator.smoothing.verdict.judge import judge
 
@@ -323,14 +324,6 @@ class _Run:
             problem.cameras, Lasting.of(_shapes_of(self.tracks)),
         )  # fmt: skip
 
-    def _solved(self, problem: SmoothingProblem, step: Progress) -> Solution:
-        """Solve a run, or a piece; hyper-parameters that are not given are set by the result."""
-        solution = _adapted_solution(problem, self.model, self.options, step, given=self.given)
-        if solution.graph.model.learned and not self.given:
-            step("uncertainty of what was learned", 0.9)
-            solution = with_hyperparameter_uncertainty(solution)
-        return solution
-
     def in_pieces(self, pieces: Sequence[Piece], tables: StoredTables) -> _Done:
         """Smooth it piece by piece, each of which is written as it comes.
 
@@ -346,7 +339,10 @@ class _Run:
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
             middle = piece_with_most(problem, pieces)
             step("a piece in the middle", 0.0)
-            model = self._solved(pieces[middle].cut(problem).problem, _silent).graph.model
+            model = _adapted_solution(
+                pieces[middle].cut(problem).problem, self.model, self.options, _silent,
+                given=self.given,
+            ).graph.model  # fmt: skip
             step("what is constant along the run", 0.0)
             constants = Constants.of(problem, model, pieces, self.options, step)
             with results_file(tables.folder) as file:
@@ -544,7 +540,9 @@ def problem_of(
         )
     check_increasing(at_frames, "frames")
     described = None if rig is None else rig.stage
-    encoder_sigma = _ENCODER_SIGMA_MM if described is None else float(described.position_sigma_mm)
+    encoder_sigma = ShakeModel.encoder_sigma_mm
+    if described is not None:
+        encoder_sigma = float(described.position_sigma_mm)
     travel = travel_of(calibration.stage, described)
     axis, mounting = travel.axis, Mounting.of(described, travel.axis)
     sensors = read_sensors(
@@ -591,17 +589,22 @@ def choose_model(
 
     Raises InputError for an unknown word.
     """
-    if isinstance(model, ShakeModel):
-        return model
-    if callable(model):
-        made = model(problem)
-        if not isinstance(made, ShakeModel):
+    made = model(problem) if callable(model) else model
+    if isinstance(made, ShakeModel):
+        if problem.accelerometers and problem.stage and made.carriage.kind == "readings":
             raise InputError(
-                f"the function given as model returns {type(made).__name__}",
+                "the model's carriage has no acceleration, which accelerometers measure",
                 where="smooth",
-                todo="return a ShakeModel",
+                todo='give the ShakeModel carriage=CarriageModel("force"), or leave out the '
+                "accelerometers",
             )
         return made
+    if callable(model):
+        raise InputError(
+            f"the function given as model returns {type(made).__name__}",
+            where="smooth",
+            todo="return a ShakeModel",
+        )
     if not isinstance(model, str) or model not in ("auto", "default"):
         raise InputError(
             f"model is {model!r}", where="smooth", todo='give "auto", "default" or a ShakeModel'

@@ -127,8 +127,7 @@ class Solution:
     log_evidence : natural logarithm of the marginal likelihood; exact for affine cameras, otherwise
         at the last linearisation.
     passes : number of linearisations that were made.
-    sample_weights, sample_residuals : weights (N,) of each accelerometer's samples, None where all
-        are 1, and their whitened residuals (N, k) along the k directions of modelled motion.
+    sample_weights : weights (N,) of each accelerometer's samples, None where all are 1.
     draws : None if they were not asked for.
     ways : what `way_variances` returns; None without draws, or without a low-pass of the bubbles'
         forces.
@@ -144,7 +143,6 @@ class Solution:
     log_evidence: float
     passes: int
     sample_weights: SampleWeights = ()
-    sample_residuals: tuple[Array, ...] = ()
     draws: Draws | None = None
     ways: tuple[Array, Array] | None = None
     constants: Array | None = None
@@ -256,9 +254,7 @@ def _solve(
     _check_converged(graph, state, 0.0 if exact else last.largest_px)
     found = _finish(graph, state, (weights, residuals), last, options, done, progress)
     _check_variances(found.covariances)
-    return replace(
-        found, sample_weights=samples, sample_residuals=sample_residuals(graph, found.state)
-    )
+    return replace(found, sample_weights=samples)
 
 
 def _shake_mm(graph: GraphLayout, state: State) -> dict[str, Array]:
@@ -297,7 +293,7 @@ def _check_variances(found: Covariances | None) -> None:
         return
     for what, covariance in (("bubble", found.bubbles), ("rig", found.shake)):
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        if variance.size and np.any(variance < -_ROUNDING * variance.max(axis=0)):
+        if variance.size and not np.all(variance >= -_ROUNDING * variance.max(axis=0)):
             raise CalibrationError(
                 f"a state of a {what} has a negative variance because of rounding: the data hardly "
                 "determine it",

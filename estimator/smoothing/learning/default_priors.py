@@ -51,7 +51,9 @@ DEFAULT_FLOOR = 0.12
 """Of the band. A mode of damping z has 4 z / (pi f) RMS^2 per Hz below it; this is z = 0.05."""
 
 
-def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
+def default_model(
+    problem: SmoothingProblem, encoder_sigma_mm: float = ShakeModel.encoder_sigma_mm
+) -> ShakeModel:
     """Return default priors for a problem.
 
     With marks or accelerometers the prior of the shake is a broad band; otherwise it consists of a
@@ -226,14 +228,13 @@ def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> Carr
     stage = problem.stage
     if stage is None:
         return CarriageModel()
-    wanted = bool(problem.accelerometers) or not _dense(stage, problem.t_s, encoder_sigma_mm)
-    if not wanted:
+    if not problem.accelerometers and _dense(stage, encoder_sigma_mm):
         return CarriageModel()
     rms = acceleration_rms(stage, encoder_sigma_mm)
     return CarriageModel("force", acceleration_rms_mm_s2=max(rms, 100.0))
 
 
-def _dense(stage: Stage, t_s: Array, sigma_mm: float) -> bool:
+def _dense(stage: Stage, sigma_mm: float) -> bool:
     """Return whether linear interpolation between two readings errs by less than their noise."""
     if len(stage.t_s) < 3:
         return False

@@ -327,7 +327,7 @@ class Factor:
         self.bases = steps.basis
         self.weight = weight = signal.weight / model.pixel_inflation**2
         self.rows = system.rows @ self.bases
-        self.guess = _fitted(signal, system, weight)
+        self.guess = _fitted(signal, weight)
         self.rest = _replicates(signal) - system.columns @ self.guess
         self.count = self.rest.shape[-1]
         data = np.concatenate([self.rest, system.columns], -1)
@@ -419,7 +419,7 @@ def _replicates(signal: Signal) -> Array:
     return values if values.ndim == 3 else values[..., None]
 
 
-def _fitted(signal: Signal, system: _System, weight: Array) -> Array:
+def _fitted(signal: Signal, weight: Array) -> Array:
     """Return approximate constants (c, R) by a straight-line fit to each moving item."""
     values = _replicates(signal)
     out = np.zeros((len(signal.moving), values.shape[-1]))

@@ -69,12 +69,6 @@ class Signal:
         """Return the number of samples that count."""
         return int((self.weight > 0).sum())
 
-    @property
-    def span_s(self) -> float:
-        """Time from the first to the last frame, summed over replicates."""
-        replicates = self.value_mm.shape[-1] if self.value_mm.ndim == 3 else 1
-        return float(self.t_s[-1] - self.t_s[0]) * replicates
-
 
 def sight_directions(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, ...]]]:
     """Return the measured directions (3,) and the cameras that see each; the shared one first."""

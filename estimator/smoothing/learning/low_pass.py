@@ -70,15 +70,15 @@ def learned_inertia(solution: Solution) -> Inertia | None:
 
     The shorter a low-pass is, the more velocity it allows that no image shows. What the shortest
     one that is not excluded would add is stated with it, so that a velocity is never stated too
-    well. None without bubbles.
+    well. Where no bubble is seen in two frames, the solution's own is returned.
 
-    solution : of bubbles without a low-pass, with covariances.
+    solution : with covariances.
     """
     graph, draws = solution.graph, drawn(solution)
-    if not graph.rows:
-        return None
-    rig = draws.of_family(graph, 0)[..., :_DRAWS], draws.of_family(graph, 4)[0, :, :_DRAWS]
     pieces = _pieces(graph)
+    if not pieces:
+        return graph.model.bubble.inertia
+    rig = draws.of_family(graph, 0)[..., :_DRAWS], draws.of_family(graph, 4)[0, :, :_DRAWS]
     place, information = _positions(solution, rig, np.concatenate(pieces))
     t_s, up, bubble = graph.problem.t_s[graph.frame_of_row], graph.problem.up, graph.model.bubble
     dt_s, step = distinct_steps(np.concatenate([np.diff(t_s[p]) for p in pieces]))
@@ -195,13 +195,14 @@ def _everywhere(values: Array) -> Inertia:
 
 
 def _pieces(graph: GraphLayout) -> list[Ints]:
-    """Return rows of the graph, spread evenly over all bubbles and times."""
-    cuts = [
-        np.array_split(np.arange(a, b), -(-(b - a) // _PIECE_FRAMES))
+    """Return rows of the graph, spread evenly over all times and bubbles of two frames or more."""
+    pieces = [
+        piece
         for a, b in pairwise(graph.first_row.tolist())
+        if b - a > 1
+        for piece in np.array_split(np.arange(a, b), -(-(b - a) // _PIECE_FRAMES))
     ]
-    pieces = [piece for cut in cuts for piece in cut]
-    count = min(len(pieces), -(-LEARNED_ROWS * len(pieces) // graph.rows))
+    count = min(len(pieces), -(-LEARNED_ROWS * len(pieces) // max(graph.rows, 1)))
     chosen = np.unique(np.linspace(0, len(pieces) - 1, count).astype(int))
     return [pieces[i] for i in chosen]
 

@@ -145,7 +145,8 @@ def shake_processes(signal: Signal, model: ShakeModel) -> list[Process]:
         rms = _along(signal, band.rms_mm, band.camera)
         if rms > 0:
             learned = {"rms_mm": ("rms_mm", rms)}
-            fixed = {"low_hz": band.low_hz, "high_hz": band.high_hz}
+            shape = ("low_hz", "high_hz", "floor", "tail")
+            fixed = {name: getattr(band, name) for name in shape}
             out.append(Process(f"broad_bands.{i}", _broad_band, learned, fixed, band.camera))
             if band.slow_rms_mm > 0:
                 slow = {"rms": band.slow_rms_mm, "tau_s": band.slow_tau_s}

@@ -114,8 +114,6 @@ def aligned(
 def _aligned(
     problem: SmoothingProblem, refused: Sequence[Finding], log_evidence: LogEvidence
 ) -> tuple[SmoothingProblem, list[Finding]]:
-    if not problem.bubbles and not len(problem.references):
-        return _cut(problem), []
     images, wrong = _Images.of(problem), None
     encoder = None if images is None else images.encoder_alignment(problem)
     findings: list[Finding]
@@ -183,12 +181,6 @@ def _in_place(clock: Alignment, encoder: Alignment | None, problem: SmoothingPro
 
 def _with(problem: SmoothingProblem, sensors: Sequence[Accelerometer]) -> SmoothingProblem:
     return replace(problem, accelerometers=tuple(sensors))
-
-
-def _cut(problem: SmoothingProblem) -> SmoothingProblem:
-    """Return the problem with the samples near the frames, by the stated clocks."""
-    cut = [near_frames(s, problem.t_s) for s in problem.accelerometers]
-    return _with(problem, [s for s in cut if len(s.t_s) > 1])
 
 
 def _sure(clock: Alignment | None) -> bool:

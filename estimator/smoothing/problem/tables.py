@@ -173,9 +173,13 @@ def _check_references(table: Any, cameras: Sequence[Camera]) -> None:
         )
     for column in ("frame", "u_px", "v_px", *(["sigma_px"] if "sigma_px" in table else [])):
         values = times(table[column], where, column)
-        if column == "sigma_px" and np.any(values <= 0):
-            row = int(np.argmax(values <= 0))
-            raise InputError(f"sigma_px is not positive at row {row}", where=where, todo="state it")
+        bad = {"frame": values % 1 != 0, "sigma_px": values <= 0}.get(column, np.zeros(0, bool))
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(
+                f"{column} is {values[row]:g} at row {row}", where=where,
+                todo="give whole numbers of frames, and standard deviations above 0",
+            )  # fmt: skip
 
 
 def _marks(
@@ -300,8 +304,6 @@ def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | N
     import pandas as pd
 
     sample = samples[0] if len(samples) == 1 else pd.concat(samples, ignore_index=True)
-    if not ends:
-        _check(sample, cameras)
     known = pd.concat(times_of, ignore_index=True) if times_of else sample
     t_s = _times(known, max(last for _, last in ends.values()), frame_times_s)
     particles = sorted(ends)
@@ -397,6 +399,12 @@ class OnDisk:
 
 
 def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
+    if len(cameras) < 2:
+        raise InputError(
+            "bubbles are smoothed with two cameras or more, and the calibration has one",
+            where="tracks",
+            todo="give the calibration of all cameras of the run",
+        )
     needed = ["frame", "particle", "x_mm", "y_mm", "z_mm"]
     needed += [f"{c.name}_{column}" for c in cameras for column in _PIXELS]
     missing = [column for column in needed if column not in table]
@@ -481,7 +489,7 @@ def _paired(
     seen = np.isfinite(values).all(1)
     item = table["particle"].map(number).to_numpy(np.int64)[seen]
     frame = table["frame"].to_numpy(np.int64)[seen]
-    return item, frame, np.full(len(item), index), uv[seen], _covariance(values[seen])
+    return item, frame, np.full(len(item), index), uv[seen], _covariance(values[seen], camera)
 
 
 def _single(
@@ -510,7 +518,7 @@ def _single(
     frame = rows["frame"].to_numpy(np.int64)[good]
     item = np.array([number[int(p)] for p in ids], np.int64)
     # its own correction towards the centre of volume needs both views
-    loose = _covariance(values) + _LOOSE_PX**2 * np.eye(2) * corrected[camera]
+    loose = _covariance(values, camera) + _LOOSE_PX**2 * np.eye(2) * corrected[camera]
     return item, frame, np.full(len(item), index), values[:, :2], loose
 
 
@@ -519,10 +527,18 @@ def _corrected(table: pd.DataFrame, camera: str) -> bool:
     return column in table and bool(np.any(np.nan_to_num(table[column].to_numpy(float))))
 
 
-def _covariance(values: Array) -> Array:
-    a, b, c = values[:, 2], values[:, 3], values[:, 4]
-    stated = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
-    return np.asarray(stated + _SHARPEST_PX**2 * np.eye(2))
+def _covariance(values: Array, camera: str) -> Array:
+    """Return the covariances (n, 2, 2) of pixels; InputError for one that is not positive."""
+    out = values[:, [2, 3, 3, 4]].reshape(-1, 2, 2) + _SHARPEST_PX**2 * np.eye(2)
+    wrong = np.flatnonzero((out[:, 0, 0] <= 0) | (np.linalg.det(out) <= 0))
+    if len(wrong):
+        shown = ", ".join(f"{v:g}" for v in values[wrong[0], 2:])
+        raise InputError(
+            f"suu_px2, suv_px2, svv_px2 of camera {camera} are {shown}, which is no covariance",
+            where="tracks",
+            todo="state variances that are positive, and a covariance less than their mean",
+        )
+    return np.asarray(out)
 
 
 def bubbles_of(tracked: Tracked, positions_mm: Array, axis: Array) -> tuple[Bubble, ...]:

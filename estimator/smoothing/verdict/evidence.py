@@ -20,13 +20,12 @@ from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.verdict.shared import Shared, shared_motion
 from telerig.estimator.smoothing.verdict.whiteness import Lagged, lagged
+from telerig.io.tables.smoothing import AXES
 
-AXES = ("x", "y", "z")
 BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
 _STILL = 1e-12
 _WINDOW_S, _LEAST_FRAMES = 0.1, 10
 _EDGE = 0.1
-_SEEN = 0.25
 _SAMPLED = 20_000
 _USED = 0.5
 
@@ -383,7 +382,7 @@ def shake_of(solution: Solution, span: Span | None = None) -> Shake | None:
     inner = np.arange(
         max(span.own.start, edge - span.first), min(span.own.stop, count - edge - span.first)
     )
-    states = solution.state.shake[graph.nodes.of_frame[inner]]
+    states = graph.shake_at_frames(solution.state.shake)[inner]
     variances, squares = [], []
     for camera, seen in enumerate(graph.shake.seen):
         rows = seen @ graph.shake.offset[camera]

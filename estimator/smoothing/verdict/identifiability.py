@@ -103,14 +103,14 @@ def axis_verdict(
     agree, known_shake = inflation <= RESOLVED_Q, bool(measured) or given
     arms = measured != Measured.CARRIAGE or given
     flags = []
-    if rms < base and q <= RESOLVED_Q and agree and known_shake:
+    if rms < base and q * inflation <= RESOLVED_Q and agree and known_shake:
         flags.append(Flag.SHAKE_BELOW_NOISE)
     if not known_shake:
         flags.append(Flag.SHAKE_UNMEASURED)
     verdict = Verdict.CONTRADICTED
     if agree and known_shake:
         counted = eta if measured else None
-        verdict = rule(q, counted, arms=arms)
+        verdict = rule(q * inflation, counted, arms=arms)
     elif agree:
         verdict = Verdict.UNRESOLVED
     if not arms and verdict == Verdict.PARTIAL:
@@ -139,22 +139,30 @@ def measured_shake(solution: Solution) -> tuple[Measured, Measured, Measured]:
     """Return for x, y and z what measures the shake.
 
     Three bubbles in most frames show that of the cameras along all axes. So do, along the axes
-    that a camera sees, marks in its images and an accelerometer on its arm.
+    that a camera sees, marks in its images and an accelerometer on its arm, by the axes of it that
+    are used.
     """
     graph, problem = solution.graph, solution.graph.problem
     count = np.bincount(graph.frame_of_row, minlength=len(problem.t_s))
     several = np.count_nonzero(count >= FEWEST_BUBBLES) > _MOSTLY * np.count_nonzero(count)
-    carriage = any(sensor.camera == CARRIAGE for sensor in problem.accelerometers)
-    seen = [
-        direction
-        for camera in problem.arms_with_sensor | set(problem.references.camera.tolist())
-        for direction in graph.shake.seen[camera]
-    ]
+    cameras = set(problem.references.camera.tolist())
+    seen = [direction for camera in cameras for direction in graph.shake.seen[camera]]
+    felt: list[Array] = []
+    for sensor in problem.accelerometers:
+        whole = sensor.camera == CARRIAGE
+        (felt if whole else seen).extend(
+            direction
+            for direction in (np.eye(3) if whole else graph.shake.seen[sensor.camera])
+            if ((sensor.axes[list(sensor.unused_axes)] @ direction) ** 2).sum() < _SEEN
+        )
+
+    def along(axis: int, directions: list[Array]) -> bool:
+        return any(direction[axis] ** 2 > _SEEN for direction in directions)
 
     def of(axis: int) -> Measured:
-        if several or any(direction[axis] ** 2 > _SEEN for direction in seen):
+        if several or along(axis, seen):
             return Measured.CAMERAS
-        return Measured.CARRIAGE if carriage else Measured.NOTHING
+        return Measured.CARRIAGE if along(axis, felt) else Measured.NOTHING
 
     return of(0), of(1), of(2)
 

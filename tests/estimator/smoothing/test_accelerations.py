@@ -292,6 +292,10 @@ def test_bubbles_of_one_frame_and_without_pixels_have_wide_accelerations() -> No
     assert found is not None
     assert np.isfinite(found.value_mm_s2).all() and np.isfinite(found.sd_mm_s2).all()
     assert (found.sd_mm_s2[-1] > found.sd_mm_s2[15]).all()
+    alone = replace(problem, bubbles=(once,), observations=kept.of(kept.item == 1))
+    alone = replace(alone, observations=replace(alone.observations, item=0 * kept.item[-2:]))
+    model = model_of(0.01)
+    assert low_pass.learned_inertia(solve(alone, model, PLAIN)) is model.bubble.inertia
     still, _, _ = run(np.random.default_rng(0), seconds=0.2, marks=2)
     seen = Observations.none()
     empty = solve(replace(still, bubbles=(), observations=seen), true_model(), PLAIN)

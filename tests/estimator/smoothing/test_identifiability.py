@@ -195,6 +195,8 @@ def test_a_sensor_on_the_carriage_does_not_measure_the_arms() -> None:
 def test_contradicted_comes_before_all() -> None:
     assert _axis(1.0, 1.0, inflation=1.26).verdict == "CONTRADICTED"
     assert _axis(1.0, inflation=1.25).verdict == "RESOLVED"
+    judged = _axis(1.2, inflation=1.2)
+    assert (judged.verdict, judged.q) == ("PARTIAL", pytest.approx(1.44)), "by the q that is told"
     assert _axis(1.0, measured=Measured.NOTHING, inflation=4.0).verdict == "CONTRADICTED"
 
 
@@ -211,9 +213,9 @@ def test_what_measures_the_shake_along_which_axis() -> None:
         observations=seen.of((seen.item < 2) | (seen.frame <= 15)),
     )
 
-    def sensor(camera: int) -> Accelerometer:
+    def sensor(camera: int, *unused: int) -> Accelerometer:
         still = np.zeros((len(alone.t_s), 3))
-        return Accelerometer("a", camera, alone.t_s, still, np.eye(3), 10.0)
+        return Accelerometer("a", camera, alone.t_s, still, np.eye(3), 10.0, unused_axes=unused)
 
     for problem, measured in (
         (alone, (0, 0, 0)),
@@ -223,7 +225,9 @@ def test_what_measures_the_shake_along_which_axis() -> None:
         (replace(marked, references=marked.references.of(marked.references.camera == 0)),
          (2, 2, 0)),
         (replace(alone, accelerometers=(sensor(1),)), (0, 2, 2)),
+        (replace(alone, accelerometers=(sensor(1, 1),)), (0, 0, 2)),
         (replace(alone, accelerometers=(sensor(CARRIAGE),)), (1, 1, 1)),
+        (replace(alone, accelerometers=(sensor(CARRIAGE, 1),)), (1, 0, 1)),
         (replace(alone, accelerometers=(sensor(CARRIAGE), sensor(1))), (1, 2, 2)),
     ):  # fmt: skip
         solution = solve(problem, true_model(), replace(QUIET, covariances=False))

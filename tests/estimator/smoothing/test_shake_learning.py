@@ -43,7 +43,10 @@ from telerig.rig.pose import Pose
 
 OTHER = replace(
     true_model(0.4),
-    broad_bands=(BroadBand((0.1, 0.05, 0.1), 0, slow_rms_mm=0.02), BroadBand((0.0, 0.1, 0.0))),
+    broad_bands=(
+        BroadBand((0.1, 0.05, 0.1), 0, slow_rms_mm=0.02, floor=0.3),
+        BroadBand((0.0, 0.1, 0.0)),
+    ),
 )
 
 
@@ -55,6 +58,11 @@ def test_evidence_and_means_equal_the_graphs(marks: int) -> None:
     first, second = (solve(problem, m, quiet) for m in (true_model(), OTHER))
     fast = evidence(signals, true_model()) - evidence(signals, OTHER)
     assert fast == pytest.approx(first.log_evidence - second.log_evidence, abs=1e-4)
+
+    steep = replace(OTHER, broad_bands=tuple(replace(b, tail=3) for b in OTHER.broad_bands))
+    third = solve(problem, steep, quiet).log_evidence  # so stiff a prior costs digits
+    fast = evidence(signals, OTHER) - evidence(signals, steep)
+    assert fast == pytest.approx(second.log_evidence - third, abs=0.02)
 
     states = first.state.bubbles @ first.graph.bubble.position.T
     for signal in signals[:1]:

@@ -26,8 +26,10 @@ from telerig.estimator.smoothing.graph.solve import (
     solve,
 )
 from telerig.estimator.smoothing.problem.problem import CarriageModel
+from telerig.estimator.smoothing.problem.tables import read_tracks
 from telerig.estimator.smoothing.result import Smoothing
 from telerig.estimator.smoothing.smooth import smooth
+from telerig.estimator.smoothing.verdict.evidence import shake_of
 from telerig.io.results.calibration_words import NO_COVARIANCE
 
 pytestmark = pytest.mark.usefixtures("known_low_passes")
@@ -125,6 +127,22 @@ def test_the_laboratorys_gravity_is_no_bias(sensed: Smoothing) -> None:
         assert bias == pytest.approx(sensor["bias_y_mm_s2"], abs=1e-6)
 
 
+def test_the_verdicts_shake_is_that_of_the_table() -> None:
+    """Also where frames are later than the samples at which the shake is estimated."""
+    run, frames = s2(), 60
+    inputs = run.inputs("arms")
+    late, tracks = inputs["accelerometers"].eval("t_s = t_s - 2e-4"), inputs["tracks"]
+    found = smoothed(
+        run, "arms", given=True, accelerometers=late, t_s=run.t_s[:frames],
+        tracks=tracks[tracks["frame"] < frames],
+    )  # fmt: skip
+    assert found.solution is not None and found.solution.graph.nodes.frame_late_s.any()
+    judged, inner = shake_of(found.solution), found.shake.iloc[frames // 10 : -frames // 10]
+    assert judged is not None
+    expected = (inner["left_y_mm"] ** 2 + inner["sleft_y_mm"] ** 2).sum()
+    assert judged.square[0][1] == pytest.approx(expected, rel=1e-9)
+
+
 def test_a_spoilt_sample_moves_nothing(sensed: Smoothing) -> None:
     """One sample of 1,000 is off by 100 m/s^2."""
 
@@ -198,7 +216,7 @@ def test_samples_in_a_row_that_two_sensors_contradict_are_used_by_neither() -> N
 
 def test_a_negative_variance_is_refused_and_rounding_is_not() -> None:
     good, none = np.tile(np.eye(3), (4, 1, 1)), np.zeros((0, 0))
-    for least, refused in ((-1e-12, False), (-1e-3, True)):
+    for least, refused in ((-1e-12, False), (-1e-3, True), (np.nan, True)):
         bubbles = good.copy()
         bubbles[2, 1, 1] = least
         found = Covariances(good, bubbles, good, good, none, none, good, good)
@@ -315,6 +333,16 @@ def test_two_frames_and_a_bubble_seen_once() -> None:
     ]  # fmt: skip
 
 
+def test_what_a_given_model_states_of_its_learned_values_widens_the_result() -> None:
+    run, told = s2(), {"modes.0.rms_mm": 0.5}
+    model = true_model_of(run, "one")
+    sure, unsure = (
+        smoothed(run, "one", model=m).trajectories["sy_mm"].median()
+        for m in (model, replace(model, learned=told))
+    )
+    assert unsure > 1.02 * sure
+
+
 def test_too_short_a_run_to_learn_from_is_not_said_to_be_still() -> None:
     """In 0.1 s a shake of 20 Hz shows two periods at most; the encoder alone cannot clear it."""
     run = s2()
@@ -335,6 +363,21 @@ def test_offsets_without_tracks() -> None:
     assert np.corrcoef(left, run.offset_mm[0, :, 1])[0, 1] > 0.98
 
 
+def test_a_clock_that_nothing_shows_is_not_taken_for_that_of_the_frames() -> None:
+    """Without images nothing shows a logger's offset: 30 ms hide the shake altogether."""
+    run = s2()
+    arm = run.inputs("arms")["accelerometers"].query("sensor == 'arm_left'")
+    readings = arm[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy()
+    found = smoothed(
+        run,
+        "one",
+        tracks=None,
+        accelerometers={"arm_left": {"t_s": arm["t_s"], "a_m_s2": readings}},
+    )
+    assert not found.summary["accelerometers"]
+    assert any("clock is unknown" in words for words in found.summary["warnings"])
+
+
 def test_bad_input() -> None:
     run = s2()
     tracks, rig = (run.inputs("one")[name] for name in ("tracks", "rig"))
@@ -352,7 +395,8 @@ def test_bad_input() -> None:
         ({"stage": {"t_s": [0.0], "positon": [0.0]}}, "did you mean position_mm"),
         ({"references": "references.csv"}, "not a table"),
         ({"references": run.references.assign(u_px=np.nan)}, "u_px is not finite at row 0"),
-        ({"references": run.references.assign(sigma_px=0.0)}, "sigma_px is not positive"),
+        ({"references": run.references.assign(sigma_px=0.0)}, "sigma_px is 0 at row 0"),
+        ({"references": run.references.assign(frame=0.5)}, "frame is 0.5 at row 0"),
         ({"t_s": np.arange(FRAMES)[:, None]}, "t_s has the shape"),
         ({"t_s": np.arange(FRAMES)[::-1]}, "frames: times do not increase"),
         ({"rig": "rig.toml"}, "rig is str"),
@@ -365,9 +409,20 @@ def test_bad_input() -> None:
         ({"frame": tracks["frame"] - 1}, "frame is -1 in row 2"),
         ({"t_s": np.nan}, "t_s is not finite at row 0"),
         ({"particle": 0.5}, "particle is 0.5 in row 2"),
+        ({"right_svv_px2": -1.0}, "of camera right are .*, -1, which is no covariance"),
+        ({"left_suv_px2": 9.0}, "of camera left are .*, 9, .*, which is no covariance"),
     ):
         with pytest.raises(InputError, match=words):
             smooth(tracks.assign(**change), run.calibration, **good)
+    with pytest.raises(InputError, match="two cameras or more"):
+        read_tracks(tracks, run.calibration.cameras[:1], run.t_s)
+    with pytest.raises(InputError, match="stage: has 0 readings"):
+        smooth(tracks, run.calibration, stage=run.stage.iloc[:0])
+    with pytest.raises(InputError, match="carriage has no acceleration"):
+        smooth(
+            **run.inputs("arms"),
+            model=replace(true_model_of(run, "arms"), carriage=CarriageModel()),
+        )
     with pytest.raises(InputError, match="no rows"):
         smooth(tracks.iloc[:0], run.calibration, **good)
     for model in (3, lambda problem: "auto"):

@@ -197,6 +197,8 @@ def smooth(
             references=references, rig=rig, t_s=t_s,
             drift=None if refinement is None else refinement.movement,
         )  # fmt: skip
+        if isinstance(model, ShakeModel):
+            problem = _with_held_scale(problem, model)
         problem, findings = with_sensors_aligned(problem, findings)
         warnings = settled(findings, accepted)
     options = replace(options or Options(), draws=True)
@@ -426,6 +428,14 @@ def with_sensors_aligned(
         return problem, findings
     late = placed.stage.delay_sigma_s
     return replace(problem, stage=replace(problem.stage, delay_sigma_s=late)), findings
+
+
+def _with_held_scale(problem: SmoothingProblem, model: ShakeModel) -> SmoothingProblem:
+    """Return the problem with an encoder's scale that is stated if a given model holds it."""
+    travel = problem.travel
+    if travel is None or travel.source != "assumed" or model.encoder_scale_sigma > 0:
+        return problem
+    return replace(problem, travel=replace(travel, source="given"))
 
 
 def _log_evidence(problem: SmoothingProblem) -> float:

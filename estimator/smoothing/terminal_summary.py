@@ -26,7 +26,7 @@ _SCALE_FROM = {
     "rig.toml": "as stated in rig.toml",
     "stage_axis": "as calibrated from stage_axis/",
     "run": "as measured by the marks of this run",
-    "given": "taken as exact",
+    "given": "held by the given model",
 }
 
 

@@ -232,14 +232,15 @@ class Travel:
     basis : (3, 2) two unit vectors perpendicular to it.
     scale : relative scale error of the encoder, for which the readings of `Stage` are corrected.
     covariance : (3, 3) of the axis' two tilts (rad, along ``basis``) and of the scale.
-    source : "stage_axis" if calibrated, "rig.toml" if stated there, or "assumed".
+    source : "stage_axis" if calibrated, "rig.toml" if stated there, "given" if a given model holds
+        the scale, or "assumed".
     """
 
     axis: Array
     basis: Array
     scale: float
     covariance: Array
-    source: Literal["stage_axis", "rig.toml", "assumed"]
+    source: Literal["stage_axis", "rig.toml", "given", "assumed"]
 
 
 @dataclass(frozen=True)

@@ -804,6 +804,10 @@ def _encoder(
         wrong = list(_cameras(problem, marks))
         if wrong:
             return wrong
+        if found.excludes(1.0) and abs(gain - 1) > _FAR * _stated_sigma(problem):
+            off = _gain_finding(gain, 0.0, sd, where)
+            todo = f"{off.todo}, state that it may be off so much (scale_sigma in rig.toml [stage])"
+            return [replace(off, todo=f"{todo}, or calibrate magnifications that have changed")]
     elif images.encoder is not None:
         common = CommonGain.of(_responses(problem, images, images.encoder, sensors))
     if common is not None and (common.excludes(1.0) or common.opposed):
@@ -873,6 +877,16 @@ def _cameras(problem: SmoothingProblem, marks: MarkMotion) -> Iterator[Finding]:
             "stage", f"[stage] axis = [{line}] would fit; or measure it (stage_axis/)",
             Code.STAGE_AXIS, {"stage_axis": axis.tolist()},
         )  # fmt: skip
+
+
+def _stated_sigma(problem: SmoothingProblem) -> float:
+    """Return the standard deviation of marks' motion over the encoder's, by what is stated of its
+    scale and known of the lenses; infinite where its scale is assumed, so that it is estimated.
+    """
+    if problem.travel is None or problem.travel.source == "assumed":
+        return np.inf
+    depth = max(abs(c["kappa_per_mm"]) for c in problem.cameras) * _depth_sigma_mm(problem)
+    return float(np.sqrt(LENS_SIGMA**2 + depth**2 + problem.travel.covariance[2, 2]))
 
 
 def _depth_sigma_mm(problem: SmoothingProblem) -> float:

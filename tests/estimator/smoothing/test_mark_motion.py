@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from shake_runs import run_of
 
-from telerig.estimator.sensors.findings import Code, Finding
+import telerig
+from telerig.estimator.sensors.findings import Code, Finding, SensorError
 from telerig.estimator.smoothing.problem.mark_motion import MarkMotion
-from telerig.estimator.smoothing.problem.problem import SmoothingProblem
+from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.smooth import problem_of, with_sensors_aligned
 from telerig.rig.camera import Camera
 
@@ -44,12 +45,33 @@ def turned() -> dict[str, Any]:
     return {"rig": rig}
 
 
+def stretched() -> dict[str, Any]:
+    """An encoder that reads 1 % too much."""
+    stage = run_of("S1", 905).inputs("references")["stage"]
+    return {"stage": stage.assign(position_mm=1.01 * stage["position_mm"])}
+
+
+def stating(scale_sigma: float | None) -> dict[str, Any]:
+    """A rig whose encoder's scale is stated, or not."""
+    rig = run_of("S1", 905).inputs("references")["rig"]
+    rig.stage = replace(rig.stage, scale_sigma=scale_sigma)
+    return {"rig": rig}
+
+
 @pytest.mark.parametrize(
     ("changes", "code"),
-    [({}, None), (refocused("right"), Code.CAMERA_SCALE), (turned(), Code.STAGE_AXIS)],
-    ids=["sound", "refocused", "turned"],
+    [
+        ({}, None),
+        (refocused("right"), Code.CAMERA_SCALE),
+        (refocused("left", "right"), Code.ENCODER_SCALE),
+        (stretched(), Code.ENCODER_SCALE),
+        (stretched() | stating(0.005), None),
+        (stretched() | stating(None), None),
+        (turned(), Code.STAGE_AXIS),
+    ],
+    ids=["sound", "refocused", "both", "stretched", "stated", "assumed", "turned"],
 )
-def test_a_changed_magnification_and_a_wrong_axis_are_refused(
+def test_changed_magnifications_a_wrong_scale_and_a_wrong_axis_are_refused(
     changes: dict[str, Any], code: Code | None
 ) -> None:
     _, found = placed(**changes)
@@ -57,6 +79,15 @@ def test_a_changed_magnification_and_a_wrong_axis_are_refused(
     assert [f.code for f in refusals] == [code] * bool(code)
     if code is Code.STAGE_AXIS:
         np.testing.assert_allclose(refusals[0].fix["stage_axis"], [0, -1, 0], atol=2e-3)
+    if code is Code.ENCODER_SCALE:
+        assert refusals[0].fix["encoder_factor"] == pytest.approx(1 / 1.01, abs=1.5e-3)
+
+
+def test_a_given_model_that_holds_the_scale_does_not_hide_it() -> None:
+    """The motion is right then, and the origin of the laboratory frame 2.3 mm off."""
+    inputs = run_of("S1", 905).inputs("references") | stretched() | stating(None)
+    with pytest.raises(SensorError, match=r"0\.9902.*its scale is wrong"):
+        telerig.smooth(**inputs, model=ShakeModel())
 
 
 @pytest.mark.slow

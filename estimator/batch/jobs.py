@@ -22,6 +22,7 @@ from telerig.command_options import (
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.files.names import absent
+from telerig.io.results.folders.calibration import CalibrationResults
 
 MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
 RESERVED = "calibration"
@@ -167,6 +168,16 @@ def jobs_of(
         "track": tracking or TrackingOptions(),
         "smooth": smoothing or SmoothingOptions(),
     }
+    for kind, given in options.items():
+        if kind in kinds and not (kind == "calibrate" and calibration is not None):
+            continue
+        for name, setting in given.settings().items():
+            if getattr(given, name) != getattr(type(given), name):
+                raise InputError(
+                    f"{setting.in_batch or setting.flags[0]} is an option of {kind}, which this "
+                    "command does not do",
+                    todo="leave it out, or change --only or --calibration",
+                )
     shared: dict[str, Any] = {
         "calibration": "" if calibration is None else str(Path(calibration).resolve()),
         "report": report,
@@ -310,10 +321,9 @@ def check_options(calibration: Path | None, options: CalibrationOptions) -> None
     from telerig.errors import CalibrationError
     from telerig.estimator.calibration.calibrate import check_options as check
 
-    if calibration is not None and not Path(calibration).exists():
-        todo = "give the calibration.json that `telerig calibrate` wrote"
-        raise absent(Path(calibration), "calibration", todo)
+    if calibration is not None:
+        CalibrationResults.at(calibration)
     try:
         check(**options.keywords)
     except CalibrationError as error:
-        raise InputError(f"--model {options.model}", todo=error.todo) from error
+        raise InputError(error.what, where="--model", todo=error.todo) from error

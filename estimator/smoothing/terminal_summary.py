@@ -10,6 +10,7 @@ from telerig.io.results.smoothing import SmoothingFile
 from telerig.io.results.tracking import share_words
 from telerig.io.results.verdict_words import (
     number_words,
+    remedy_words,
     to_resolve,
     uses_words,
     words_of_axes,
@@ -40,7 +41,7 @@ def smoothing_words(found: Smoothing) -> str:
         lines += [str(file.verdict) + (f" ({flags})" if flags else "")]
         lines += [f"  {words_of_contradiction(one)}" for one in file.contradictions]
         lines += [f"  {words}" for words in words_of_axes(file)]
-        lines += [f"  {words}" for words in [to_resolve(file.remedy)] if words]
+        lines += [f"  {words}" for words in [to_resolve(remedy_words(file.remedies))] if words]
         lines += [f"  {line}" for line in uses_words(file.usable_for)]
         lines = [line for line in lines if line]
     bubbles = "1 bubble" if summary["bubbles"] == 1 else f"{summary['bubbles']} bubbles"

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -310,7 +310,7 @@ def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str,
         raise InputError(
             f"there is no camera {name!r} in the rig",
             where=str(entry),
-            todo=suggestion(name, every) + " If it is no camera, move it out of the run's folder.",
+            todo=suggestion(name, every) + "; if it is no camera, move it out of the run's folder",
         )
     sources = {name: open_frames(folder, name) for name in names}
     for name, source in sources.items():
@@ -525,6 +525,9 @@ def pair_frames(
     missing frame, and sentences for the user. Raises InputError if the images cannot be paired
     safely.
     """
+    if pair_by not in get_args(Pairing):
+        todo = f"give one of {', '.join(get_args(Pairing))}"
+        raise InputError(f"pair_by is {pair_by!r}", where=where, todo=todo)
     if missing is not None:
         return _by_missing(sources, missing, where)
     numbers = {name: source.numbers() for name, source in sources.items()}

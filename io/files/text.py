@@ -25,6 +25,13 @@ def read_bytes(file: Path, missing: str = "check the path") -> bytes:
         ) from error
 
 
+def need_file(file: Path) -> None:
+    """Raise InputError unless there is a file of this name."""
+    if not file.is_file():
+        what = "is a folder, not a file" if file.is_dir() else "does not exist"
+        raise InputError(what, where=str(file), todo="check the path")
+
+
 def read_text(
     file: Path, todo: str = "save it as UTF-8 in your editor", missing: str = "check the path"
 ) -> str:

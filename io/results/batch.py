@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field
 
 from telerig.io.results.record import Part, Record
 
@@ -45,17 +45,6 @@ class JobRecord(Part):
     figures: dict[str, Any] | None = None
     seconds: float | None = None
     host: str | None = None
-
-    @field_validator("figures")
-    @classmethod
-    def _flags_apart(
-        cls, figures: dict[str, Any] | None, info: ValidationInfo
-    ) -> dict[str, Any] | None:
-        """Versions before 0.2 wrote the flags of a run behind the verdict, in one text."""
-        if info.data.get("kind") != "smooth":
-            return figures
-        verdict, *flags = str((figures or {}).get("verdict") or "").split() or [""]
-        return figures | {"verdict": verdict, "flags": flags} if figures and flags else figures
 
 
 class BatchFile(Record):

@@ -20,9 +20,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.results.cameras import CameraRecord, PoseRecord, rig_cameras
 from telerig.io.results.findings import (
-    Code,
     Finding,
-    Status,
     Verdict,
     notes_of,
     objections,
@@ -148,7 +146,6 @@ class Stage(Part):
     chi2_dof : chi-square per degree of freedom of the fit; None where there is none.
     position_sigma_mm, wander_sigma_mm : standard deviation in mm of the carriage's position along
         the axis and perpendicular to it; None where the file does not state it.
-    notes : sentences of files without findings.
     """
 
     axis: Vector3
@@ -160,7 +157,6 @@ class Stage(Part):
     chi2_dof: float | None = None
     position_sigma_mm: float | None = None
     wander_sigma_mm: float | None = None
-    notes: tuple[str, ...] = ()
 
 
 class SplitHalves(Part):
@@ -168,11 +164,8 @@ class SplitHalves(Part):
 
     views : number of views in each half.
     points_mm, shift_um, sd_um : (points, 3) each.
-    words, agree : in files without findings.
     """
 
-    words: str = ""
-    agree: bool = True
     views: tuple[int, int] = (0, 0)
     points_mm: Points3 | None = None
     shift_um: Points3 | None = None
@@ -180,13 +173,8 @@ class SplitHalves(Part):
 
 
 class Structure(Part):
-    """Check the keys of the tests of the residuals; each may be missing.
+    """Check the keys of the tests of the residuals; each may be missing."""
 
-    words, sound : in files without findings.
-    """
-
-    words: tuple[str, ...] = ()
-    sound: bool = True
     widening: float = 1.0
 
 
@@ -231,7 +219,6 @@ class Diagnostics(Part):
     """Hold further findings of a calibration, which the report shows.
 
     gauge : how origin, axes and scale were chosen.
-    weak : sentences on badly determined quantities, in files without findings.
     dots_hull_px : by camera, the corners of the convex hull of the dots that were used, in px.
     tilts_deg : tilts in degrees by name; None where one is not known.
     halves : the split-half check.
@@ -241,7 +228,6 @@ class Diagnostics(Part):
 
     gauge: str = ""
     dots_hull_px: dict[Name, tuple[tuple[float, float], ...]] = Field(default_factory=dict)
-    weak: tuple[str, ...] = ()
     tilts_deg: dict[str, float | None] = Field(default_factory=dict)
     halves: Annotated[dict[str, Any], _checked(SplitHalves)] = Field(default_factory=dict)
     structure: Annotated[dict[str, Any], _checked(Structure)] = Field(default_factory=dict)
@@ -251,8 +237,7 @@ class Diagnostics(Part):
 class CalibrationFile(Record):
     """Hold the content of calibration.json, the result of a calibration.
 
-    findings : what the checks found; None in older files, which have sentences only. Read, it is
-        never None: those sentences become findings.
+    findings : what the checks found.
     verdict, notes : made from the findings: whether the calibration can be used and the objections,
         and what is no objection. A file whose status is not that of its findings is refused.
     cameras : the calibrated cameras by name; the first camera's frame is the rig frame.
@@ -275,7 +260,7 @@ class CalibrationFile(Record):
     units: dict[str, str] = Field(default_factory=dict)
     gauge: str = ""
     medium: str = "air"
-    findings: tuple[Finding, ...] | None = None
+    findings: tuple[Finding, ...]
     verdict: Verdict
     cameras: dict[Name, CameraRecord] = Field(min_length=1)
     walls: dict[str, dict[str, Any]] = Field(default_factory=dict)
@@ -304,34 +289,14 @@ class CalibrationFile(Record):
 
     @model_validator(mode="after")
     def _says_what_was_found(self) -> Self:
-        findings = self._earlier_findings() if self.findings is None else self.findings
-        verdict = verdict_of(findings)
-        if self.findings is not None and verdict.status != self.verdict.status:
-            against = ", ".join(finding.code.name for finding in objections(findings))
+        verdict = verdict_of(self.findings)
+        if verdict.status != self.verdict.status:
+            against = ", ".join(finding.code.name for finding in objections(self.findings))
             raise ValueError(
                 f"the status is {self.verdict.status}, but the findings make it {verdict.status} "
                 f"({against or 'there is no objection'})"
             )
-        said = {"findings": findings, "verdict": verdict, "notes": notes_of(findings)}
-        return self.model_copy(update=said)
-
-    def _earlier_findings(self) -> tuple[Finding, ...]:
-        """Return the sentences of a file without findings as findings.
-
-        What such a version printed as a warning is an objection, also where it said GOOD.
-        """
-        status, found = self.verdict.status, self.diagnostics
-        halves = SplitHalves.model_validate(found.halves)
-        structure = Structure.model_validate(found.structure)
-        against = [*self.verdict.reasons] or [status] * (status != Status.GOOD)
-        warned = [*[halves.words] * (not halves.agree), *structure.words * (not structure.sound)]
-        said = (*structure.words, halves.words, *found.weak, *self.notes)
-        said += () if self.stage is None else self.stage.notes
-        codes = {Status.REJECTED: Code.EARLIER_REJECTION, Status.IMPORTED: Code.NO_UNCERTAINTY}
-        code_of = dict.fromkeys(filter(None, said), Code.NOTE)
-        code_of |= dict.fromkeys(warned, Code.EARLIER_REASON)
-        code_of |= dict.fromkeys(against, codes.get(status, Code.EARLIER_REASON))
-        return tuple(code.found(text=words) for words, code in code_of.items())
+        return self.model_copy(update={"verdict": verdict, "notes": notes_of(self.findings)})
 
     @field_validator("statistics")
     @classmethod

@@ -30,8 +30,8 @@ def has_ordinary_lens(statistics: Mapping[str, Any]) -> bool:
 def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
     """Return sentences on how far each camera is telecentric.
 
-    statistics : `statistics` of `calibration.json`; files of earlier versions have no entry
-    "telecentricity", and give no sentences.
+    statistics : `statistics` of `calibration.json`; without an entry "telecentricity", as of an
+    imported calibration, there are no sentences.
     """
     of: Mapping[str, Mapping[str, float]] = statistics.get("telecentricity") or {}
     ordinary = [name for name, lens in of.items() if lens["perspective"] > ORDINARY]

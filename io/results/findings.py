@@ -356,10 +356,8 @@ class Code(Enum):
         "the tilt. Points are not affected",
         "If you need the normal itself, state it more precisely in rig.toml",
     )
-    # Sentences without a code: on the files of a dataset, and of versions that had no codes.
+    # Sentences without a code, on the files of a dataset.
     NOTE = Kind(_NOTE, "{text}")
-    EARLIER_REASON = Kind(_USABLE, "{text}")
-    EARLIER_REJECTION = Kind(Status.REJECTED, "{text}")
 
     def __repr__(self) -> str:
         return f"Code.{self.name}"
@@ -413,7 +411,7 @@ class Finding(Part):
 
     cameras, views, names : where; names are those of parameters or of keys of rig.toml.
     numbers : by name, as the sentence of the code states them.
-    text : what has no code: a lens model's name, the cause of an error, a sentence of older files.
+    text : what has no code: a lens model's name, the cause of an error.
     """
 
     code: Annotated[Code, PlainValidator(_code), PlainSerializer(lambda code: code.name)]

@@ -25,7 +25,7 @@ class Input(Part):
         tables alone. Empty for a whole file.
     cameras : for a folder of images, the cameras whose images count.
     files, bytes : number and total size of these images.
-    sampled : hash of parts of their content; None in results of older versions.
+    sampled : hash of parts of their content.
     """
 
     sha256: str | None = None
@@ -47,9 +47,8 @@ class Input(Part):
         if self.sha256 is None and not self.cameras:
             return "was added after they were made"
         now = Source(path, self.tables, self.cameras).fingerprint()
-        same = (now.sha256, now.files, now.bytes) == (self.sha256, self.files, self.bytes)
-        if self.sampled is not None:
-            same = same and now.sampled == self.sampled
+        keys = ("sha256", "files", "bytes", "sampled")
+        same = all(getattr(now, key) == getattr(self, key) for key in keys)
         return "" if same else "has changed since they were made"
 
 

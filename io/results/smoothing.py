@@ -122,6 +122,7 @@ class AxisVerdict(Part):
     sigma_offset_mm : standard deviation in mm of an offset that all positions share: the encoder's
         delay and where the cameras stood are not known. No other standard deviation contains it.
     shake_rms_mm : RMS of the shake in mm of the camera that shakes most.
+    words : these numbers as sentences, for people who read the file.
     """
 
     verdict: Verdict | None = None
@@ -209,11 +210,11 @@ class Mode(Part):
     damping : damping ratio; None where it is not known.
     rms_mm : RMS of the displacement in mm, in total or for each axis; None where it is not known.
     source, remedy : the probable cause and what helps against it, in words.
-    place, camera : ``where`` as a code and the name of a camera; None in older files.
+    place, camera : ``where`` as a code and the name of a camera.
     """
 
     where: str
-    place: Place | None = None
+    place: Place
     camera: str = ""
     frequency_hz: float
     damping: float | None = None
@@ -244,11 +245,10 @@ class SmoothingFile(Record):
     inflation : factor by axis by which the standard deviations in the tables have been multiplied
         because of contradictions; () without.
     usable_for : what this run is good for, by quantity and axis.
-    words, remedy : the verdict as a sentence, and what to do about it.
-    vertical, remedies : the axis nearest to the vertical, and the remedy as codes; "" and () in
-        older files.
+    words, remedy : the verdict as a sentence and what to do about it, for people.
+    vertical, remedies : the axis nearest to the vertical, and the remedy as codes.
     rig, walls : the calibrated cameras and refractive windows that the run was smoothed with, by
-        name; empty in older files.
+        name.
     frames, bubbles : how many were smoothed.
     modes : the vibrations of the rig.
     log_evidence : logarithm of the model's probability density for the data; None if not computed.
@@ -338,5 +338,5 @@ class SmoothingFile(Record):
         return self
 
     def rig_cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras that the run was smoothed with; none for an older file."""
+        """Return the cameras that the run was smoothed with."""
         return rig_cameras(self.rig, self.walls)

@@ -73,7 +73,7 @@ class TrackingFile(Record):
 
     frames, detections, points, tracks : their numbers; None where they were not counted.
     cameras, walls : the calibrated cameras and refractive windows that the run was tracked with, by
-        name; empty in older files.
+        name.
     events : number of events of each kind.
     pairs : statistics of the ray miss, or None.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
@@ -120,7 +120,7 @@ class TrackingFile(Record):
         return self
 
     def rig_cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras that the run was tracked with; none for an older file."""
+        """Return the cameras that the run was tracked with."""
         return rig_cameras(self.cameras, self.walls)
 
 

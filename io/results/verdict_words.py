@@ -160,14 +160,13 @@ def _removed(axis: AxisVerdict) -> str:
 
 
 def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
-    """Return the verdict along one axis as sentences.
+    """Return the verdict along one axis as sentences; "" if a number is missing.
 
-    If a number is missing, as in files of older versions, the stored sentences are returned.
     name : of the axis. vertical : whether the axis is the one nearest to the vertical.
     """
     sd, sd_known, rms = axis.sigma_mm, axis.sigma_shake_known_mm, axis.shake_rms_mm
     if axis.verdict is None or axis.q is None or sd is None or sd_known is None or rms is None:
-        return axis.words
+        return ""
     title = f"{name} (vertical)" if vertical else name
     removed = "" if Flag.SHAKE_BELOW_NOISE in axis.flags else _removed(axis)
     text = (
@@ -325,8 +324,8 @@ def words_of_refusals(file: SmoothingFile) -> list[str]:
         path = any(use.quantity == Quantity.PATH and use.below_hz is None for use in refused)
         text += ". At no frequency is the path nine times the power of its errors." if path else "."
         lines.append(text)
-    if True in shaken and (file.remedies or file.remedy):
-        lines.append(to_resolve(remedy_words(file.remedies) or file.remedy))
+    if True in shaken and file.remedies:
+        lines.append(to_resolve(remedy_words(file.remedies)))
     if False in shaken:
         lines.append(_LESS_NOISE)
     return lines
@@ -356,11 +355,9 @@ def uses_words(found: Sequence[Use]) -> list[str]:
 
 
 def words_of_axes(file: SmoothingFile) -> list[str]:
-    """Return the sentences of every axis; those that an older file stores, if it has any."""
-    found = [
-        words_of_axis(name, axis, vertical=name == file.vertical) if file.vertical else axis.words
-        for name, axis in file.axes.items()
-    ]
+    """Return the sentences of every axis."""
+    vertical = file.vertical
+    found = [words_of_axis(n, axis, vertical=n == vertical) for n, axis in file.axes.items()]
     return [words for words in found if words]
 
 
@@ -375,9 +372,7 @@ def to_resolve(remedy: str) -> str:
 
 
 def mode_remedy(mode: Mode) -> str:
-    """Return what would make a vibration smaller; the stored words of an older file."""
-    if mode.place is None:
-        return mode.remedy
+    """Return what would make a vibration smaller."""
     text = MODE_REMEDIES[mode.place].format(camera=mode.camera)
     if mode.place == Place.SERVO:
         return text

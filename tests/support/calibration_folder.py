@@ -73,7 +73,11 @@ def _content(cameras: tuple[Camera, ...], views: dict[str, Pose]) -> dict[str, A
         "kind": "telerig calibration",
         "name": "tank <2>",
         "gauge": "the gauge in words",
-        "verdict": {"status": "USABLE, with warnings", "reasons": ["only 6 views & <few> dots"]},
+        "findings": [
+            {"code": "ODD_VIEW", "views": ["<odd> &"], "numbers": {"kept": 6, "dots": 15}},
+            {"code": "NOTE", "text": "a note"},
+        ],
+        "verdict": {"status": "USABLE, with warnings"},
         "cameras": {c.name: _camera_json(c) for c in cameras},
         "target": {"dots": list(range(15)), "points_mm": _points().tolist()},
         "views": {name: _pose_json(pose) for name, pose in views.items()},
@@ -83,8 +87,7 @@ def _content(cameras: tuple[Camera, ...], views: dict[str, Pose]) -> dict[str, A
         "statistics": {"rms_px": 0.01, "chi2_dof": 1.01, "dots_kept": 178, "dots_measured": 180,
                        "degrees_of_freedom": 301.0, "axes_angle_deg": 90.0,
                        "axes_angle_sd_deg": 6.9e-4, "space_sd_um": 0.51, "noise_floor_px": 0.0},
-        "diagnostics": {"weak": ["depth scale of the right camera is weak"]},
-        "notes": ["a note"],
+        "diagnostics": {},
         "stage": {},
     }  # fmt: skip
 

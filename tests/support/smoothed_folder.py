@@ -83,8 +83,7 @@ def _trajectories(rng: np.random.Generator, tracks: pd.DataFrame, shake: pd.Data
 
 def content() -> dict[str, Any]:
     return {
-        "verdict": "RESOLVED", "flags": [], "axes": AXES, "remedy": "",
-        "words": "x: told apart (23 µm). y (vertical): told apart (13 µm). z: told apart (23 µm).",
+        "verdict": "RESOLVED", "flags": [], "axes": AXES, "vertical": "y",
         "modes": [], "schema": 1, "cameras": ["left", "right"], "frames": 600, "bubbles": 2,
         "model": {
             "bubble": {"velocity_sigma_mm_s": 10.0, "zigzags": []}, "modes": [],

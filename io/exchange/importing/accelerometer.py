@@ -28,6 +28,7 @@ from telerig.io.exchange.importing.headers import (
 from telerig.io.exchange.importing.logger_text import is_number
 from telerig.io.exchange.importing.recording import EXPORT_AGAIN, Recording
 from telerig.io.files.csv_table import LARGEST_NUMBER
+from telerig.io.files.text import need_file
 from telerig.rig.units import ACCELERATION_UNITS
 
 AXES = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
@@ -97,8 +98,11 @@ def import_accelerations(
     blank = np.isnan(raw).all(-1) if recording.lines is not None else np.zeros(len(raw), bool)
     kept = np.logical_not(blank)
     scale, unit = _scale(recording, names, layout)
+    stated = {unit_in(name) for name in names} - {"", unit}
     channels = f"x, y, z are the channels {', '.join(map(repr, names))} in {unit}"
     notes = [*recording.notes, channels, said]
+    if stated:
+        notes.append(f"their names state another unit: {', '.join(sorted(stated))}")
     if not kept.all():
         notes.append(f"{int((~kept).sum())} rows are left out, because they have no reading")
     _check_numbers(recording, np.c_[raw, t_s], [*names, "time"], kept)
@@ -236,7 +240,8 @@ def _stamps(recording: Recording, name: str, form: str) -> Array:
         stamps = pd.to_datetime(cells, format=form)
     except ValueError as error:
         raise recording.error(
-            f"channel {name!r} has stamps that are not of the form {form!r}: {str(error)[:200]}",
+            f"channel {name!r} has stamps that are not of the form {form!r}: "
+            f"{str(error).partition('. You might')[0]:.200}",
             "correct --time-unit",
         ) from error
     first = stamps.dropna()
@@ -298,8 +303,7 @@ def layout_from(options: dict[str, Any]) -> Layout:
 def open_recording(path: Path, layout: Layout) -> Recording:
     """Read a file by its ending, one of `RECORDINGS`. Raises InputError when it cannot be read."""
     ending = path.suffix.lower()
-    if not path.is_file():
-        raise InputError("there is no such file", where=str(path), todo="check the path")
+    need_file(path)
     if ending not in RECORDINGS:
         raise InputError(
             f"recordings that end in {ending or 'nothing'} cannot be read",

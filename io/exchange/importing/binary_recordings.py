@@ -122,6 +122,8 @@ def read_tdms(path: Path, group: str | None = None) -> Recording:
 def _of_tdms(file: Any, path: Path, group: str | None) -> Recording:
     groups = [g for g in file.groups() if g.channels()]
     chosen = [g for g in groups if group in (None, g.name)]
+    if not groups:
+        raise InputError("holds no channels", where=str(path), todo=EXPORT_AGAIN)
     if len(chosen) != 1:
         names = ", ".join(g.name for g in groups)
         raise InputError(

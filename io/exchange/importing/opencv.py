@@ -17,6 +17,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
 from telerig.io.files.csv_table import LARGEST_NUMBER
+from telerig.io.files.text import need_file
 from telerig.io.machine.parallel import isolated
 from telerig.rig.pose import rotation_from_rotvec
 
@@ -81,8 +82,7 @@ def read_opencv_cameras(
 
 def _content(file: Path) -> dict[str, Array]:
     """Return every matrix and number at the root of the file."""
-    if not file.is_file():
-        raise InputError("there is no such file", where=str(file), todo="check the path")
+    need_file(file)
     try:
         out = isolated(_root_of, str(file))
     except Exception as error:  # cv2.error, what Python makes of it, and crashes

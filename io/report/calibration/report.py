@@ -234,7 +234,7 @@ def same_everywhere(results: CalibrationResults) -> str:
 
 
 def _trust(results: CalibrationResults) -> list[Block]:
-    findings = results.file.findings or ()
+    findings = results.file.findings
     words = [f.words for f in findings if f.status == Status.GOOD and f.code in TRUST]
     words.append(same_everywhere(results))
     maps = list(_maps(results))[1:]
@@ -414,9 +414,7 @@ def _views(results: CalibrationResults, page_folder: Path) -> list[Block]:
 
 def _more(results: CalibrationResults) -> list[Block]:
     file = results.file
-    notes = [
-        f.words for f in file.findings or () if f.status == Status.GOOD and f.code not in TRUST
-    ]
+    notes = [f.words for f in file.findings if f.status == Status.GOOD and f.code not in TRUST]
     costs = (file.twin.cost, file.twin.other_cost)
     costs_words = [ABSENT if c is None else f"{c:.10g}" for c in costs]
     twin = [

@@ -75,13 +75,11 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVe
     sentences = [good, meaning]
     sentences += map(words_of_contradiction, file.contradictions)
     sentences += of_axes if not good and not contradicted else []
-    sentences += [file.words] if not of_axes else []
     sentences.append("" if contradicted else _size_words(results))
     if file.rig_change is not None and file.rig_change.words:
         sentences.append(f"Rig: {file.rig_change.words}.")
-    in_words = file.words and not of_axes  # files from before hold the remedy in their words
-    if file.verdict in (Verdict.PARTIAL, Verdict.UNRESOLVED) and not in_words:
-        sentences.append(to_resolve(remedy_words(file.remedies) or file.remedy))
+    if file.verdict in (Verdict.PARTIAL, Verdict.UNRESOLVED):
+        sentences.append(to_resolve(remedy_words(file.remedies)))
     flags = {flag: f"{flag}: {FLAG_WORDS.get(flag, UNKNOWN_FLAG)}" for flag in file.flags}
     sentences += [text for flag, text in flags.items() if flag in _HARMLESS]
     warnings = [text for flag, text in flags.items() if flag not in _HARMLESS]

@@ -72,7 +72,7 @@ class TrackResults:
 
     @cached_property
     def rig(self) -> tuple[Camera, ...]:
-        """These cameras; empty for a folder of an older version, whose tracking.json has none."""
+        """These cameras; empty where tracking.json has none."""
         known = {camera.name: camera for camera in self.file.rig_cameras()}
         if known and not set(self.cameras) <= set(known):
             what = f"its cameras are {list(known)}, those of tracks.csv {list(self.cameras)}"

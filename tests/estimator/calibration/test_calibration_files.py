@@ -229,7 +229,7 @@ def test_damaged_files(change: Any, saved: Path) -> None:
         (lambda d: d["cameras"]["left"]["parameters"].update(k1=50.0), "any lens"),
         (lambda d: d["diagnostics"].update(next_view={"poses": 5}), "next_view.*poses"),
         (lambda d: d["diagnostics"].update(halves={"views": "x"}), "halves.*views"),
-        (lambda d: d["diagnostics"].update(structure={"words": 3}), "structure.*words"),
+        (lambda d: d["diagnostics"].update(structure={"widening": "x"}), "structure.*widening"),
         (lambda d: d["cameras"]["left"].update(free=["zoom"]), "no parameter"),
         (lambda d: d["cameras"]["left"].update(standard_deviations={"zoom": 1}), "no parameter"),
         (lambda d: d["covariance"]["matrix"][0].__setitem__(0, -1), "variance is negative"),

@@ -127,6 +127,7 @@ def test_counts_that_differ_without_numbers(run_folder: Path) -> None:
     run = load_run(run_folder, pair_by="order")
     assert run.frame_count == 6 and run.image("right", 4) is None
     error_of(run_folder, "do not contain the number", pair_by="numbers")
+    error_of(run_folder, "pair_by is 'nmbers'", "auto, numbers, order", pair_by="nmbers")
 
 
 def test_counters_of_their_own(run_folder: Path) -> None:

@@ -14,6 +14,7 @@ from telerig.errors import InputError
 from telerig.io.dataset.tables import read_accelerometer_csv
 from telerig.io.exchange.importing.accelerometer import (
     Layout,
+    import_accelerations,
     layout_from,
     read_accelerations,
 )
@@ -155,6 +156,14 @@ def test_units_and_channels_are_never_guessed(tmp_path: Path) -> None:
         readings(other, unit="g")
     with pytest.raises(InputError, match="--rate-hz"):
         readings(other, unit="g", columns=("p", "q", "r"))
+
+
+def test_a_unit_against_that_in_the_names_is_noted(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t_s,ax_m_s2,ay_m_s2,az_m_s2\n0,1,2,3\n0.1,1,2,3\n")
+    assert "another unit" not in " ".join(import_accelerations(path, "arm").notes)
+    found = import_accelerations(path, "arm", Layout(unit="g"))
+    assert "their names state another unit: m/s^2" in found.notes
 
 
 def test_the_unit_g_is_the_standard_one() -> None:

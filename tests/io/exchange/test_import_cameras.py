@@ -95,7 +95,7 @@ def test_opencv_says_what_is_missing(tmp_path: Path) -> None:
     (tmp_path / "d.yml").write_text("%YAML:1.0\n---\nM1: [1, 2\n")
     with pytest.raises(InputError):
         read_opencv_cameras([tmp_path / "d.yml"])
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="does not exist"):
         read_opencv_cameras([tmp_path / "none.yml"])
 
 

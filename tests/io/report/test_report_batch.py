@@ -107,9 +107,8 @@ def test_the_headline_names_what_failed_and_short_names_tell_datasets_apart(tmp_
 @pytest.mark.parametrize(
     ("verdicts", "colour", "words"),
     [
-        # flags behind the verdict, as versions before 0.2 wrote them
         (["RESOLVED"], "good", "Verdicts of 1 smoothed run: 1 RESOLVED."),
-        (["RESOLVED", *["UNRESOLVED SHAKE_UNMEASURED"] * 4], "usable",
+        (["RESOLVED", *["UNRESOLVED"] * 4], "usable",
          "Verdicts of 5 smoothed runs: 1 RESOLVED, 4 UNRESOLVED."),
         (["", "PARTIAL"], "usable", "may still contain shake"),
     ],

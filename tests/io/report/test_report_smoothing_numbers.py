@@ -80,9 +80,27 @@ def test_spectra_obey_parseval_and_show_the_lines(whole: Path) -> None:
 
 def test_modes_are_listed_by_place(folder: Path) -> None:
     modes = [
-        {"where": "common", "frequency_hz": 20.0, "damping": 0.03, "rms_mm": [0, 0.12, 0]},
-        {"where": "arm right", "frequency_hz": 32.0, "damping": 0.01, "rms_mm": [0.02, 0.05, 0]},
-        {"where": "servo", "frequency_hz": 15.0, "damping": 0.3, "rms_mm": [0, 0.1, 0]},
+        {
+            "where": "common",
+            "place": "common",
+            "frequency_hz": 20.0,
+            "damping": 0.03,
+            "rms_mm": [0, 0.12, 0],
+        },
+        {
+            "where": "arm right",
+            "place": "arm",
+            "frequency_hz": 32.0,
+            "damping": 0.01,
+            "rms_mm": [0.02, 0.05, 0],
+        },
+        {
+            "where": "servo",
+            "place": "servo",
+            "frequency_hz": 15.0,
+            "damping": 0.3,
+            "rms_mm": [0, 0.1, 0],
+        },
     ]
     rows, words = mode_rows(read(changed(folder, modes=modes)))
     common, arm, servo = (row.cells for row in rows)
@@ -93,7 +111,13 @@ def test_modes_are_listed_by_place(folder: Path) -> None:
 
 
 def test_a_mode_learned_axis_by_axis_is_one_row(folder: Path) -> None:
-    mode = {"where": "common", "frequency_hz": 20.36, "damping": 0.028, "source": "model"}
+    mode = {
+        "where": "common",
+        "place": "common",
+        "frequency_hz": 20.36,
+        "damping": 0.028,
+        "source": "model",
+    }
     parts = [mode | {"rms_mm": [0.0, 0.075, 0.0]}, mode | {"rms_mm": [0.063, 0.0, 0.064]}]
     rows, _ = mode_rows(read(changed(folder, modes=parts)))
     assert [row.cells[3] for row in rows] == ["x: 63.0, y: 75.0, z: 64.0"]

@@ -19,7 +19,6 @@ from telerig.command_options import CalibrationOptions
 from telerig.errors import InputError
 from telerig.estimator.batch.batch import do_job, write_batch
 from telerig.estimator.batch.jobs import Job
-from telerig.io.report.calibration.report import write_calibration_report
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.findings import Code, Finding, Status, objections, verdict_of
 from telerig.short_text import sentence
@@ -176,26 +175,3 @@ def test_findings_that_cannot_be_said_are_refused(
     edit("calibration.json", folder, findings=[finding])
     with pytest.raises(InputError, match=words):
         CalibrationFile.read(folder / "calibration.json")
-
-
-@pytest.mark.filterwarnings(MISSING_MANIFEST)
-@pytest.mark.parametrize("status", ["GOOD", "USABLE, with warnings", "REJECTED"])
-def test_sentences_of_files_without_findings_are_shown(status: str, tmp_path: Path) -> None:
-    """What such a version printed with `!` is an objection, also where it said GOOD."""
-    folder = write_calibration_folder(tmp_path / "r", cameras=2)
-    reasons = [] if status == "GOOD" else ["a reason"]
-    halves = {"words": "the halves agree", "agree": True}
-    structure = {"words": ["the lens lacks a term", "a view is worse"], "sound": False}
-    diagnostics = {"halves": halves, "structure": structure, "weak": ["k1 is weak"]}
-    verdict = {"status": status, "reasons": reasons}
-    edit(
-        "calibration.json", folder, verdict=verdict, diagnostics=diagnostics,
-        notes=["a note", *reasons],
-    )  # fmt: skip
-    file = CalibrationFile.read(folder / "calibration.json")
-    assert file.verdict.status == (Status.USABLE if status == "GOOD" else status)
-    assert set(file.verdict.reasons) == {*reasons, *structure["words"]}
-    assert set(file.notes) == {"the halves agree", "k1 is weak", "a note"}
-    text = Page(write_calibration_report(folder)).spaced
-    for words in (*file.verdict.reasons, *file.notes):
-        assert text.count(words) + text.count(sentence(words)) == 1, words

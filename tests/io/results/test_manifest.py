@@ -18,7 +18,7 @@ from killed_writers import killed_at_every_rename
 from telerig.errors import InputError, TelerigWarning
 from telerig.io.files import atomic
 from telerig.io.results import manifest
-from telerig.io.results.inputs import Input, Source, fingerprints
+from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import is_whole, read_manifest, reading, replaced_results
 from telerig.io.results.stale import refuse_stale, stale
 
@@ -328,15 +328,6 @@ def test_an_image_replaced_by_one_of_the_same_size_makes_results_stale(tmp_path:
     assert stale(folder) == ()
     (run / "left" / "4.raw").replace(run / "left" / "5.raw")
     assert len(stale(folder)) == 1, "an image was renamed"
-
-
-def test_results_without_samples_of_their_images_are_compared_by_number_and_size(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "left").mkdir()
-    (tmp_path / "left" / "1.tif").write_bytes(b"123")
-    assert Input(cameras=("left",), files=1, bytes=3).change(tmp_path) == ""
-    assert Input(cameras=("left",), files=1, bytes=4).change(tmp_path) != ""
 
 
 @pytest.mark.parametrize(

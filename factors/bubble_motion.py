@@ -108,10 +108,6 @@ class Prior:
         """Return the log density up to a constant."""
         return float(-0.5 * (np.log(value / self.median) / self.log_sigma) ** 2)
 
-    def density(self, value: float) -> float:
-        """Return the probability per unit of the value's logarithm."""
-        return float(np.exp(self.log_density(value)) / (self.log_sigma * np.sqrt(2 * np.pi)))
-
     def log_gradient(self, value: float) -> float:
         """Return the derivative of the log density by the number's logarithm."""
         return float(-np.log(value / self.median) / self.log_sigma**2)

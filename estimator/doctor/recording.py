@@ -443,7 +443,7 @@ def _planned(run: RunData, tracks: Tracks, smoothing: Smoothing) -> Experiment:
 def _verdict(expected: Verdict, seconds: float, smoothing: Smoothing) -> Check:
     """Check which verdict the planned run may expect."""
     file = SmoothingFile.model_validate(smoothing.verdict)
-    numbers = number_words(file.axes, file.vertical) or "its measurements disagree"
+    numbers = number_words(file.axes, file.vertical, file.verdict) or "its measurements disagree"
     return _judged(
         "expected verdict",
         f"{expected} of a run of {seconds:.3g} s; of this recording {file.verdict}: {numbers}",

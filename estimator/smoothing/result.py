@@ -95,7 +95,8 @@ class Smoothing(ShortText):
 
         file = SmoothingFile.model_validate(self.verdict)
         flags = f" ({', '.join(file.flags)})" if file.flags else ""
-        words = f"{number_words(file.axes, file.vertical)} {file.verdict or 'not judged'}{flags}"
+        words = f"{number_words(file.axes, file.vertical, file.verdict)} "
+        words += f"{file.verdict or 'not judged'}{flags}"
         return f"Smoothing{self.name and f' of run {self.name!r}'}: {words.strip()}"
 
     def facts(self) -> dict[str, str]:
@@ -674,8 +675,8 @@ def _rts(
 
 
 def shake(solution: Solution, inflation: Sequence[float] = (1.0, 1.0, 1.0)) -> pd.DataFrame:
-    """Return a table with one row per frame: the carriage's position and the offset of each camera
-    from the carriage, in mm along the axes of the rig frame.
+    """Return a table with one row per frame: the carriage's position and the shake of each camera,
+    its offset from where this position puts it, in mm along the axes of the rig frame.
 
     A camera's own shake along its optical axis cannot be seen. Its estimate is 0 and its standard
     deviation is that of the prior.

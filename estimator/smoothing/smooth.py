@@ -652,7 +652,8 @@ def _adapted_solution(
     if learned:
         expected = Inertia((INERTIA_S.median,) * 3)
         model = replace(model, bubble=replace(model.bubble, inertia=expected))
-    frames = max(_SIZED_FRAMES, int(LEARNED_ROWS / max(_mean_in_sight(problem), 1e-9)))
+    in_sight = sum(map(len, problem.bubbles)) / len(problem.t_s)
+    frames = max(_SIZED_FRAMES, int(LEARNED_ROWS / max(in_sight, 1e-9)))
     if model.broad_bands and not given:
         if problem.accelerometers:
             few = thinned(problem.accelerometers, _COARSE_STEP_S)
@@ -680,7 +681,3 @@ def _adapted_solution(
     if len(part.t_s) == len(problem.t_s):
         bare = replace(last, covariances=None, draws=None)
     return solve(problem, model, options, progress, start=bare)
-
-
-def _mean_in_sight(problem: SmoothingProblem) -> float:
-    return sum(len(bubble) for bubble in problem.bubbles) / len(problem.t_s)

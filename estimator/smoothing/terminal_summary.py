@@ -37,7 +37,7 @@ def smoothing_words(found: Smoothing) -> str:
     lines = []
     if file.verdict is not None:
         flags = ", ".join(file.flags)
-        lines += [number_words(file.axes, file.vertical)]
+        lines += [number_words(file.axes, file.vertical, file.verdict)]
         lines += [str(file.verdict) + (f" ({flags})" if flags else "")]
         lines += [f"  {words_of_contradiction(one)}" for one in file.contradictions]
         lines += [f"  {words}" for words in words_of_axes(file)]

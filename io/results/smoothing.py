@@ -224,9 +224,9 @@ class Mode(Part):
 
 
 class PixelResiduals(Part):
-    """Hold statistics of pixel residuals, divided by their stated standard deviations.
+    """Hold statistics of pixel residuals, divided by the standard deviations of their white noise.
 
-    pixels, outliers : number of pixel coordinates, and how many of them are outliers.
+    pixels, outliers : number of detections, and how many of them are outliers.
     rms_sigmas, median_sigmas : RMS and median of these ratios; None where there are none.
     """
 

@@ -78,8 +78,8 @@ FLAG_WORDS: dict[str, str] = {
         "motion is as good as it would be on a rig that stands still."
     ),
     Flag.SHAKE_UNMEASURED: (
-        "Nothing in this run but the motion of one or two bubbles at a time shows the shake, and "
-        "the data do not say what of it is the rig's. The bands hold if the assumptions about "
+        "In most frames nothing but the motion of one or two bubbles shows the shake, and the data "
+        "do not say what of it is the rig's. The bands hold if the assumptions about "
         "bubbles and shake are right, which nothing tests."
     ),
     Flag.ARMS_UNMEASURED: (
@@ -112,15 +112,18 @@ MODE_REMEDIES = {
 _WEAK_DAMPING, _SLOW_HZ = 0.02, 5.0
 
 
-def number_words(axes: Mapping[str, AxisVerdict], vertical: str) -> str:
+def number_words(
+    axes: Mapping[str, AxisVerdict], vertical: str, verdict: Verdict | None = None
+) -> str:
     """Return the numbers of a verdict: how much of the shake is removed along the vertical,
     and to what the paths are good.
 
     axes : the verdicts by axis.
     vertical : the axis nearest to the vertical. Returns "" where it or its numbers are missing, and
     where measurements disagree, so that no path is good to anything.
+    verdict : of the run.
     """
-    if any(axis.verdict == Verdict.CONTRADICTED for axis in axes.values()):
+    if Verdict.CONTRADICTED in (verdict, *(axis.verdict for axis in axes.values())):
         return ""
     sds = {name: axis.sigma_mm for name, axis in axes.items() if axis.sigma_mm is not None}
     if vertical not in sds:
@@ -299,7 +302,12 @@ _LESS_NOISE = (
 
 
 def words_of_refusals(file: SmoothingFile) -> list[str]:
-    """Return why a run does not determine what is graded NO, axis by axis, and what to add."""
+    """Return why a run does not determine what is graded NO, axis by axis, and what to add.
+
+    Nothing is said of a run whose measurements disagree: that is why, and what widens its numbers.
+    """
+    if file.verdict == Verdict.CONTRADICTED:
+        return []
     lines, shaken = [], set()
     for name in AXES:
         refused = [u for u in file.usable_for if u.axis == name and u.grade == Grade.NO]

@@ -29,7 +29,7 @@ STATE = tuple(pattern.format(axis) for pattern in (POSITION, VELOCITY) for axis 
 """The names of the columns of position (mm) and velocity (mm/s)."""
 
 _ID = replace(PARTICLE, kind="whole")
-_OBSERVED = may("observed", "", "1 where the bubble was detected in the frame, else 0")
+_OBSERVED = may("observed", "", "1 where a camera saw the bubble, and not as an outlier, else 0")
 
 
 def _state(prefix: str, what: str) -> list[Column]:
@@ -83,7 +83,7 @@ SHAKE = Table(
     (
         FRAME, TIME,
         *sure([f"{{camera}}_{axis}_mm" for axis in AXES], "mm",
-              "offset of the camera from the carriage"),
+              "shake of the camera: its offset from where the carriage's position puts it"),
         *may([f"s{{camera}}_{axis}_mm" for axis in AXES], "mm", "its standard deviation"),
         *may("position_mm", "mm", "position of the carriage"),
         *may("sposition_mm", "mm", "its standard deviation"),

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from telerig.arrays import Array, as_points
 from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.result.summary import summary
-from telerig.io.dataset.run import run_folder
 from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
 from telerig.rig.camera import Camera
@@ -661,6 +660,8 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
     """
     if not files:
         default = run.resolve().parent.parent / "results" / "calibration" / "calibration.json"
+        from telerig.io.dataset.run import run_folder
+
         run_folder(run)
         if not default.is_file():
             inside = run.resolve().parent.name == "runs"

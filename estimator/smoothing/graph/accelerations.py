@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State, points_in_rig
 from telerig.estimator.smoothing.graph.linear import white_noise
 from telerig.factors.bubble_motion import Inertia, inertial_bubble_path
@@ -19,6 +19,7 @@ from telerig.factors.state_space import Component
 from telerig.rig.triangulation import stacked_jacobian
 
 _LEAST_INFORMATION = 1e-6
+"""Of a place's least known direction over that of its best, for all to count as seen."""
 _LOWEST_HZ, _FREQUENCIES, _ABOVE = 1e-2, 6000, 1e3
 """Of the spectra: the lowest frequency, their number, and the highest one over the low-pass's."""
 
@@ -86,8 +87,7 @@ def add_slow_noise(graph: GraphLayout, state: State, bubbles: Array) -> None:
         gain = np.linalg.solve(white[index] @ stated[mine] @ white[index], by_place)
         np.add.at(information, row[mine], by_place.mT @ gain)
         np.add.at(noise, row[mine], gain.mT @ slow @ gain)
-    size = np.linalg.eigvalsh(information)
-    whole = size[:, 0] > _LEAST_INFORMATION * size[:, -1]
+    whole = are_seen(information)
     added = np.zeros((graph.rows, 3, 3))
     inverse = np.linalg.inv(information[whole])
     added[whole] = inverse @ noise[whole] @ inverse
@@ -96,6 +96,12 @@ def add_slow_noise(graph: GraphLayout, state: State, bubbles: Array) -> None:
     added[~whole] = mean[graph.bubble_of_row[~whole]]
     at = graph.bubble.path_position
     bubbles[:, at[:, None], at] += added
+
+
+def are_seen(information: Array) -> Bools:
+    """Return whether information (n, 3, 3) is of all directions of a place."""
+    size = np.linalg.eigvalsh(information)
+    return np.asarray(size[:, 0] > _LEAST_INFORMATION * size[:, -1])
 
 
 def _bandwidth_hz(process: Component, variance: float, highest_hz: float) -> float:

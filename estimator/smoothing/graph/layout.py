@@ -207,9 +207,6 @@ def _offsets(cameras: Sequence[Camera], model: ShakeModel) -> list[_Placed]:
                 rms, low_hz=band.low_hz, high_hz=band.high_hz, floor=band.floor, tail=band.tail
             )
             placed.append(_Placed(part, BROAD_BAND, direction, band.camera))
-            if band.slow_rms_mm > 0:
-                slow = slow_ou(band.slow_rms_mm, band.slow_tau_s)
-                placed.append(_Placed(slow, "slow", direction, band.camera))
     return placed
 
 

@@ -76,8 +76,9 @@ def _compared(window: Window, model: ShakeModel) -> OtherWindow | None:
         return None
     group = groups_of(signals, problem.up)[0]
     parts = group.fast
-    count = sum(Factor(p, model).count * int((p.weight > 0).sum()) for p in parts)
-    square = sum(Factor(p, model).square for p in parts) / max(count, 1)
+    found = [Factor(part, model) for part in parts]
+    count = sum(one.count * int((one.weight > 0).sum()) for one in found)
+    square = sum(one.square for one in found) / max(count, 1)
     free = free_names(model, group, Learning(), True)
     names = [n for n in free if n.startswith("modes.") and n.endswith("frequency_hz")]
     fit = maximise(parts, model, names, steps=_STEPS)

@@ -62,6 +62,7 @@ def default_model(
     encoder_sigma_mm : standard deviation of an encoder reading.
     """
     bands, modes = _default_bands(problem), tuple[RigMode, ...]()
+    marked = problem.stage is not None and len(problem.references) > 0  # else it is held
     if not bands:
         modes = (RigMode(12.0, 0.2, (0.1,) * 3, force_hz=None),)
         cameras = range(len(problem.cameras))
@@ -72,16 +73,10 @@ def default_model(
         broad_bands=bands,
         carriage=default_carriage(problem, encoder_sigma_mm),
         encoder_sigma_mm=encoder_sigma_mm,
-        encoder_scale_sigma=_scale_sigma(problem),
+        encoder_scale_sigma=default_scale_sigma(problem.travel) if marked else 0.0,
         accelerometer_delay_sigma_s=DELAY_SIGMA_S if problem.accelerometers else 0.0,
         name="default",
     )
-
-
-def _scale_sigma(problem: SmoothingProblem) -> float:
-    """Return the prior sd of the encoder's scale factor; 0 (held) without marks."""
-    marked = len(problem.references) > 0 and problem.stage is not None
-    return default_scale_sigma(problem.travel) if marked else 0.0
 
 
 def _default_bands(problem: SmoothingProblem) -> tuple[BroadBand, ...]:
@@ -306,7 +301,8 @@ def adapted(solution: Solution, start: ShakeModel | None = None) -> ShakeModel |
         floor = fitted_floor(solution.graph.problem.t_s, _offsets(solution), fresh.broad_bands)
         moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
         if max(np.max(np.abs(np.log(factor))), moved) > _RESCALE_BEYOND:
-            better = _with_floor(fresh, floor)
+            bands = (b if floor is None else replace(b, floor=floor) for b in fresh.broad_bands)
+            better = replace(fresh, broad_bands=tuple(bands))
     elif guessed_modes(model):
         factor, faster = _size_of_offsets(solution), _faster(solution)
         if np.max(np.abs(np.log([*factor, faster]))) > _RESCALE_BEYOND:
@@ -368,12 +364,6 @@ def _size_of_offsets(solution: Solution) -> Array:
     if _is_few(solution) and known.any():
         factor[:] = factor[known].max()
     return factor
-
-
-def _with_floor(model: ShakeModel, floor: float | None) -> ShakeModel:
-    if floor is None:
-        return model
-    return replace(model, broad_bands=tuple(replace(b, floor=floor) for b in model.broad_bands))
 
 
 def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) -> float | None:

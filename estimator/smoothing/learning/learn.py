@@ -152,15 +152,11 @@ def _learn_group(
     found = dict(zip(names, sigma.tolist()))
     model = fit.model
     if not options.target:
-        medians = {n: prior_of(n).median for n in names if _is_of_rig(n)} | seeds
+        medians = {n: prior_of(n).median for n in names if fnmatch(n, "modes.*.rms_mm")} | seeds
         vague = [n for n in medians if found.get(n, 0.0) > _VAGUE_LOG_SIGMA]
         likely = [posterior_rms(coarse.fast, model, n, medians[n]) for n in vague]
         model = with_values(model, vague, likely)
     return _averaged_rms(model, factor, t_s, back=True), found
-
-
-def _is_of_rig(name: str) -> bool:
-    return name.startswith("modes.") and name.endswith("rms_mm")
 
 
 def _seeded(
@@ -277,7 +273,8 @@ def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) 
         if is_held(name, model, options):
             continue
         if name == FORCE:
-            if any(_concerns(group, model, f"modes.{i}.rms_mm") for i in _low_pass_modes(model)):
+            low = (i for i, mode in enumerate(model.modes) if mode.force_hz is not None)
+            if any(_concerns(group, model, f"modes.{i}.rms_mm") for i in low):
                 names.append(name)
         elif name.startswith(("modes", "bubble.zigzags", "broad_bands")):
             if _concerns(group, model, name):
@@ -293,10 +290,6 @@ def is_held(name: str, model: ShakeModel, options: Learning) -> bool:
     if name == FORCE:
         names += [f"modes.{i}.force_hz" for i in range(len(model.modes))]
     return any(fnmatch(n, pattern) for n in names for pattern in options.hold)
-
-
-def _low_pass_modes(model: ShakeModel) -> list[int]:
-    return [i for i, mode in enumerate(model.modes) if mode.force_hz is not None]
 
 
 def _concerns(group: Group, model: ShakeModel, name: str) -> bool:

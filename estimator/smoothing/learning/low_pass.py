@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from telerig.arrays import Array, Ints
+from telerig.estimator.smoothing.graph.accelerations import are_seen
 from telerig.estimator.smoothing.graph.layout import GraphLayout
 from telerig.estimator.smoothing.graph.linear import images
 from telerig.estimator.smoothing.graph.solve import Solution, drawn
@@ -43,7 +44,6 @@ RigErrors = tuple[Array, Array]
 
 _PIECE_FRAMES, LEARNED_ROWS, _DRAWS = 250, 6000, 2
 """Pieces of tracks of at most so many frames, so many together, with so many draws of the rig."""
-_LEAST_INFORMATION = 1e-6
 _FREQUENCY_HZ = np.geomspace(0.1, 3e4, 4000)
 _STILL_MM_S, _NONE = 1e-9, np.zeros(0)
 _EXCLUDED, _HALVINGS, _SHORTEST_S = 0.5, 6, 1e-5
@@ -228,8 +228,7 @@ def _positions(solution: Solution, rig: RigErrors, rows: Ints) -> tuple[Array, A
         right = np.concatenate([linear.rhs[..., None], -pushed], -1)
         np.add.at(information, number[row], by_place.mT @ by_place)
         np.add.at(side, number[row], by_place.mT @ right)
-    size = np.linalg.eigvalsh(information)
-    seen = size[:, 0] > _LEAST_INFORMATION * size[:, -1]
+    seen = are_seen(information)
     information[~seen], side[~seen] = 0.0, 0.0
     side[seen] = np.linalg.solve(information[seen], side[seen])
     side[..., 0] += solution.state.bubbles[rows] @ graph.bubble.position.T

@@ -26,7 +26,7 @@ from telerig.factors.bubble_motion import (
     learned_names,
     line_process,
 )
-from telerig.factors.state_space import Component, broad_band, slow_ou
+from telerig.factors.state_space import Component, broad_band
 
 FORCE = "modes.force_hz"
 """Low-pass cut-off of the force that drives the modes, one for all."""
@@ -123,7 +123,7 @@ def log_prior(model: ShakeModel, names: Sequence[str]) -> float:
     return sum(prior_of(n).log_density(value_of(model, n)) for n in names)
 
 
-_broad_band, _slow_ou = lru_cache(maxsize=512)(broad_band), lru_cache(maxsize=512)(slow_ou)
+_broad_band = lru_cache(maxsize=512)(broad_band)
 
 
 def names_of_process(process: Process) -> dict[str, str]:
@@ -148,9 +148,6 @@ def shake_processes(signal: Signal, model: ShakeModel) -> list[Process]:
             shape = ("low_hz", "high_hz", "floor", "tail")
             fixed = {name: getattr(band, name) for name in shape}
             out.append(Process(f"broad_bands.{i}", _broad_band, learned, fixed, band.camera))
-            if band.slow_rms_mm > 0:
-                slow = {"rms": band.slow_rms_mm, "tau_s": band.slow_tau_s}
-                out.append(Process("", _slow_ou, {}, slow, band.camera))
     return out
 
 

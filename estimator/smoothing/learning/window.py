@@ -14,14 +14,14 @@ from telerig.estimator.smoothing.learning.lines_of_sight import (
     signals_of,
     stacked,
 )
-from telerig.estimator.smoothing.problem.problem import SmoothingProblem
+from telerig.estimator.smoothing.problem.problem import FEWEST_BUBBLES, SmoothingProblem
 from telerig.estimator.smoothing.problem.window import Window, cut_out
 
 MOST_FRAMES = 1500
 """A run of so many frames is learned from as a whole."""
 _PLACES = 8
 """Windows begin at multiples of this part of a window."""
-_SHORTER, _ENOUGH_BUBBLES, _FEW_BUBBLES = (0.7, 0.5), 3, 2
+_SHORTER, _FEW_BUBBLES = (0.7, 0.5), 2
 _LONG, _SHORTEST, _UNEVEN = 750, 32, 0.01
 """Frames of a window from which on pieces of it are learned from, and of the shortest piece; by how
 much the steps of frames may differ then."""
@@ -63,7 +63,7 @@ def _pieces(
     length, end = len(window.problem.t_s), window.first + len(window.problem.t_s)
     firsts, lasts = (np.array([getattr(b, n) for b in problem.bubbles]) for n in ("first", "last"))
     lasting = np.count_nonzero((firsts <= window.first) & (lasts >= end - 1))
-    if length < _LONG or len(problem.marks) or lasting >= _ENOUGH_BUBBLES:
+    if length < _LONG or len(problem.marks) or lasting >= FEWEST_BUBBLES:
         return []
     most = min(int((lasts - firsts).max(initial=0)) + 1, length)
     steps = np.diff(problem.t_s)
@@ -73,12 +73,12 @@ def _pieces(
         found, first = list[Window](), 0
         while first + size <= len(problem.t_s) and len(found) * size < 2 * MOST_FRAMES:
             lasting = np.count_nonzero((firsts <= first) & (lasts >= first + size - 1))
-            if lasting >= _ENOUGH_BUBBLES:
+            if lasting >= FEWEST_BUBBLES:
                 piece = cut_out(
                     problem, first, first + size, weights, MOST_BUBBLES,
                     least_share=PRESENT, throughout=True,
                 )  # fmt: skip
-                if len(piece.problem.bubbles) >= _ENOUGH_BUBBLES and _all_see(piece.problem):
+                if len(piece.problem.bubbles) >= FEWEST_BUBBLES and _all_see(piece.problem):
                     found.append(piece)
                     first += size
                     continue
@@ -120,7 +120,7 @@ def learning_window(
         return Window(problem, 0, np.arange(len(problem.bubbles)))
     for length in (MOST_FRAMES, *(int(share * MOST_FRAMES) for share in _SHORTER)):
         first, there = _best(problem, length)
-        if there >= _ENOUGH_BUBBLES:
+        if there >= FEWEST_BUBBLES:
             return cut_out(problem, first, first + length, least_share=PRESENT)
     first, _ = _best(problem, MOST_FRAMES, share=0.0)
     return cut_out(problem, first, first + MOST_FRAMES)

@@ -61,8 +61,6 @@ class BroadBand:
     rms_mm : RMS displacement along x, y and z of the rig frame.
     camera : index of the camera, or CARRIAGE or ARMS for all cameras.
     low_hz, high_hz, floor, tail : see `telerig.factors.state_space.broad_band`.
-    slow_rms_mm, slow_tau_s : RMS and correlation time of an additional slow offset
-        (Ornstein-Uhlenbeck process), which accelerometers do not measure.
     """
 
     rms_mm: Triple
@@ -70,8 +68,6 @@ class BroadBand:
     low_hz: float = 8.0
     high_hz: float = 60.0
     floor: float = 0.0
-    slow_rms_mm: float = 0.0
-    slow_tau_s: float = 0.1
     tail: int = 2
 
 

@@ -669,20 +669,15 @@ def _mountings(
 
 
 def _axes_finding(name: str, found: Mounting) -> Finding:
-    rows = [[float(v) + 0.0 for v in np.round(row, 6)] for row in found.axes]
+    rows = np.round(found.axes, 6) + 0.0
+    line = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in rows)
     return Finding(
         "its axes do not fit what images, encoder and gravity show",
         f"accelerometer {name}",
-        f"{_axes_line(name, found)} would fit",
+        f"[accelerometers.{name}] axes = [{line}] would fit",
         Code.SENSOR_AXES,
-        {"sensor": name, "axes": rows},
+        {"sensor": name, "axes": rows.tolist()},
     )
-
-
-def _axes_line(name: str, found: Mounting) -> str:
-    rows = np.round(found.axes, 6) + 0.0
-    line = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in rows)
-    return f"[accelerometers.{name}] axes = [{line}]"
 
 
 def _expected(

@@ -25,7 +25,8 @@ from telerig.io.tables.smoothing import AXES
 BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
 _STILL = 1e-12
 _WINDOW_S, _LEAST_FRAMES = 0.1, 10
-_EDGE = 0.1
+EDGE = 0.1
+"""Share of a run, and of each track, at both ends that says little of the whole."""
 _SAMPLED = 20_000
 _USED = 0.5
 
@@ -378,7 +379,7 @@ def shake_of(solution: Solution, span: Span | None = None) -> Shake | None:
     if found is None or not graph.shake.size:
         return None
     count = len(span.t_s)
-    edge = int(_EDGE * count)
+    edge = int(EDGE * count)
     inner = np.arange(
         max(span.own.start, edge - span.first), min(span.own.stop, count - edge - span.first)
     )

@@ -16,13 +16,13 @@ from enum import IntEnum
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.smoothing.graph.known_rig import shake_known_variances
 from telerig.estimator.smoothing.graph.layout import GraphLayout
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance, offset_sigma
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, FEWEST_BUBBLES
-from telerig.estimator.smoothing.verdict.evidence import Shake, shake_of
+from telerig.estimator.smoothing.verdict.evidence import EDGE, Shake, shake_of
 from telerig.factors.motion import start
 from telerig.io.results.smoothing import (
     PARTIAL_ETA,
@@ -35,7 +35,6 @@ from telerig.io.results.smoothing import (
 )
 from telerig.io.tables.smoothing import AXES
 
-_EDGE = 0.1
 _SEEN = 0.25
 _MOSTLY = 0.5
 """Share of the frames in which so many bubbles have to be seen."""
@@ -138,17 +137,24 @@ def rule(q: float, eta: float | None, *, arms: bool) -> Verdict:
 def measured_shake(solution: Solution) -> tuple[Measured, Measured, Measured]:
     """Return for x, y and z what measures the shake.
 
-    Three bubbles in most frames show that of the cameras along all axes. So do, along the axes
-    that a camera sees, marks in its images and an accelerometer on its arm, by the axes of it that
-    are used.
+    Three bubbles in most frames show that of the cameras along all axes. So do, in most frames and
+    along the axes that a camera sees, marks in its images and an accelerometer on its arm, by the
+    axes of it that are used.
     """
     graph, problem = solution.graph, solution.graph.problem
-    count = np.bincount(graph.frame_of_row, minlength=len(problem.t_s))
-    several = np.count_nonzero(count >= FEWEST_BUBBLES) > _MOSTLY * np.count_nonzero(count)
-    cameras = set(problem.references.camera.tolist())
-    seen = [direction for camera in cameras for direction in graph.shake.seen[camera]]
-    felt: list[Array] = []
+    t_s, marks = problem.t_s, problem.references.of(solution.weights[1] > 0.5)
+    count = np.bincount(graph.frame_of_row, minlength=len(t_s))
+
+    def mostly(there: Bools) -> bool:
+        return bool(np.count_nonzero(there & (count > 0)) > _MOSTLY * np.count_nonzero(count))
+
+    several, seen, felt = mostly(count >= FEWEST_BUBBLES), list[Array](), list[Array]()
+    for camera, directions in enumerate(graph.shake.seen):
+        if mostly(np.isin(np.arange(len(t_s)), marks.frame[marks.camera == camera])):
+            seen.extend(directions)
     for sensor in problem.accelerometers:
+        if not mostly((t_s >= sensor.t_s[0]) & (t_s <= sensor.t_s[-1])):
+            continue
         whole = sensor.camera == CARRIAGE
         (felt if whole else seen).extend(
             direction
@@ -193,7 +199,7 @@ def _inner_rows(graph: GraphLayout) -> Ints:
     """Return the rows of the bubbles' states, without a tenth of each track at both ends."""
     lengths = np.diff(graph.first_row)[graph.bubble_of_row]
     age = np.arange(graph.rows) - graph.first_row[graph.bubble_of_row]
-    edge = (_EDGE * lengths).astype(np.int64)
+    edge = (EDGE * lengths).astype(np.int64)
     return np.flatnonzero((age >= edge) & (age < lengths - edge))
 
 

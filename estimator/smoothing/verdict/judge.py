@@ -70,10 +70,9 @@ def judge(
         name: axis.content() | {"words": words_of_axis(name, axis, vertical=name == vertical)}
         for name, axis in found.items()
     }
-    worst = worst_of(found)
-    sound = not disagree.found and worst != Verdict.RESOLVED
-    remedies = remedies_of(problem) if sound else ()
-    words = [number_words(found, vertical), contradiction_words(disagree.found)]
+    worst = Verdict.CONTRADICTED if disagree.found else worst_of(found)
+    remedies = remedies_of(problem) if worst in (Verdict.PARTIAL, Verdict.UNRESOLVED) else ()
+    words = [number_words(found, vertical, worst), contradiction_words(disagree.found)]
     words += [axis["words"] for axis in axes.values()]
     words += [to_resolve(remedy_words(remedies))]
     words += ["The shake's modes were learned from this run."] if model.name == "learned" else []

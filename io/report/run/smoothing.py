@@ -68,7 +68,7 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVe
     file = results.file
     (headline, meaning, _), colour, good = NOT_JUDGED, "usable", ""
     if file.verdict is not None:
-        colour, good = _COLOURS[file.verdict], number_words(file.axes, file.vertical)
+        colour, good = _COLOURS[file.verdict], number_words(file.axes, file.vertical, file.verdict)
         headline, meaning = VERDICT_WORDS[file.verdict].headline, consequence_words(file)
     of_axes = words_of_axes(file)
     contradicted = file.verdict == Verdict.CONTRADICTED

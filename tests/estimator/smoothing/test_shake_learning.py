@@ -44,7 +44,7 @@ from telerig.rig.pose import Pose
 OTHER = replace(
     true_model(0.4),
     broad_bands=(
-        BroadBand((0.1, 0.05, 0.1), 0, slow_rms_mm=0.02, floor=0.3),
+        BroadBand((0.1, 0.05, 0.1), 0, floor=0.3),
         BroadBand((0.0, 0.1, 0.0)),
     ),
 )

@@ -33,7 +33,7 @@ from telerig.factors.bubble_motion import BubbleModel, Zigzag
 
 Array = NDArray[np.float64]
 
-BANDS = (BroadBand((0.1, 0.05, 0.1), 0, slow_rms_mm=0.02), BroadBand((0.0, 0.1, 0.0)))
+BANDS = (BroadBand((0.1, 0.05, 0.1), 0), BroadBand((0.0, 0.1, 0.0)))
 
 
 def driven(model: ShakeModel, force_hz: float) -> ShakeModel:

@@ -338,7 +338,7 @@ def test_white_force_modes_equal_the_dense_posterior(rng: np.random.Generator) -
 
 
 def test_broad_band_equals_the_dense_posterior(rng: np.random.Generator) -> None:
-    bands = tuple(BroadBand((0.2,) * 3, j, slow_rms_mm=0.02) for j in range(2))
+    bands = tuple(BroadBand((0.2,) * 3, j) for j in range(2))
     compare(problem(rng, marks=True), replace(MODEL, modes=(), broad_bands=bands))
 
 

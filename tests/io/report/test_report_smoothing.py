@@ -169,6 +169,9 @@ def test_the_page_says_why_it_is_not_good_for_more_and_what_to_add(folder: Path)
     changed(folder, usable_for=[path | {"axis": "y"}], axes=axes, remedies=[])
     (by_shake,) = words_of_refusals(read(folder).file)  # strip and accelerometers are there
     assert "partly because of the shake" in by_shake
+    changed(folder, verdict="CONTRADICTED")  # what widens q is no shake
+    assert words_of_refusals(read(folder).file) == []
+    changed(folder, verdict="PARTIAL")
     changed(folder, usable_for=[path | {"axis": "y", "grade": "good"}])
     assert words_of_refusals(read(folder).file) == []
 

@@ -38,6 +38,7 @@ def test_the_number_that_a_person_wants() -> None:
 def test_a_share_that_means_nothing_is_not_said() -> None:
     assert number_words(axes(eta=None), "y").startswith("Vertical: paths good to 22 µm")
     assert number_words(axes(verdict="CONTRADICTED"), "y") == "", "a path is good to nothing"
+    assert number_words(axes(), "y", Verdict.CONTRADICTED) == "", "along no axis"
     below = number_words(axes(eta=0.1, flags=(Flag.SHAKE_BELOW_NOISE,)), "y")
     assert "below the noise" in below and "removed" not in below
     assert "assumptions" in number_words(axes(flags=(Flag.SHAKE_UNMEASURED,)), "y")

@@ -71,7 +71,7 @@ def contradictions(solution: Solution, evidence: Evidence) -> Contradictions:
 
 def _of_one(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
     yield from _outliers(evidence)
-    yield from _constants(solution, evidence)
+    yield from _constants(evidence)
     yield from _speeds(solution, evidence)
     yield from residual_contradictions(evidence)
     yield from _shared(evidence)
@@ -88,23 +88,19 @@ def _outliers(evidence: Evidence) -> Iterator[Contradiction]:
             )  # fmt: skip
 
 
-def _constants(solution: Solution, evidence: Evidence) -> Iterator[Contradiction]:
+def _constants(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield the biases and delays that are more than 5 prior standard deviations off."""
-    graph = solution.graph
-    delays, (first, last) = solution.delays_s, evidence.times_s
-    for i, sensor in enumerate(graph.problem.accelerometers):
-        by_axis = np.abs(solution.state.sensors[i, :3]) / sensor.bias_sigma_mm_s2
-        axis = int(by_axis.argmax())
-        if by_axis[axis] > _MOST_SD:
+    first, last = evidence.times_s
+    for name, off in evidence.off.items():
+        axis = int(off[:3].argmax())
+        if off[axis] > _MOST_SD:
             yield Contradiction(
-                source=sensor.name, axis=AXES[axis], from_s=first, to_s=last,
-                statistic=float(by_axis[axis]), test=Disagreement.BIAS,
+                source=name, axis=AXES[axis], from_s=first, to_s=last,
+                statistic=float(off[axis]), test=Disagreement.BIAS,
             )  # fmt: skip
-        sigma = graph.model.accelerometer_delay_sigma_s
-        late = abs(delays[i] - sensor.delay_s) / sigma if sigma else 0.0
-        if late > _MOST_SD:
+        if off[3] > _MOST_SD:
             yield Contradiction(
-                source=sensor.name, from_s=first, to_s=last, statistic=float(late),
+                source=name, from_s=first, to_s=last, statistic=float(off[3]),
                 test=Disagreement.DELAY,
             )  # fmt: skip
 
@@ -231,7 +227,7 @@ def _blamed(
         except CalibrationError:
             continue
         sums = Evidence.of(other, drawn(other))
-        misfit = [*_outliers(sums), *_constants(other, sums), *residual_contradictions(sums)]
+        misfit = [*_outliers(sums), *_constants(sums), *residual_contradictions(sums)]
         misfit += _shared(sums)
         off = sum(f.statistic for f in misfit)
         if off < best[0]:

@@ -202,6 +202,8 @@ class Evidence:
     pixels : detections by source.
     lagged : products of the bubbles' residuals by camera.
     lost : unused samples by accelerometer.
+    off : (4,) by accelerometer: how many standard deviations of their priors the biases along x, y
+        and z of the sensor, and its delay, are off.
     means : mean velocities by particle number.
     shake : None without a shake in the model.
     nodes : number of times at which the shake is estimated.
@@ -215,6 +217,7 @@ class Evidence:
     pixels: Mapping[str, Pixels]
     lagged: Mapping[str, Lagged]
     lost: Mapping[str, Lost]
+    off: Mapping[str, Array]
     means: Mapping[int, Mean]
     shake: Shake | None
     nodes: int
@@ -240,7 +243,7 @@ class Evidence:
             (float(span.t_s[0]), float(span.t_s[-1])), span.window_s, tallies,
             _pixels(solution, span),
             lagged(solution, draws, span.holds(solution.graph.problem.observations.frame)),
-            _lost(solution, span), _means(solution, span),
+            _lost(solution, span), _off(solution), _means(solution, span),
             shake_of(solution, span), int(np.count_nonzero(span.spans(nodes.t_s))), solution.passes,
             shared,
         )  # fmt: skip
@@ -261,6 +264,7 @@ class Evidence:
             pixels=_added(self.pixels, other.pixels),
             lagged=_added(self.lagged, other.lagged),
             lost=_added(self.lost, other.lost),
+            off={**self.off, **other.off},  # each piece knows what all tell of the constants
             means=means,
             shake=reduce(Shake.__add__, shake) if shake else None,
             nodes=self.nodes + other.nodes,
@@ -344,6 +348,17 @@ def _lost(solution: Solution, span: Span) -> dict[str, Lost]:
         gone = given & ~used & mine
         masked = np.count_nonzero(mine & ~used)
         out[sensor.name] = Lost(int(mine.sum()), int(masked), sensor.t_s[gone])
+    return out
+
+
+def _off(solution: Solution) -> dict[str, Array]:
+    graph = solution.graph
+    sigma = graph.model.accelerometer_delay_sigma_s
+    out = {}
+    for i, sensor in enumerate(graph.problem.accelerometers):
+        biases = solution.state.sensors[i, :3] / sensor.bias_sigma_mm_s2
+        late = (solution.delays_s[i] - sensor.delay_s) / sigma if sigma else 0.0
+        out[sensor.name] = np.abs([*biases, late])
     return out
 
 

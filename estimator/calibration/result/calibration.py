@@ -478,7 +478,8 @@ class Calibration(ShortText):
 
         The pose of the first of them is taken as exact: its uncertainty moves all triangulated
         points in the same way (an S-transformation of the gauge). Raises CalibrationError if a
-        camera does not exist, or if they are not in the order of `rig.toml`.
+        camera does not exist, or if they are not in the order of `rig.toml`; InputError if the
+        covariance lacks a parameter.
         """
         chosen = tuple(self.camera(camera) for camera in cameras)
         at = [self.cameras.index(camera) for camera in chosen]
@@ -491,10 +492,17 @@ class Calibration(ShortText):
         names += [f"{camera.name}.{p}" for camera in chosen[1:] for p in POSE_COMPONENTS]
         rows = np.zeros((len(names), len(self.covariance_names)))
         index = {name: i for i, name in enumerate(self.covariance_names)}
+        first_pose = [f"{chosen[0].name}.{p}" for p in POSE_COMPONENTS if at[0] > 0]
+        missing = [name for name in [*names, *first_pose] if name not in index]
+        if missing:
+            raise InputError(
+                f"its covariance has no {first_of(missing)}", where=f"Calibration {self.name!r}",
+                todo="name every free lens parameter and pose component in covariance_names",
+            )  # fmt: skip
         for row, name in enumerate(names):
             rows[row, index[name]] = 1.0
         if at[0] > 0:  # T_b Exp(x_b) seen from T_a Exp(x_a): x_b - Ad(b_from_a) x_a
-            own = [index[f"{chosen[0].name}.{p}"] for p in POSE_COMPONENTS]
+            own = [index[name] for name in first_pose]
             for k, camera in enumerate(chosen[1:]):
                 first = len(rows) - 6 * (len(chosen) - 1 - k)
                 b_from_a = camera.camera_from_rig @ chosen[0].rig_from_camera

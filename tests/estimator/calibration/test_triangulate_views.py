@@ -163,5 +163,9 @@ def test_what_cannot_be_triangulated_says_why() -> None:
         calibration.triangulate({"left": uv, "right": uv}, sigma_px={"left": 0.1})
     with pytest.raises(CalibrationError, match="not in the rig's order"):
         calibration.subset("right", "left")
+    bare = replace(calibration, covariance=np.zeros((0, 0)), covariance_names=())
+    for pair in (("left", "right"), ("middle", "right")):
+        with pytest.raises(InputError, match=r"its covariance has no .*more\)"):
+            bare.subset(*pair)
     with pytest.raises(CalibrationError, match="one camera cannot triangulate"):
         calibration_from_cameras(cameras(1)).triangulate(uv, uv)

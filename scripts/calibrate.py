@@ -84,7 +84,7 @@ def calibrate(
     Exit code 0: calibrated. 1: calibrated, but the verdict is REJECTED. 2: the input cannot be
     used; the message says what, where and what to do. 130: interrupted.
     """
-    from telerig.estimator.calibration.calibrate import check_options
+    from telerig.estimator.calibration.calibrate import check_options, run_calibration
     from telerig.estimator.calibration.quality.comparison import compare_calibrations
     from telerig.estimator.calibration.results_folder import sources, write_report, write_results
     from telerig.io.dataset.dataset import load_dataset
@@ -108,7 +108,8 @@ def calibrate(
                     )
             data = load_dataset(dataset, source=chosen.source)
             used = fingerprints(out or data.results / "calibration", sources(data))
-            run = _at_once(data, quiet, settings)
+            with progress(quiet) as stage:
+                run = run_calibration(data, **settings, stage=stage, pictures=True)
         folder = out or data.results / "calibration"
         change = None if earlier is None else compare_calibrations(earlier, run.calibration)
         write_results(
@@ -123,16 +124,6 @@ def calibrate(
     say_written(folder, report)
     if run.calibration.verdict["status"] == "REJECTED":
         raise typer.Exit(EXIT_REJECTED)
-
-
-def _at_once(data: Dataset, quiet: bool, settings: dict[str, Any]) -> CalibrationRun:
-    """Calibrate the dataset as it is now."""
-    from telerig.estimator.calibration.calibrate import check_options, detect, run_calibration
-
-    check_options(**settings, cameras=list(data.rig.cameras))
-    with progress(quiet) as stage:
-        detected = detect(data, stage=stage, pictures=True)
-        return run_calibration(data, **settings, stage=stage, detected=detected)
 
 
 def _earlier(path: Path, dataset: Path) -> Calibration:

@@ -63,7 +63,7 @@ def smooth_run(
     """
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
-    _check_cameras(followed, calibration)
+    _check_tracks(followed, source, run, calibration)
     calibration = of_run(calibration, run.cameras)
     run, marks = with_followed_references(run, source.parent)
     of_tracks = [source.parent / name for name in _USED] if tracks.is_dir() else [source]
@@ -107,9 +107,19 @@ def run_sources(run: RunData) -> list[Path | Source]:
     ]
 
 
-def _check_cameras(tracks: Tracks | StoredTracks | Any, calibration: Calibration) -> None:
-    """Raises InputError when a camera by which the run was tracked is not in the calibration."""
-    used = list(getattr(tracks, "summary", {}).get("image_size_px") or [])
+def _check_tracks(
+    tracks: Tracks | StoredTracks | Any, file: Path, run: RunData, calibration: Calibration
+) -> None:
+    """Raise InputError for tracks of another run, or of a camera that is not in the calibration."""
+    summary = getattr(tracks, "summary", {})
+    name = summary.get("run") or run.name
+    if name != run.name and (run.path.parent / name).is_dir():  # the run was not renamed
+        raise InputError(
+            f"has the tracks of the run {name!r}, not of {run.name!r}",
+            where=str(file),
+            todo="name the tracks of this run with --tracks, or choose another --out",
+        )
+    used = list(summary.get("image_size_px") or [])
     have = [camera.name for camera in calibration.cameras]
     if set(used) - set(have):
         raise InputError(

@@ -23,7 +23,7 @@ from telerig.arrays import Array, Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import atomic_path
 from telerig.io.files.names import ADVICE, fault_of_name
-from telerig.io.files.text import read_text
+from telerig.io.files.text import LARGEST_NUMBER, read_text
 
 _EVERY_DIGIT: dict[str, Any] = (
     {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
@@ -34,8 +34,6 @@ _EXPORT = "export the table as comma-separated UTF-8 with one header line"
 _NO_MARKS = bytes(set(range(256)) - set(b",\n"))
 
 MOST_COLUMNS = 1000
-LARGEST_NUMBER = 1e15
-"""The largest number in a column of numbers; whole numbers up to it are exact as floats."""
 
 
 @dataclass(frozen=True)

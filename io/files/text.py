@@ -6,6 +6,9 @@ from pathlib import Path
 
 from telerig.errors import InputError
 
+LARGEST_NUMBER = 1e15
+"""The largest number that is read; whole numbers up to it are exact as floats."""
+
 
 def read_bytes(file: Path, missing: str = "check the path") -> bytes:
     """Read a whole file.

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from telerig.errors import InputError
-from telerig.io.files.text import read_text
+from telerig.io.files.text import LARGEST_NUMBER, read_text
 
 LONGEST = 4_000_000
 """Characters of a file: a target of 100,000 points."""
 DEEPEST = 32
 """Tables and lists inside each other. tomllib needs time and memory that grow with its square."""
-LARGEST_NUMBER = 1e15
 
 
 def read_toml(file: Path, todo: str, missing: str = "check the path") -> dict[str, Any]:

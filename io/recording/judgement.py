@@ -16,7 +16,8 @@ from telerig.errors import InputError
 from telerig.io.recording.protocols import Readings
 from telerig.io.rig_file.description import DeviceDescription
 
-_GAP_INTERVALS = 1.5
+GAP_INTERVALS = 1.5
+"""A step longer than so many usual ones is a gap."""
 _NEIGHBOURS = 8
 """Readings on each side from which a value is predicted."""
 _FAR_RESIDUALS = 5.0
@@ -117,7 +118,7 @@ def _far_at_first(t_s: Array, values: Sequence[Array], most: float) -> Bools:
     step = np.diff(t_s)
     if step.size < 4 * _NEIGHBOURS:
         return far
-    wide = np.flatnonzero(step > _GAP_INTERVALS * np.median(step))
+    wide = np.flatnonzero(step > GAP_INTERVALS * np.median(step))
     beside = np.zeros(len(t_s), bool)
     if len(wide) < len(t_s) / 10:
         beside[wide] = beside[wide + 1] = True

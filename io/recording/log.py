@@ -23,6 +23,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from telerig.arrays import Ints
 from telerig.errors import InputError
+from telerig.io.files.atomic import make_parent, unwritable
 from telerig.io.files.names import check_name
 from telerig.io.rig_file.description import DeviceDescription
 
@@ -77,18 +78,15 @@ class RawLog:
         head = MAGIC + _CRC.pack(len(text)) + text + _CRC.pack(zlib.crc32(text))
         self._waiting: list[bytes] = []
         self.bytes = 0
+        make_parent(path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             self._file: BinaryIO = path.open("x+b", buffering=0)
         except FileExistsError as error:
-            if path.parent.is_dir():
-                raise InputError(
-                    "exists, and a recording is never written over",
-                    where=str(path),
-                    todo="give the new run another name, or move this one away",
-                ) from error
-            what = "is a file, and a folder is needed"
-            raise InputError(what, where=str(path.parent), todo="give another name") from error
+            raise InputError(
+                "exists, and a recording is never written over",
+                where=str(path),
+                todo="give the new run another name, or move this one away",
+            ) from error
         except OSError as error:
             raise log_error(path, error, recorded=False) from error
         try:
@@ -186,11 +184,7 @@ def log_error(path: Path, error: OSError, *, recorded: bool = True) -> InputErro
             if recorded
             else "make room, then run again",
         )
-    return InputError(
-        f"cannot be written: {error.strerror or error}",
-        where=str(path),
-        todo="choose a folder that can be written",
-    )
+    return unwritable(path, error)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
+from telerig.io.files.text import LARGEST_NUMBER
 from telerig.io.recording.clock import ClockFit, check_unit, host_times
 from telerig.io.recording.judgement import amid_garbage, far_from_neighbours, mostly_garbage
 from telerig.io.recording.log import (
@@ -29,15 +30,11 @@ from telerig.io.recording.protocols import Readings, joined, parser
 from telerig.io.recording.unstamped import spread_arrivals
 from telerig.io.rig_file.description import DeviceDescription
 
-GAP_INTERVALS = 1.5
-"""A step longer than so many usual ones is a gap."""
 _BLOCK_BYTES = 1 << 19
 REPLAY_WITH_RIG = "run `telerig record --replay RUN --rig rig.toml`"
 """The advice for a recording whose devices were described wrongly."""
 TIME_DIGITS = 7
 """Decimals of t_s in the tables: a tenth of a microsecond."""
-_LARGEST = 1e15
-"""A larger number is no reading: neither a stamp nor a value has so many digits."""
 MALFORMED = "malformed"
 REGULAR_CLOCK = "arrival, by a regular clock"
 _ACCELERATION_MM_S2 = 5000.0
@@ -288,7 +285,7 @@ def _judged(line: _Line, start_ns: int, times: Callable[..., _Timed]) -> DeviceR
         kept = kept[~bad]
 
     numbers = np.column_stack([*found.values.values(), np.zeros(count)])
-    refuse(~np.all(np.abs(numbers) < _LARGEST, axis=1), "not a number")
+    refuse(~np.all(np.abs(numbers) < LARGEST_NUMBER, axis=1), "not a number")
     garbage = found.malformed_spans[found.garbage]
     refuse(amid_garbage(found.spans[kept], garbage), "amid garbage")
     error = mostly_garbage(device, found)

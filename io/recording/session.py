@@ -18,11 +18,10 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.recording.clock import check_unit
-from telerig.io.recording.judgement import mostly_garbage
+from telerig.io.recording.judgement import GAP_INTERVALS, mostly_garbage
 from telerig.io.recording.log import END, LOST, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.ports import Reader, open_port
 from telerig.io.recording.protocols import Readings, joined, parser
-from telerig.io.recording.replay import GAP_INTERVALS
 from telerig.io.rig_file.description import DeviceDescription
 from telerig.live import publish
 

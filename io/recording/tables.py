@@ -17,8 +17,8 @@ import numpy as np
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
+from telerig.io.recording.judgement import GAP_INTERVALS
 from telerig.io.recording.replay import (
-    GAP_INTERVALS,
     REGULAR_CLOCK,
     TIME_DIGITS,
     DeviceRecord,

@@ -54,7 +54,6 @@ def write_trial_report(
         [*_views(run, detections), *_shake(run, shake)],
         [Section("checks", "What was looked at", table(head, rows, (99, 99)))], TERMS,
     ))  # fmt: skip
-    file.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(file, page)
 
 

@@ -41,6 +41,11 @@ LONGEST_COMMAND = 300
 _SMOOTHED = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
 _MARKS = "references.csv"
 """Without a manifest, smoothing would take the marks of an earlier tracking for new ones."""
+_OF = {
+    "detect": "calibration", "calibrate": "calibration", "track": "run", "smooth": "run",
+    "validate": "run", "bubbles": "bubbles", "batch": "batch",
+}  # fmt: skip
+"""What the results of a command are of; results of different things need folders of their own."""
 _LOCK_WITHIN_S = 30.0
 _MOST_TRIES = 20
 _LONGEST_NAME, _LONGEST_PATH = 255, 3000
@@ -295,8 +300,13 @@ def replaced_results(
     again = again if len(again) <= LONGEST_COMMAND else again[:LONGEST_COMMAND] + " ..."
     section = Section(again=again, telerig=VERSION, inputs=dict(inputs))
     with staged_folder(folder) as staged:
+        before = _old(folder).sections
+        for name in before if command != "report" else ():
+            if name != "report" and _OF.get(name) != _OF[command]:
+                what = f"holds results of `telerig {name}`, of which some files would be replaced"
+                raise InputError(what, where=str(folder), todo="choose another --out")
         sections = {
-            **_old(folder).sections,
+            **before,
             command: section.model_copy(update={"unfinished": True}),
         }
         if folder.is_dir() and staged.parent.samefile(folder):

@@ -67,7 +67,7 @@ def log_run(
         _log_smoothed_series(stream, smoothing)
     if len(cameras) and len(tracks.tracks):
         log_cameras(stream, f"{SPACE}/rig", cameras, tracks.points_mm, bodies=False)
-    bodies = tracks.tracks if smoothing is None else _with_shapes(smoothing, tracks)
+    bodies = tracks.tracks if smoothing is None else _with_shapes(smoothing)
     found, in_space, tracked = map(_rows_by_frame, (detections, bodies, tracks.tracks))
     hidden = _hidden(tracks.tracks)
     unseen, none = _rows_by_frame(hidden), np.zeros(0, np.int64)
@@ -103,7 +103,7 @@ def _times(tracks: TrackResults, smoothing: SmoothingResults | None) -> dict[int
     return dict(zip(table["frame"].astype(int).tolist(), table["t_s"].tolist()))
 
 
-def _with_shapes(smoothing: SmoothingResults, tracks: TrackResults) -> pd.DataFrame:
+def _with_shapes(smoothing: SmoothingResults) -> pd.DataFrame:
     """Return the smoothed rows with the bodies' shapes, where bubbles.csv has them."""
     frames = smoothing.bubble_frames
     return frames if len(frames) else smoothing.trajectories.assign(d_eq_mm=np.nan)

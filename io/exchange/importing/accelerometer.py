@@ -27,8 +27,7 @@ from telerig.io.exchange.importing.headers import (
 )
 from telerig.io.exchange.importing.logger_text import is_number
 from telerig.io.exchange.importing.recording import EXPORT_AGAIN, Recording
-from telerig.io.files.csv_table import LARGEST_NUMBER
-from telerig.io.files.text import need_file
+from telerig.io.files.text import LARGEST_NUMBER, need_file
 from telerig.rig.units import ACCELERATION_UNITS
 
 AXES = ["ax_m_s2", "ay_m_s2", "az_m_s2"]

@@ -16,8 +16,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
-from telerig.io.files.csv_table import LARGEST_NUMBER
-from telerig.io.files.text import need_file
+from telerig.io.files.text import LARGEST_NUMBER, need_file
 from telerig.io.machine.parallel import isolated
 from telerig.rig.pose import rotation_from_rotvec
 

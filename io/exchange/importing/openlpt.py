@@ -15,8 +15,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
-from telerig.io.files.csv_table import LARGEST_NUMBER
-from telerig.io.files.text import read_text
+from telerig.io.files.text import LARGEST_NUMBER, read_text
 
 _LINES = ("calibration error", "pose error", "image size", "camera matrix", "camera matrix",
           "camera matrix", "distortion coefficients", "rotation vector", "rotation matrix",

@@ -11,6 +11,7 @@ from telerig.arrays import Array
 from telerig.io.exchange.importing.accelerometer import AXES
 from telerig.io.rig_file.writer import toml_key
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.statistics import robust_sd
 
 _UP_RIG = [0, -1, 0]
 _MOSTLY = 0.9
@@ -60,6 +61,6 @@ def _noise_density(t_s: Array, readings_m_s2: Array) -> float:
     if len(t_s) < 4:
         return 100.0
     bend = np.abs(np.diff(readings_m_s2, 2, axis=0)) / np.sqrt(6)
-    sigma = float(np.max(np.median(bend, axis=0)) / 0.6745) or float(np.sqrt(np.mean(bend**2)))
+    sigma = float(np.max(robust_sd(bend, axis=0))) or float(np.sqrt(np.mean(bend**2)))
     half_rate_hz = 0.5 / float(np.median(np.diff(t_s)))
     return max(1.0, float(1e6 * sigma / STANDARD_GRAVITY_M_S2 / np.sqrt(half_rate_hz)))

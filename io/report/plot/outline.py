@@ -34,7 +34,6 @@ class RigOutline:
     """plates_mm : (V, 4, 3) corners of the target in each view; dots_mm : (V, N, 3)."""
 
     cameras: tuple[CameraOutline, ...]
-    view_names: tuple[str, ...]
     plates_mm: Array
     dots_mm: Array
 
@@ -51,7 +50,7 @@ def rig_outline(
     plates = np.array([pose.apply(plate) for pose in every]).reshape(-1, 4, 3)
     dots = np.array([pose.apply(points_mm) for pose in every]).reshape(len(every), -1, 3)
     outlines = tuple(camera_outline(camera, plates.reshape(-1, 3)) for camera in cameras)
-    return RigOutline(outlines, tuple(poses), plates, dots)
+    return RigOutline(outlines, plates, dots)
 
 
 def plate_corners(points_mm: Array, margin: float = 0.0) -> Array:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.io.files.text import need_file
 from telerig.io.report.plot.axes import (
     COLOURS,
     LEFT_OUT,
@@ -24,6 +25,7 @@ from telerig.io.report.plot.axes import (
     image_axes,
 )
 from telerig.io.report.plot.outline import common_plane, plate_corners, rig_outline
+from telerig.io.results.calibration import read_uncertainty
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.short_text import nice_below, no_formula, number, short_names
@@ -315,7 +317,11 @@ def uncertainty(
     """
     from scipy.interpolate import RectBivariateSpline
 
-    arrays = source if isinstance(source, Mapping) else _npz(source)
+    if isinstance(source, Mapping):
+        arrays = source
+    else:
+        need_file(Path(source))
+        arrays = read_uncertainty(Path(source))
     name = f"{share}_mm2"
     if "points_mm" not in arrays or name not in arrays:
         what = f"holds no {name}"
@@ -393,12 +399,3 @@ def _of_camera(table: pd.DataFrame, camera: str) -> pd.DataFrame:
             f"there is no camera {camera!r}", where="telerig.plot", todo=f"it has {known}"
         )
     return mine
-
-
-def _npz(path: str | PathLike[str]) -> dict[str, Array]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, TypeError, BadZipFile) as error:
-        what = f"cannot be read: {error}"
-        raise InputError(what, where=str(path), todo="give uncertainty.npz") from error

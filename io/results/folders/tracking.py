@@ -22,7 +22,7 @@ from telerig.io.tables.run import DETECTIONS, EVENTS, REFERENCES, TRACKS
 from telerig.io.tables.table import POINT, Table
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
-from telerig.statistics import median
+from telerig.statistics import NORMAL_FROM_MEDIAN, median
 
 UP = (0.0, -1.0, 0.0)
 """In the rig frame, where tracking.json has no ``up``."""
@@ -230,7 +230,7 @@ def unit_vector(vector: ArrayLike) -> Array:
     return np.asarray(found / np.linalg.norm(found))
 
 
-NORMAL_MEDIAN = 0.6745
+NORMAL_MEDIAN = 1 / NORMAL_FROM_MEDIAN
 """Of the absolute value, in standard deviations."""
 
 

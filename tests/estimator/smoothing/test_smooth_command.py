@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -71,3 +72,14 @@ def test_no_tracks_and_an_unknown_model_are_refused(
     result = CliRunner().invoke(app, ["smooth", str(tank / "runs" / "rise"), option, value])
     assert result.exit_code == 2
     assert words in result.output
+
+
+def test_tracks_of_another_run_are_refused_and_those_of_a_renamed_one_not(tank_copy: Path) -> None:
+    runs, own = tank_copy / "runs", tank_copy / "results" / "rise"
+    shutil.copytree(runs / "rise", runs / "fall")
+    command = ["smooth", str(runs / "fall"), "--out", str(own), "--model", "default", "--quiet"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2
+    assert "tracks of the run 'rise', not of 'fall'" in " ".join(result.output.split())
+    (runs / "rise").rename(tank_copy / "away")
+    assert CliRunner().invoke(app, [*command, "--no-report"]).exit_code == 0

@@ -429,3 +429,13 @@ def test_a_folder_that_is_a_disk_of_its_own_and_one_without_a_name(
         assert "rig.toml has changed" in " ".join(stale(staged))
     assert read(folder, "tracks.csv") == ["new"]
     assert sorted(p.name for p in folder.iterdir()) == ["manifest.json", "tracks.csv"]
+
+
+def test_results_of_different_things_need_folders_of_their_own(tmp_path: Path) -> None:
+    write(tmp_path, "calibrate", calibration_json="c", run_json="c")
+    write(tmp_path, "report", report_html="c")
+    with pytest.raises(InputError, match="holds results of `telerig calibrate`"):
+        write(tmp_path, "track", tracks_csv="t", run_json="t")
+    assert read(tmp_path, "run.json", "report.html") == ["c", "c"]
+    write(tmp_path, "detect", dots_csv="d")
+    write(tmp_path, "report", report_html="d")

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.arrays import Array
+from telerig.arrays import Array, as_pixels
 from telerig.errors import GeometryError, InputError
 from telerig.rig import projection
 from telerig.rig.camera import Camera
@@ -219,8 +219,8 @@ def triangulate(
     Raises InputError for unequal shapes, pixels that are not finite or an unknown method, and
     GeometryError for parallel rays.
     """
-    first, second = (np.asarray(uv, float) for uv in uv_px)
-    if first.shape != second.shape or first.shape[-1:] != (2,):
+    first, second = (as_pixels(uv, "triangulate") for uv in uv_px)
+    if first.shape != second.shape:
         raise InputError(
             f"pixels of shapes {first.shape} and {second.shape} do not pair up",
             todo="give two arrays (N, 2), row i of one matching row i of the other",

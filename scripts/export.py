@@ -32,7 +32,7 @@ def export(
     ],
     run: Annotated[
         str | None,
-        typer.Option(help="For trajectories: name of the run [the only one with results]."),
+        typer.Option(help="For trajectories: the run, by name [the only one with results]."),
     ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="calibration.json [the run's or dataset's].")

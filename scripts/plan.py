@@ -75,7 +75,7 @@ def plan(
     chosen = variants(rig, planned)
     expected = {}
     with progress(quiet) as stage:
-        stage("calibration", 0, 1)
+        stage("calibration", 0.0, 1)
         known = calibration_of(dataset, rig, calibration, views)
         for number, (name, one) in enumerate(chosen.items()):
             stage("variants", number, len(chosen))

@@ -112,12 +112,16 @@ def _recorded(
     run: Path | None, seconds: float | None, ports: list[str], rig: Path | None, view: bool,
     quiet: bool,
 ) -> Path:  # fmt: skip
+    from telerig.estimator.batch.jobs import check_run_name
+    from telerig.io.files.names import check_name
     from telerig.io.recording.session import record as record_run
 
     if run is None:
         raise InputError(
             "no run is given", todo="name a new folder: telerig record DATASET/runs/NAME"
         )
+    check_name(run.resolve().name, str(run), "run")
+    check_run_name(run)
     file = rig or run.resolve().parent.parent / "rig.toml"
     if rig is None and not file.is_file():
         raise InputError(

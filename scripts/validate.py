@@ -28,7 +28,11 @@ def validate(
     ] = 6,
     model: Annotated[
         ShakePriors,
-        typer.Option(help="Priors of the shake, as of `telerig smooth`: auto or default."),
+        typer.Option(
+            "--model",
+            "--shake",
+            help="Priors of the shake, as of `telerig smooth`: auto or default.",
+        ),
     ] = "auto",
     accept: options.AcceptedFaults = None,
     seed: Annotated[

@@ -111,7 +111,7 @@ def track_run(
     cluster = options.cluster
     with nullcontext() if cluster is None else dask_executor(cluster, "--cluster") as executor:
         if stage is not None:
-            stage("reading the run", 0, 1)
+            stage("reading the run", 0.0, 1)
         data = load_with(run, calibrated, options.source)
         publish("recording", path=data.path, rig=of_run(calibrated, data.cameras).cameras)
         summary = write_tracking(
@@ -144,7 +144,7 @@ def smooth_run(
 
     calibrated, files = calibration_for(run, calibration)
     if stage is not None:
-        stage("reading the run", 0, 1)
+        stage("reading the run", 0.0, 1)
     data = load_tracked_run(run, calibrated)
     publish("recording", path=data.path, rig=of_run(calibrated, data.cameras).cameras)
     found = results_folder.smooth_run(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from telerig.errors import CalibrationError, InputError
+from telerig.errors import CalibrationError, InputError, need_kind
 from telerig.estimator.calibration.solver.problem import DOTS_FREE, checked_outlier_sd
 from telerig.estimator.calibration.thresholds import OUTLIER_SD
 from telerig.io.results.findings import Code, Finding
@@ -107,6 +107,7 @@ def calibrate(
     Raises InputError, DetectionError or CalibrationError; each says what happened, where, and what
     to do.
     """
+    need_kind(dataset, "rig", "telerig.calibrate", "give what telerig.load_dataset returns")
     run = run_calibration(
         dataset, model=model, medium=medium, outlier_sd=outlier_sd,
         stage=None if isinstance(progress, bool) else progress,

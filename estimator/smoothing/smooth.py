@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.errors import InputError
+from telerig.errors import LOAD, InputError, need_kind
 from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
@@ -456,12 +456,7 @@ def _smoothing_words(problem: SmoothingProblem) -> str:
 
 def _check_kinds(tracks: Any, calibration: Any, rig: Any) -> None:
     """Raise InputError for a path, or anything else, in place of what would be read from it."""
-    if not hasattr(calibration, "cameras"):
-        raise InputError(
-            f"calibration is {type(calibration).__name__}",
-            where="smooth",
-            todo="give a Calibration: telerig.load_calibration(path)",
-        )
+    need_kind(calibration, "cameras", "telerig.smooth", LOAD)
     if tracks is not None and not hasattr(getattr(tracks, "table", tracks), "columns"):
         raise InputError(
             f"tracks is {type(tracks).__name__}",

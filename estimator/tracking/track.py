@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
-from telerig.errors import CalibrationError, InputError
+from telerig.errors import LOAD, CalibrationError, InputError, need_kind
 from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.groups import candidates_of
@@ -264,11 +264,8 @@ def track(
     Raises InputError for recordings that cannot be used, and CalibrationError for the calibration
     of another rig.
     """
-    if not isinstance(run, RunData):
-        raise InputError(
-            f"this is a {type(run).__name__} and no run", where="telerig.track",
-            todo="give what telerig.load_run returns",
-        )  # fmt: skip
+    need_kind(run, "frame_count", "telerig.track", "give what telerig.load_run returns")
+    need_kind(calibration, "cameras", "telerig.track", LOAD)
     stage = None if isinstance(progress, bool) else progress
     with tempfile.TemporaryDirectory(prefix="telerig-") as work:
         stream = tracking_stream(run, calibration, Path(work) / "work", options, stage)

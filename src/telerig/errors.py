@@ -58,6 +58,19 @@ class InputError(TelerigError):
     """A file, table, image or argument cannot be used as it is."""
 
 
+LOAD = "give what telerig.calibrate or telerig.load_calibration returns"
+"""The advice for an argument that is no calibration."""
+
+
+def need_kind(value: object, attribute: str, where: str, todo: str) -> None:
+    """Raise InputError for an argument that lacks an attribute, so that it is of a wrong kind.
+
+    where : the function of the library. todo : what to give it.
+    """
+    if not hasattr(value, attribute):
+        raise InputError(f"was given a {type(value).__name__}", where=where, todo=todo)
+
+
 class DetectionError(TelerigError):
     """The target or a bubble cannot be found in an image, or the dots cannot be numbered."""
 

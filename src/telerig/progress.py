@@ -139,6 +139,7 @@ def _how_far(done: float, of: int, seconds: float, here: float) -> str:
     """
     share = isinstance(done, float)
     words = [f"{100 * done:.0f} %" if share else f"{done} of {of}" if of else f"{done or ''}"]
+    words = [] if share and not done else words
     if here and seconds >= 1:
         rate = here / seconds
         words += [] if share else [f"{rate:.3g} a second"]

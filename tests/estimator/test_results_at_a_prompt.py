@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -204,3 +205,17 @@ def test_images_that_cannot_be_undistorted(image: np.ndarray) -> None:
     calibration = calibration_from_cameras([Camera.create("left", (240, 200), 10.0)])
     with pytest.raises(InputError, match=r"undistort_image, camera left"):
         calibration.undistort_image("left", image)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: telerig.calibrate("tank"),
+        lambda: telerig.track("tank/runs/rise", None),
+        lambda: telerig.compare_calibrations("tank", "tank"),
+        lambda: telerig.uncertainty_map("tank"),
+    ],
+)
+def test_a_path_in_place_of_what_it_holds_is_named(call: Callable[[], object]) -> None:
+    with pytest.raises(telerig.TelerigError, match=r"was given a str\n  -> give what telerig\."):
+        call()

@@ -221,7 +221,7 @@ def test_bad_input() -> None:
     cameras, pixels = rig(), noisy(rig(), 4)
     with pytest.raises(InputError, match="pair up"):
         triangulate(cameras, (pixels[0], pixels[1][:3]), 0.1)
-    with pytest.raises(InputError, match="pair up"):
+    with pytest.raises(InputError, match="has the shape"):
         triangulate(cameras, (pixels[0][:, :1], pixels[1][:, :1]), 0.1)
     with pytest.raises(InputError, match="unknown method"):
         triangulate(cameras, tuple(pixels), 0.1, "best")

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from telerig.arrays import Array, Ints
-from telerig.errors import CalibrationError, InputError
+from telerig.errors import LOAD, CalibrationError, InputError, need_kind
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.gaussian import Estimate
 from telerig.estimator.calibration.solver.problem import HELD_SCALE, Problem, cameras_from_state
@@ -234,6 +234,8 @@ def compare_calibrations(first: Calibration, second: Calibration) -> RigComparis
     Returns a `RigComparison`; its ``words()`` are a sentence for the user. Raises InputError if the
     two calibrations have different cameras or image sizes, or only one camera.
     """
+    for one in (first, second):
+        need_kind(one, "cameras", "telerig.compare_calibrations", LOAD)
     check_same_rig(first.cameras, second.cameras)
     found = compare_rigs(_rig(first), _rig(second))
     known = (first.covariance_known, second.covariance_known)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from telerig.arrays import Array
-from telerig.errors import CalibrationError
+from telerig.errors import LOAD, CalibrationError, need_kind
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.rig.triangulation import working_volume
 
@@ -40,6 +40,7 @@ def uncertainty_map(
 
     Raises CalibrationError for a single camera.
     """
+    need_kind(calibration, "cameras", "telerig.uncertainty_map", LOAD)
     sigma = float(calibration.statistics.get("scatter_px", 0.02)) if sigma_px is None else sigma_px
     points = working_volume(calibration.cameras, steps)
     if len(calibration.cameras) < 2:

@@ -216,8 +216,9 @@ def cameras_of(
 def run_folder(source: Path, run: str | None) -> Path:
     """Return the results folder of a run.
 
-    source : a dataset or one of its results folders. run : name of the run; None takes ``source``
-    if it is the results folder of a run, otherwise the only run of the dataset with results.
+    source : a dataset or one of its results folders. run : name of the run, or its folder; None
+    takes ``source`` if it is the results folder of a run, otherwise the only run of the dataset
+    with results.
     Raises InputError if there is no such run, or if there are several.
     """
 
@@ -229,9 +230,10 @@ def run_folder(source: Path, run: str | None) -> Path:
         return source
     root = results_root(source)
     if run is not None:
-        if not (root / run).is_dir():
-            raise absent(root / run, "folder of results", "run `telerig track` first")
-        return root / run
+        named = root / Path(run).name
+        if not named.is_dir():
+            raise absent(named, "folder of results", "run `telerig track` first")
+        return named
     found = sorted(p for p in root.iterdir() if holds(p)) if root.is_dir() else []
     if len(found) == 1:
         return found[0]

@@ -223,6 +223,7 @@ def test_only_the_results_of_runs_are_taken_for_runs(folder: Path, tmp_path: Pat
     write_table(table(), left_behind / "tracks.csv")
     (tmp_path / "rig.toml").write_text("")
     assert run_folder(tmp_path, None) == folder
+    assert run_folder(tmp_path, f"runs/{folder.name}") == folder
     elsewhere = folder.parent / "fall"
     elsewhere.mkdir()
     with pytest.raises(InputError, match="neither a dataset nor a folder of results"):

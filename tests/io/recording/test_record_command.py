@@ -274,3 +274,9 @@ def test_a_log_of_another_time_needs_no_rig_file(tmp_path: Path) -> None:
     said = run("record", "--replay", tmp_path)
     assert "encoder: 29" in said or "encoder: 30" in said
     assert "no recording of telerig" in run("record", "--replay", tmp_path / "stage.csv", code=2)
+
+
+@pytest.mark.parametrize("name", ["calibration", "@one"])
+def test_a_run_that_no_command_would_take_is_not_recorded(tmp_path: Path, name: str) -> None:
+    said = run("record", tmp_path / "runs" / name, code=2)
+    assert "the calibration" in said or "begins with @" in said

@@ -17,6 +17,7 @@ from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.given import Sensor, given_sensors, table_columns
 from telerig.estimator.sensors.samples import mostly_masked, screened
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -150,7 +151,7 @@ def _encoder(stage: Any, frames: Array, where: str) -> tuple[Encoder | None, lis
         raise InputError(
             f"times do not increase at row {int(bad[0]) + 1}"
             if len(bad)
-            else f"has {len(t)} readings",
+            else f"has {counted(len(t), 'reading')}",
             where=where,
             todo="sort the rows and remove duplicates; a stage that stands needs no encoder",
         )

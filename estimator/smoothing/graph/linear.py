@@ -186,9 +186,10 @@ def white_noise(graph: GraphLayout, most: float = np.inf) -> Array:
 def pixel_whiteners(graph: GraphLayout, covariance_px2: Array, noise: Array) -> Array:
     """Return the matrices (n, 2, 2) that whiten pixels with stated covariances (n, 2, 2).
 
-    noise : (n or none, 2, 2) factor from the stated noise to that which is white.
+    noise : (n or none, 2, 2) factor from the stated noise to that which is white. What is whitened
+    times this factor is in units of the stated noise, however a camera is turned.
     """
-    return whitener_of(noise @ covariance_px2 @ noise) / graph.model.pixel_inflation
+    return whitener_of(covariance_px2) @ np.linalg.inv(noise) / graph.model.pixel_inflation
 
 
 def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
@@ -313,7 +314,8 @@ def _one_camera(
         graph.in_shake_basis(w @ by_shake, node),
         w @ np.concatenate([by_encoder[..., : graph.encoder_size], by_rig], -1),
     )
-    return LinearFactors((), blocks, -np.einsum("mij,mj->mi", w, off), log_det_of(w))
+    log_det = np.linalg.slogdet(w)[1]
+    return LinearFactors((), blocks, -np.einsum("mij,mj->mi", w, off), log_det)
 
 
 def _by_calibration(

@@ -48,8 +48,10 @@ def uses(
     if not len(chosen):
         return []
     widen = np.asarray(inflation)
-    errors = draws.of_family(graph, 1)
-    paths = [_Path(solution, errors, int(bubble), widen) for bubble in chosen]
+    errors, place, speed = draws.of_family(graph, 1), *considered_variance(solution)
+    whole = solution.velocity_variances() + speed
+    shared = offset_sigma(solution)
+    paths = [_Path(solution, errors, (place, speed, whole, shared), int(b), widen) for b in chosen]
     best = Grade.LIMITED if np.any(widen > 1) else Grade.GOOD
     out = []
     for axis in range(3):
@@ -65,10 +67,14 @@ class _Path:
     3, K), and its zigzag across the vertical.
     """
 
-    def __init__(self, solution: Solution, errors: Array, bubble: int, widen: Array) -> None:
+    def __init__(
+        self, solution: Solution, errors: Array, known: tuple[Array, ...], bubble: int, widen: Array
+    ) -> None:
         """Collect a bubble's states.
 
         errors : (rows, d, K) draws of the errors of all bubbles.
+        known : variances (rows, 3) by encoder and travel axis of places and velocities, and all
+            those of velocities; and standard deviation (3,) of an offset of all places.
         widen : (3,) factors of the standard deviations.
         """
         graph, found = solution.graph, solution.covariances
@@ -77,7 +83,7 @@ class _Path:
         states = solution.state.bubbles[rows]
         self.rows, self.widen = rows, widen
         self.t_s = graph.problem.t_s[graph.frame_of_row[rows]]
-        place, speed = (v[rows] for v in considered_variance(solution))
+        place, speed, whole = (variance[rows] for variance in known[:3])
         row = graph.bubble.position
         drawn = graph.bubble_basis(rows) @ errors[rows]
         error = np.einsum("id,ndk->nik", row, drawn)
@@ -85,9 +91,9 @@ class _Path:
         scale = np.sqrt(variance.mean(0) / (error**2).mean((0, 2)).clip(1e-300))
         self.errors = error * (scale * widen)[None, :, None]
         self.place = states @ row.T
-        self.place_sd = np.hypot(np.sqrt(variance + place) * widen, offset_sigma(solution))
+        self.place_sd = np.hypot(np.sqrt(variance + place) * widen, known[3])
         self.speed = solution.velocities_mm_s[rows]
-        self.speed_sd = np.sqrt(solution.velocity_variances()[rows] + speed) * widen
+        self.speed_sd = np.sqrt(whole) * widen
         self.mean_speed_variance = speed.mean(0) * widen**2
         self.lateral = np.flatnonzero(np.abs(graph.problem.up) <= _UPRIGHT)
         turned = np.einsum("id,ndk->nik", graph.bubble.velocity, drawn) * widen[:, None]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, run_file, say, typed_command
 
@@ -29,7 +31,7 @@ def detect(
     inputs = fingerprints(folder, sources(data))
     with progress(quiet) as stage:
         found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
-    again = typed_command() or f"telerig detect {data.path}"
+    again = typed_command() or shlex.join(["telerig", "detect", str(data.path)])
     with replaced_results(folder, "detect", again=again, inputs=inputs) as staged:
         write_table(found.dots, staged / "dots.csv")
         write_detections(found, staged)

@@ -24,11 +24,11 @@ _WIDTH = 8
 def doctor(
     dataset: Annotated[Path | None, typer.Argument(help="Dataset or run to check as well.")] = None,
     frames: Annotated[
-        str, typer.Option("--frames", help="Frames of a run that are tracked and smoothed.")
+        str, typer.Option(help="Frames of a run that are tracked and smoothed.")
     ] = "0:500",
     seconds: Annotated[
         float | None,
-        typer.Option("--seconds", help="How long the planned run is [as long as this one]."),
+        typer.Option(help="How long the planned run is [as long as this one].", min=0.1),
     ] = None,
     calibration: options.CalibrationFiles = None,
     out: options.RunFolder = None,

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from telerig.errors import InputError
 from telerig.live import ADDRESS
 from telerig.scripts.console import errors_in_words, run_file, say
 
@@ -41,6 +42,8 @@ def view(
     from telerig.io.view.show import frames_of
     from telerig.io.view.show import view as show
 
+    if web and save is not None:
+        raise InputError("--web and --save are given", todo="give only one of them")
     stream = show(folder, save=save, web=web, frames=frames_of(frames), recording=run)
     if save is not None:
         say(f"written: {save} ({save.stat().st_size / 1e6:.1f} MB)")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 
-from telerig.errors import InputError
+from telerig.errors import InputError, need_package
 
 _CONNECT_S = 20
 
@@ -23,15 +23,9 @@ def dask_executor(address: str, option: str = "--scheduler") -> Iterator[Executo
     Raises InputError if Dask is not installed, if no scheduler answers, or if the scheduler has no
     workers.
     """
+    distributed = need_package("distributed", "cluster", option)
     try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError(
-            "Dask is not installed", where=f"{option} {address}",
-            todo="pip install 'telerig[cluster]'",
-        ) from error  # fmt: skip
-    try:
-        client = Client(address, timeout=_CONNECT_S)
+        client = distributed.Client(address, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
             f"no Dask scheduler answers: {error}", where=f"{option} {address}",

@@ -12,7 +12,7 @@ from telerig.command_options import CalibrationOptions, SmoothingOptions, Tracki
 from telerig.errors import InputError
 from telerig.estimator.batch.cluster import dask_executor
 from telerig.io.dataset.dataset import load_dataset
-from telerig.io.dataset.run import RunData, load_run
+from telerig.io.dataset.run import RunData, load_run, recordings, run_folder
 from telerig.io.results.inputs import fingerprints
 from telerig.live import publish
 
@@ -100,9 +100,10 @@ def track_run(
     if options.cluster is not None:
         run, folder = run.resolve(), folder.resolve()
     calibrated, files = calibration_for(run, calibration)
-    if folder.resolve() == run.resolve():
+    place = run_folder(run)
+    if folder.resolve() in (place, *recordings(place).values()):
         raise InputError(
-            "is the folder of the run, whose detections.csv is of the recording",
+            "holds the recording, whose files and detections.csv results must not replace",
             where=str(folder),
             todo="choose another --out",
         )

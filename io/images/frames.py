@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Ints
-from telerig.errors import InputError
+from telerig.errors import InputError, need_package
 from telerig.io.images.high_speed import HIGH_SPEED_EXTENSIONS, open_high_speed
 from telerig.io.images.read import (
     PALETTE,
@@ -414,16 +414,7 @@ def _grey_plane(frame: Any, path: Path) -> NDArray[Any]:
 
 
 def _av() -> Any:
-    try:
-        import av
-        import av.error
-    except ImportError as error:
-        raise InputError(
-            "reading a video needs PyAV, which is not installed",
-            where="av",
-            todo='pip install "telerig[video]" (or: pip install av)',
-        ) from error
-    return av
+    return need_package("av", "video", "reading a video")
 
 
 def _opened(path: Path) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from telerig.errors import InputError
+from telerig.errors import need_package
 
 FRAME, TIME, VIEW = "frame", "time", "view"
 """The time lines: frames and seconds of a run, views of a calibration."""
@@ -33,14 +33,7 @@ PLOTS = {
 
 def need_rerun() -> Any:
     """Return rerun. Raises InputError, with what to install, where it is missing."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise InputError(
-            "the viewer needs rerun, which is not installed", where="rerun",
-            todo="pip install 'telerig[view]'",
-        ) from error  # fmt: skip
-    return rerun
+    return need_package("rerun", "view", "the viewer")
 
 
 def path(*parts: str) -> str:

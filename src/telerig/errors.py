@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
+from importlib import import_module
+from typing import Any
 from unicodedata import category
 
 LONGEST_BYTES = {"where": 600, "what": 2000, "todo": 900}
@@ -69,6 +71,21 @@ def need_kind(value: object, attribute: str, where: str, todo: str) -> None:
     """
     if not hasattr(value, attribute):
         raise InputError(f"was given a {type(value).__name__}", where=where, todo=todo)
+
+
+def need_package(module: str, extra: str, what: str) -> Any:
+    """Import and return a package that is an optional dependency.
+
+    extra : its name, as in ``pip install 'telerig[tdms]'``. what : what needs it.
+    Raises InputError, with what to install, where it is missing.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise InputError(
+            f"{what} needs {module}, which is not installed",
+            todo=f"pip install 'telerig[{extra}]'",
+        ) from error
 
 
 class DetectionError(TelerigError):

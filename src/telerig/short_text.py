@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from telerig.errors import InputError
+from telerig.errors import need_package
 
 if TYPE_CHECKING:
     import xarray
@@ -60,12 +60,9 @@ def xarray_dataset(
 
     about : its attributes. Raises InputError if xarray is not installed.
     """
-    try:
-        import xarray
-    except ImportError as error:
-        todo = "pip install 'telerig[notebook]'"
-        raise InputError("xarray is not installed", where="to_xarray", todo=todo) from error
-    return xarray.Dataset(variables, coordinates, {"Conventions": "CF-1.8", **about})
+    of = need_package("xarray", "notebook", "to_xarray").Dataset
+    found: xarray.Dataset = of(variables, coordinates, {"Conventions": "CF-1.8", **about})
+    return found
 
 
 def _shown(facts: Mapping[str, str]) -> dict[str, str]:

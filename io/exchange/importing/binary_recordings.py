@@ -7,14 +7,13 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
+from telerig.errors import InputError, need_package
 from telerig.io.exchange.importing.recording import EXPORT_AGAIN, Recording
 from telerig.io.machine.parallel import isolated
 
@@ -108,12 +107,7 @@ def loaded_hdf5(path: Path) -> dict[str, NDArray[Any]]:
 
 def read_tdms(path: Path, group: str | None = None) -> Recording:
     """Read the channels of one group, with their units and rate."""
-    try:
-        nptdms = import_module("nptdms")
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "TDMS files need nptdms", where=str(path), todo="pip install 'telerig[tdms]'"
-        ) from error
+    nptdms = need_package("nptdms", "tdms", "reading a TDMS file")
     nptdms.log.log_manager.set_level(logging.CRITICAL)  # what it finds is in our errors
     with _reading(path, "TDMS"):
         return _of_tdms(nptdms.TdmsFile.read(path), path, group)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
+from telerig.errors import need_package
 from telerig.io.files.atomic import atomic_path
 
 Picture = NDArray[np.uint8]
@@ -65,11 +65,4 @@ def _stream(film: Any, picture: Picture, rate_hz: float) -> Any:
 
 def need_av() -> Any:
     """Return PyAV. Raises InputError, with what to install, where it is missing."""
-    try:
-        import av
-    except ImportError as error:
-        raise InputError(
-            "a film needs PyAV, which is not installed", where="av",
-            todo="pip install 'telerig[video]'",
-        ) from error  # fmt: skip
-    return av
+    return need_package("av", "video", "a film")

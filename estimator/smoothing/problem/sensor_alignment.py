@@ -119,8 +119,8 @@ def _aligned(
     findings: list[Finding]
     seen = iter(()) if images is None else _of_images(problem, images, encoder)
     elsewhere = 0.0
-    for one in (c for c in seen if c.connected):
-        if _in_place(one, encoder, problem):
+    for one in seen:
+        if one.connected and _in_place(one, encoder, problem):
             break
         elsewhere = max(elsewhere, one.log_ratio)
     else:

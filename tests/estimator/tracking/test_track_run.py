@@ -534,8 +534,3 @@ def test_only_doubtful_frames_are_worst_and_where_none_is_three_are_shown() -> N
     doubtful.add(Linked(tracks, seen))
     assert [w["frame"] for w in doubtful.frames()] == [6, 2]
     assert doubtful.frames()[0]["why"] == "1 without partner or track"
-
-
-def test_a_path_in_place_of_a_run_says_what_to_give(rise: Path) -> None:
-    with pytest.raises(InputError, match=r"no run(.|\n)*load_run"):
-        telerig.track(rise, None)  # type: ignore[arg-type]

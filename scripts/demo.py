@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from telerig.command_options import CalibrationOptions, TrackingOptions
 from telerig.scripts import options
 from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, run_file, say
 from telerig.short_text import counted
@@ -39,35 +41,29 @@ def demo(
     """
     import numpy as np
 
-    from telerig.estimator.calibration.calibrate import run_calibration
+    from telerig.estimator.batch.work import calibrate_dataset
     from telerig.estimator.calibration.quality.comparison import difference_from_truth
-    from telerig.estimator.calibration.results_folder import write_results
     from telerig.io.simulation.calibration.scene import true_cameras
     from telerig.io.simulation.simulate import simulate
 
     say("simulating two telecentric cameras of 512 x 512 px: 12 views of a hand-held target,")
     say("and a bubble of 4-5 mm that zigzags upwards, followed by the vibrating rig")
-    begun = time.perf_counter()
     config = _config()
     data = simulate(config, rng=np.random.default_rng(seed), out=out)
-    simulated = time.perf_counter()
+    folder, again = data.results / "calibration", shlex.join(["telerig", "calibrate", str(out)])
     with progress(quiet) as stage:
-        run = run_calibration(data, stage=stage, pictures=True)
-    seconds = {"simulate": simulated - begun, "calibrate": time.perf_counter() - simulated}
-    folder = data.results / "calibration"
-    record = {"seed": seed}
-    page = write_results(data, run, folder, command="demo", options=record, seconds=seconds)
-    say(run.calibration.report())
-    off = difference_from_truth(run.calibration, tuple(true_cameras(config.calibration).values()))
+        calibration = calibrate_dataset(out, folder, CalibrationOptions(), again=again, stage=stage)
+    say(calibration.report())
+    off = difference_from_truth(calibration, tuple(true_cameras(config.calibration).values()))
     calibrated = off.rms_um < MOST_RATIO * off.predicted_um
     say(
         f"\n{'PASSED' if calibrated else 'FAILED'}: the calibration's errors displace points in "
         f"space by {off.rms_um:.2f} µm RMS per axis; its covariance predicts "
-        f"{off.predicted_um:.2f} µm\nreport: {page}\n"
+        f"{off.predicted_um:.2f} µm\nreport: {folder / 'report.html'}\n"
     )
-    tracked = track_and_compare(data, run.calibration, record, quiet)
+    tracked = track_and_compare(data, quiet)
     say("")
-    smoothed = smooth_and_compare(data, run.calibration, quiet)
+    smoothed = smooth_and_compare(data, calibration, quiet)
     if not (calibrated and tracked and smoothed):
         raise typer.Exit(EXIT_REJECTED)
 
@@ -83,31 +79,26 @@ def _config() -> RunConfig:
     return replace(config, stage=stage)
 
 
-def track_and_compare(
-    data: Dataset, calibration: Calibration, record: dict[str, int], quiet: bool
-) -> bool:
+def track_and_compare(data: Dataset, quiet: bool) -> bool:
     """Track the only run of a simulated dataset, and print the errors.
 
     Returns whether the bubble was followed throughout.
     """
     import pandas as pd
 
-    from telerig.estimator.tracking.results_folder import write_tracking
-    from telerig.estimator.tracking.track import TrackOptions
+    from telerig.estimator.batch.work import track_run
     from telerig.estimator.tracking.tracks import load_tracks, tracking_words
     from telerig.estimator.tracking.truth import score_tracks
 
     begun = time.perf_counter()
     (name,) = data.runs
-    folder = data.results / name
+    folder, path = data.results / name, data.runs[name].path
+    again = shlex.join(["telerig", "track", str(path)])
     with progress(quiet) as stage:
-        summary = write_tracking(
-            data.runs[name].load(), calibration, folder, options=TrackOptions(),
-            record={"command": "demo", "options": record}, stage=stage,
-        )  # fmt: skip
+        summary = track_run(path, folder, TrackingOptions(), again=again, stage=stage)
     say(tracking_words(summary, time.perf_counter() - begun))
     truth = pd.read_csv(data.path / "truth" / "runs" / name / "bubbles.csv")
-    score = score_tracks(load_tracks(folder), truth, [c.name for c in calibration.cameras])
+    score = score_tracks(load_tracks(folder), truth, list(data.rig.cameras))
     passed = score.recall == 1 and score.precision == 1 and score.tracks == 1
     say(
         f"{score.right} of the bubble's {score.in_view} true positions found, {score.wrong} false "
@@ -145,7 +136,8 @@ def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> 
     ):
         with progress(quiet) as stage:
             found = smooth_run(
-                used, calibration, folder, target, report=used is run, stage=stage
+                used, calibration, folder, target, report=used is run, stage=stage,
+                inputs=[data.results / "calibration" / "calibration.json"],
             )  # fmt: skip
         say(f"{words}:\n{smoothing_words(found)}")
         rows.append((words, motion_error(found.trajectories, truth), found.verdict.get("verdict")))

@@ -252,11 +252,6 @@ def read_log(path: Path, scan: LogScan | None = None) -> Iterator[Entry]:
     yield from sorted(once, key=lambda entry: entry.time_ns)
 
 
-def damaged_bytes(path: Path) -> int:
-    """Read a raw log and return the number of bytes that belong to no undamaged entry."""
-    return scan_log(path).damaged_bytes
-
-
 def received_bytes(path: Path, scan: LogScan, spans: Sequence[Ints]) -> list[list[bytes]]:
     """Read some lines of each device from a raw log.
 

@@ -123,7 +123,7 @@ def page_of(
     tracking = [*texts(*verdict.warnings, points=True), *words, *key.contents]
     return Page(
         "telerig report of a smoothed run", "Smoothed run", name,
-        smoothed.smoothing_verdict(smoothing, results), _look_smoothed(smoothing),
+        smoothed.smoothing_verdict(smoothing), _look_smoothed(smoothing),
         [
             Section("smoothing-key", "", [Tiles(tuple(smoothed.smoothing_tiles(smoothing)))]),
             Section("good-for", "What this run is good for", _uses(smoothing)),

@@ -18,8 +18,7 @@ from telerig.io.results.folders.smoothing import (
     shake_rms_um,
     taken_away,
 )
-from telerig.io.results.folders.tracking import TrackResults
-from telerig.io.results.smoothing import Flag, Grade, Mode, Verdict
+from telerig.io.results.smoothing import Flag, Grade, Mode, Place, Verdict
 from telerig.io.results.verdict_words import (
     FLAG_WORDS,
     NOT_JUDGED,
@@ -63,7 +62,7 @@ _IN_UM = {"mm": ("µm", 1e3)}
 _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 
 
-def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVerdict:
+def smoothing_verdict(results: SmoothingResults) -> PageVerdict:
     """Return the verdict of the smoothing, with a remedy if there is one."""
     file = results.file
     (headline, meaning, _), colour, good = NOT_JUDGED, "usable", ""
@@ -84,22 +83,10 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> PageVe
     sentences += [text for flag, text in flags.items() if flag in _HARMLESS]
     warnings = [text for flag, text in flags.items() if flag not in _HARMLESS]
     warnings += [sentence(w) for w in file.warnings]
-    warnings += _stale(results, tracks)
     if warnings and colour == "good":
         colour = "usable"
     known = tuple(dict.fromkeys(s for s in sentences if s))
     return PageVerdict(headline, colour, known, tuple(warnings))
-
-
-def _stale(results: SmoothingResults, tracks: TrackResults) -> list[str]:
-    strange = sorted(set(results.bubbles) - {int(k) for k in tracks.tracks["particle"].unique()})
-    if not strange:
-        return []
-    some = ", ".join(str(k) for k in strange[:5]) + (", ..." if len(strange) > 5 else "")
-    return [
-        f"Bubbles {some} of trajectories.csv are not in tracks.csv: the run was tracked again "
-        "after it was smoothed. Smooth it again (`telerig smooth`)."
-    ]
 
 
 def smoothing_tiles(results: SmoothingResults) -> list[Tile]:
@@ -282,13 +269,15 @@ def residual_words(results: SmoothingResults) -> str:
 MODE_HEADS = ["what shakes", "Hz", "damping", "RMS, µm", "what would help"]
 
 MOST_ROWS = 30
-_PLACES = {"common": "all cameras alike (carriage, mount)", "servo": "servo (following error)"}
+_PLACES = {
+    Place.COMMON: "all cameras alike (carriage, mount)", Place.SERVO: "servo (following error)",
+}  # fmt: skip
 
 
 def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
     """Return rows of the shake's modes with remedies, and a sentence on their origin."""
     modes = results.file.modes
-    rows = [_mode(mode, results.cameras) for mode in _merged(modes)]
+    rows = [_mode(mode) for mode in _merged(modes)]
     if not rows:
         return rows, "The model has no modes, and no peak in the spectrum of the shake was found."
     if any(mode.source != "estimate" for mode in modes):
@@ -312,14 +301,10 @@ def _merged(modes: Sequence[Mode]) -> list[Mode]:
     return list(found.values())
 
 
-def _mode(mode: Mode, cameras: Sequence[str]) -> Row:
+def _mode(mode: Mode) -> Row:
+    where = f"arm of {mode.camera}" if mode.place == Place.ARM else f"{mode.place} {mode.camera}"
     numbers = (number(mode.frequency_hz), number(mode.damping), _rms_um(mode.rms_mm))
-    return Row((_place(mode.where, cameras), *numbers, mode_remedy(mode)))
-
-
-def _place(where: str, cameras: Sequence[str]) -> str:
-    name = where.removeprefix("arm ")
-    return f"arm of {name}" if name in cameras else _PLACES.get(where, where)
+    return Row((_PLACES.get(mode.place, where), *numbers, mode_remedy(mode)))
 
 
 def _rms_um(rms_mm: Any) -> str:

@@ -16,7 +16,6 @@ from telerig.io.recording.log import (
     Entry,
     LogHeader,
     RawLog,
-    damaged_bytes,
     read_log,
     scan_log,
 )
@@ -49,7 +48,7 @@ def log(tmp_path: Path) -> Path:
 def test_what_is_written_reads_back(log: Path) -> None:
     assert scan_log(log).header == HEADER
     assert list(read_log(log)) == entries()
-    assert damaged_bytes(log) == 0
+    assert scan_log(log).damaged_bytes == 0
 
 
 def test_only_what_was_flushed_is_promised(tmp_path: Path) -> None:
@@ -79,7 +78,7 @@ def test_zeros_that_a_power_cut_leaves_at_the_end(log: Path) -> None:
     with log.open("ab") as stream:
         stream.write(bytes(4096))
     assert list(read_log(log)) == entries()
-    assert damaged_bytes(log) == 4096
+    assert scan_log(log).damaged_bytes == 4096
 
 
 def test_damage_in_the_middle_costs_its_own_entry(log: Path) -> None:
@@ -88,7 +87,7 @@ def test_damage_in_the_middle_costs_its_own_entry(log: Path) -> None:
     data[at] ^= 0x10
     log.write_bytes(data)
     assert list(read_log(log)) == [e for k, e in enumerate(entries()) if k != 3]
-    assert damaged_bytes(log) > 300
+    assert scan_log(log).damaged_bytes > 300
 
 
 def test_blocks_do_not_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:

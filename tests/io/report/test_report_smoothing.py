@@ -21,7 +21,6 @@ from telerig.io.report.page.figures import Figure, drawn
 from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.smoothing import smoothing_verdict, use_rows
-from telerig.io.results.folders.tracking import read_track_results
 from telerig.io.results.verdict_words import uses_words, words_of_refusals
 
 LAST = ["rays", "images", "more", "origin"]
@@ -48,7 +47,7 @@ def _titles(folder: Path) -> set[str]:
 
 
 def _judged(folder: Path) -> Any:
-    return smoothing_verdict(read(folder), read_track_results(folder))
+    return smoothing_verdict(read(folder))
 
 
 def test_page_begins_with_the_smoothing_and_loads_nothing(whole: Path) -> None:
@@ -201,13 +200,6 @@ def test_nothing_judged_and_nothing_optional(folder: Path) -> None:
     shown = [name for name in SMOOTHING if name not in ("look", "lab")]
     assert page.ids == [*shown, *LAST[1:]]
     assert "Not judged" in page.spaced and "nan" not in page.spaced.lower().split()
-
-
-def test_tables_of_another_tracking_are_named(folder: Path) -> None:
-    tracks = pd.read_csv(folder / "tracks.csv")
-    tracks.assign(particle=7).to_csv(folder / "tracks.csv", index=False)
-    told = _judged(folder)
-    assert "Bubbles 0 of trajectories.csv" in told.warnings[-1] and told.colour == "usable"
 
 
 def test_no_bubbles_leaves_the_shake(folder: Path) -> None:

@@ -80,28 +80,13 @@ def test_spectra_obey_parseval_and_show_the_lines(whole: Path) -> None:
 
 def test_modes_are_listed_by_place(folder: Path) -> None:
     modes = [
-        {
-            "where": "common",
-            "place": "common",
-            "frequency_hz": 20.0,
-            "damping": 0.03,
-            "rms_mm": [0, 0.12, 0],
-        },
-        {
-            "where": "arm right",
-            "place": "arm",
-            "frequency_hz": 32.0,
-            "damping": 0.01,
-            "rms_mm": [0.02, 0.05, 0],
-        },
-        {
-            "where": "servo",
-            "place": "servo",
-            "frequency_hz": 15.0,
-            "damping": 0.3,
-            "rms_mm": [0, 0.1, 0],
-        },
-    ]
+        {"where": f"{place} {camera}", "place": place, "camera": camera, "frequency_hz": hz,
+         "damping": damping, "rms_mm": rms_mm}
+        for place, camera, hz, damping, rms_mm in (
+            ("common", "", 20.0, 0.03, [0, 0.12, 0]), ("arm", "right", 32.0, 0.01, [0.02, 0.05, 0]),
+            ("servo", "", 15.0, 0.3, [0, 0.1, 0]),
+        )
+    ]  # fmt: skip
     rows, words = mode_rows(read(changed(folder, modes=modes)))
     common, arm, servo = (row.cells for row in rows)
     assert common[:4] == ("all cameras alike (carriage, mount)", "20.0", "0.0300", "y: 120")

@@ -122,7 +122,6 @@ class AxisVerdict(Part):
     sigma_offset_mm : standard deviation in mm of an offset that all positions share: the encoder's
         delay and where the cameras stood are not known. No other standard deviation contains it.
     shake_rms_mm : RMS of the shake in mm of the camera that shakes most.
-    words : these numbers as sentences, for people who read the file.
     """
 
     verdict: Verdict | None = None
@@ -134,7 +133,6 @@ class AxisVerdict(Part):
     sigma_encoder_mm: float | None = None
     sigma_offset_mm: float | None = None
     shake_rms_mm: float | None = None
-    words: str = ""
 
 
 def worst_of(axes: Mapping[str, AxisVerdict]) -> Verdict:
@@ -209,7 +207,7 @@ class Mode(Part):
     frequency_hz : its frequency in Hz.
     damping : damping ratio; None where it is not known.
     rms_mm : RMS of the displacement in mm, in total or for each axis; None where it is not known.
-    source, remedy : the probable cause and what helps against it, in words.
+    source : the probable cause in words.
     place, camera : ``where`` as a code and the name of a camera.
     """
 
@@ -220,7 +218,6 @@ class Mode(Part):
     damping: float | None = None
     rms_mm: tuple[float, ...] | float | None = None
     source: str = ""
-    remedy: str = ""
 
 
 class PixelResiduals(Part):
@@ -239,13 +236,14 @@ class PixelResiduals(Part):
 class SmoothingFile(Record):
     """Hold the content of smoothing.json, the result of smoothing a run.
 
+    Sentences in the file (``words``, ``remedy``) are for people; nothing reads them.
+
     verdict, flags, axes : the verdict on the run, conditions under which it has to be read with
         care (`Flag`), and the verdict by axis.
     contradictions : the sources that disagree, the worst first.
     inflation : factor by axis by which the standard deviations in the tables have been multiplied
         because of contradictions; () without.
     usable_for : what this run is good for, by quantity and axis.
-    words, remedy : the verdict as a sentence and what to do about it, for people.
     vertical, remedies : the axis nearest to the vertical, and the remedy as codes.
     rig, walls : the calibrated cameras and refractive windows that the run was smoothed with, by
         name.
@@ -289,8 +287,6 @@ class SmoothingFile(Record):
     contradictions: tuple[Contradiction, ...] = ()
     inflation: tuple[float, ...] = ()
     usable_for: tuple[Use, ...] = ()
-    words: str = ""
-    remedy: str = ""
     remedies: tuple[Remedy, ...] = ()
     vertical: str = ""
     left_out: tuple[str, ...] = ()

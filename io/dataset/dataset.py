@@ -14,7 +14,7 @@ import pandas as pd
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import choose_source, read_dots_csv
 from telerig.io.files.names import absent, check_name
-from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
+from telerig.io.images.read import EXTENSIONS, Image, by_stem, list_images, natural, read_image
 from telerig.io.results.record import read_object
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.rig_file import read_rig_toml
@@ -296,17 +296,9 @@ def files_by_view(folder: Path, notes: list[str]) -> dict[str, Path]:
             f"{folder.parent.name}/{folder.name}: not used, as they are no images "
             f"({' '.join(EXTENSIONS)}): {', '.join(unused)}"
         )
-    stems: dict[str, Path] = {}
-    for file in images:
-        check_name(file.stem, str(folder), "view")
-        if file.stem in stems:
-            raise InputError(
-                f"{stems[file.stem].name} and {file.name} are the same view twice",
-                where=str(folder),
-                todo="the name without its extension is the name of the view: remove or rename "
-                "one of the files",
-            )
-        stems[file.stem] = file
+    stems = by_stem(images, "view")
+    for name in stems:
+        check_name(name, str(folder), "view")
     return stems
 
 

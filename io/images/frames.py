@@ -20,6 +20,7 @@ from telerig.io.images.read import (
     PALETTE,
     WHITE_IS_0,
     Image,
+    by_stem,
     damaged,
     decoding,
     image_from_pixels,
@@ -245,15 +246,7 @@ def open_frames(folder: Path, camera: str) -> FrameSource | None:
     path = found[0]
     if path.is_dir():
         files = list_images(path)
-        names: dict[str, str] = {}
-        for file in files:
-            other = names.setdefault(file.stem, file.name)
-            if other != file.name:
-                raise InputError(
-                    f"{other} and {file.name} are the same frame twice",
-                    where=str(path),
-                    todo="the name without its extension is the frame: remove or rename one",
-                )
+        by_stem(files, "frame")
         if len(files) == 1 and files[0].suffix.lower() in PAGE_EXTENSIONS:
             _refuse_pages(files[0], path)
         return ImageFiles(path, tuple(file.name for file in files))

@@ -11,7 +11,7 @@ import logging
 import re
 import struct
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
@@ -80,6 +80,24 @@ def list_images(folder: str | PathLike[str]) -> list[Path]:
         raise InputError("is not a folder", where=str(place), todo="check the path")
     files = (p for p in place.iterdir() if p.suffix.lower() in EXTENSIONS and p.is_file())
     return sorted((p for p in files if not p.name.startswith(".")), key=lambda p: natural(p.name))
+
+
+def by_stem(files: Iterable[Path], thing: str) -> dict[str, Path]:
+    """Return image files by their names without extension.
+
+    thing : what such a name stands for, "view" or "frame". Raises InputError for two files of one.
+    """
+    found: dict[str, Path] = {}
+    for file in files:
+        other = found.setdefault(file.stem, file)
+        if other != file:
+            raise InputError(
+                f"{other.name} and {file.name} are the same {thing} twice",
+                where=str(file.parent),
+                todo=f"the name without its extension is the name of the {thing}: remove or rename "
+                "one of the files",
+            )
+    return found
 
 
 def natural(name: str) -> tuple[Any, ...]:

@@ -41,6 +41,10 @@ _ACCELERATION_MM_S2 = 5000.0
 """A stage accelerates less, so that an encoder's reading beyond it is doubtful."""
 
 
+def _none() -> Array:
+    return np.zeros(0)
+
+
 @dataclass(frozen=True)
 class Refused:
     """Hold the R lines of a device that were refused, so that they are in no table.
@@ -52,10 +56,10 @@ class Refused:
     lines : the bytes of each line.
     """
 
-    spans: Ints
-    t_s: Array
-    arrived_s: Array
-    reason: NDArray[np.object_]
+    spans: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    t_s: Array = field(default_factory=_none)
+    arrived_s: Array = field(default_factory=_none)
+    reason: NDArray[np.object_] = field(default_factory=lambda: np.zeros(0, np.object_))
     lines: tuple[bytes, ...] = ()
 
 
@@ -84,22 +88,22 @@ class DeviceRecord:
     """
 
     device: DeviceDescription
-    t_s: Array
-    arrived_s: Array
-    values: dict[str, Array]
-    malformed_s: Array
-    malformed_bytes: int
-    samples: tuple[str, ...]
-    partial_bytes: int
-    away_s: tuple[tuple[float, float], ...]
-    clocks: tuple[ClockFit, ...]
-    wraps: int
-    faults: dict[str, int]
-    time_from: str
-    half_width_s: float
-    time_sd_s: float | None
-    refused: Refused
-    error: InputError | None
+    t_s: Array = field(default_factory=_none)
+    arrived_s: Array = field(default_factory=_none)
+    values: dict[str, Array] = field(default_factory=dict)
+    malformed_s: Array = field(default_factory=_none)
+    malformed_bytes: int = 0
+    samples: tuple[str, ...] = ()
+    partial_bytes: int = 0
+    away_s: tuple[tuple[float, float], ...] = ()
+    clocks: tuple[ClockFit, ...] = ()
+    wraps: int = 0
+    faults: dict[str, int] = field(default_factory=dict)
+    time_from: str = "nothing"
+    half_width_s: float = 0.0
+    time_sd_s: float | None = None
+    refused: Refused = field(default_factory=Refused)
+    error: InputError | None = None
 
 
 @dataclass(frozen=True)
@@ -218,14 +222,10 @@ def _record(line: _Line, start_ns: int) -> DeviceRecord:
 
 
 def _without_readings(line: _Line, error: InputError) -> DeviceRecord:
-    none, no_lines = np.zeros(0), np.zeros((0, 2), np.int64)
-    refused = Refused(no_lines, none, none, np.zeros(0, np.object_))
     found = joined(line.found) if line.found else None
     return DeviceRecord(
-        device=line.device, t_s=none, arrived_s=none, values={}, malformed_s=none,
-        malformed_bytes=found.malformed_bytes if found else 0, samples=_samples(line),
-        partial_bytes=line.partial_bytes, away_s=(), clocks=(), wraps=0, faults={},
-        time_from="nothing", half_width_s=0.0, time_sd_s=None, refused=refused, error=error,
+        line.device, malformed_bytes=found.malformed_bytes if found else 0, samples=_samples(line),
+        partial_bytes=line.partial_bytes, error=error,
     )  # fmt: skip
 
 

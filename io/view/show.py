@@ -153,8 +153,7 @@ def _recording_of(place: Path, recording: Path | None, tracks: TrackResults) -> 
     if not (run.is_dir() and (recordings(run) or (run / "detections.csv").is_file())):
         return None
     source: RunSource = "images" if recordings(run) else "detections"
-    sizes = {c: s for c in tracks.cameras if (s := tracks.image_size_px(c)) is not None}
-    return load_for_view(run, source, tracks.cameras, sizes)
+    return load_for_view(run, source, tracks.cameras, tracks.image_sizes_px)
 
 
 def load_for_view(

@@ -191,26 +191,16 @@ def cameras_of(
     Returns the cameras, and why the calibration is stale, if it was read although it is. Raises
     InputError for a calibration that is stale or cannot be read.
     """
-    if calibration is not None and not calibration.exists():
-        raise absent(calibration, "calibration", "check the path")
-    trials = [results_root(source) / "calibration" / "calibration.json"]
-    if source.suffix == ".json":
-        trials.insert(0, source)
-    elif (source / "calibration.json").is_file():
-        trials.insert(0, source / "calibration.json")
-    place = calibration or next((p for p in trials if p.is_file()), None)
-    if place is not None:
-        found = CalibrationResults.at(place)
-        with reading(found.folder, [found.name]):
-            accepted = refuse_stale(found.folder, [found.name], accept)
-            return found.rig, accepted
-    if required:
-        raise InputError(
-            "there is no calibration",
-            where=str(trials[0]),
-            todo="run `telerig calibrate` first, or give a calibration with --calibration",
-        )
-    return (), ()
+    place = calibration
+    if place is None:
+        own = source.suffix == ".json" or (source / "calibration.json").is_file()
+        place = source if own else results_root(source) / "calibration" / "calibration.json"
+    if not (required or calibration or place.exists()):
+        return (), ()
+    found = CalibrationResults.at(place)
+    with reading(found.folder, [found.name]):
+        accepted = refuse_stale(found.folder, [found.name], accept)
+        return found.rig, accepted
 
 
 def run_folder(source: Path, run: str | None) -> Path:

@@ -37,7 +37,7 @@ def write_films(
             yield f"the film of both views is left out: {why}"
             return
     tracked = read_track_results(results_folder)
-    sizes = {c: s for c in tracked.cameras if (s := tracked.image_size_px(c)) is not None}
+    sizes = tracked.image_sizes_px
     data = load_run(recording, source="images", cameras=tracked.cameras, image_sizes_px=sizes)
     frames = tracked.file.frames or data.frame_count
     if frames > data.frame_count:

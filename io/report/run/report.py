@@ -405,7 +405,7 @@ def _images(results: TrackResults) -> list[Block]:
         )
     for i, camera in enumerate(results.cameras):
         mine = results.outlines[results.outlines["camera"] == camera]
-        alone, size = int(mine["particle"].isna().sum()), results.image_size_px(camera)
+        alone, size = int(mine["particle"].isna().sum()), results.image_sizes_px.get(camera)
         caption = (
             f"{number(len(mine))} bubbles; red dots: {number(alone)} ({share(alone, len(mine))}) "
             "in no track, which should not gather anywhere but at the border."

@@ -172,9 +172,10 @@ class TrackResults:
         """Return what the run says of its pairs of cameras; an empty one where it says nothing."""
         return self.file.pairs or Pairs()
 
-    def image_size_px(self, camera: str) -> tuple[int, int] | None:
-        """Return a camera's image size; None if tracking.json does not state it."""
-        return self.file.image_size_px.get(camera)
+    @property
+    def image_sizes_px(self) -> dict[str, tuple[int, int]]:
+        """Return the image sizes by camera, as far as tracking.json states them."""
+        return {name: size for name, size in self.file.image_size_px.items() if size is not None}
 
 
 def read_track_table(file: Path) -> pd.DataFrame:

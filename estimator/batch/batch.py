@@ -358,7 +358,7 @@ def write_batch(
         if report:
             from telerig.io.report.batch.report import write_batch_report
 
-            write_batch_report(staged)
+            write_batch_report(staged, page_folder=folder)
     return table
 
 

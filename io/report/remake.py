@@ -84,7 +84,7 @@ def _write_page(results: ResultsFolder, out: Path, page_folder: Path) -> Path:
         return write_track_report(results.folder, out, page_folder=page_folder)
     from telerig.io.report.batch.report import write_batch_report
 
-    return write_batch_report(results.folder, out)
+    return write_batch_report(results.folder, out, page_folder=page_folder)
 
 
 def _is_imported(results: ResultsFolder) -> bool:

@@ -240,6 +240,8 @@ def test_only_telerigs_own_command_line_is_taken(monkeypatch: pytest.MonkeyPatch
     [
         (["report", "TANK", "--run", "x"], "add --film"),
         (["init", "new", "--pitch", "7"], "add --from-images"),
+        (["view", "TANK", "--web", "--save", "a.rrd"], "give only one of them"),
+        (["simulate", "paper", "--devices"], "give only one of them"),
         (["simulate", "paper", "--out", "new", "--seconds", "5"], "is for --devices"),
         (["simulate", "paper", "--out", "new", "--seed", "-1"], "--seed"),
         (["simulate", "rise", "--out", "new", "--encoder-scale", "nan"], "encoder_scale is nan"),

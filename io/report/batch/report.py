@@ -42,10 +42,15 @@ _LONGEST_WORDS = 600
 _LEFT_OUT, _MOST_LOST = "left out", 4
 
 
-def write_batch_report(folder: Path, out: Path | None = None) -> Path:
-    """Write report.html beside batch.json, or into ``out``; InputError where there is no batch."""
+def write_batch_report(
+    folder: Path, out: Path | None = None, *, page_folder: Path | None = None
+) -> Path:
+    """Write report.html beside batch.json, or into ``out``; InputError where there is no batch.
+
+    page_folder : where the page will lie in the end, if its place is temporary.
+    """
     place = Path(folder) if out is None else Path(out)
-    page = page_of(read_batch_results(Path(folder)), place)
+    page = page_of(read_batch_results(Path(folder)), page_folder or place)
     write_text_atomic(place / "report.html", render_page(page))
     return place / "report.html"
 

@@ -156,11 +156,16 @@ def test_a_batch_that_cannot_be_read_is_named(
     assert list(tmp_path.iterdir()) == before
 
 
-def test_links_reach_datasets_of_any_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize("staged", ["out", "out/.results.part"])
+def test_links_reach_datasets_of_any_name(tmp_path: Path, staged: str) -> None:
+    """Links are those from where the page will lie."""
     page = tmp_path / "tank #2, 50%" / "results" / "rise" / "report.html"
     page.parent.mkdir(parents=True)
     page.write_text("")
     job = _job("track", "rise") | {"dataset": str(page.parents[2])}
-    found = Page(write_batch_report(_write(tmp_path / "out", [job]))).loads
+    place = tmp_path / staged
+    place.mkdir(parents=True)
+    written = write_batch_report(_write(place, [job]), page_folder=tmp_path / "out")
+    found = Page(written).loads
     links = [unquote(urlsplit(load).path) for load in found if not load.startswith(("data:", "#"))]
     assert links == ["../tank #2, 50%/results/rise/report.html"]

@@ -145,6 +145,7 @@ _TODO_OF_SYSTEM = {
     errno.EROFS: "choose a folder that can be written (--out)",
     errno.EACCES: "change the permissions, or choose another folder",
     errno.EIO: "the disk reports a fault: copy the data to another disk, then run again",
+    errno.ENAMETOOLONG: "give a shorter name or path",
     errno.EMFILE: "close other programs, or raise the limit of open files (`ulimit -n`)",
 }
 """What a user can do about errors of the operating system, which no command can avoid."""

@@ -48,7 +48,7 @@ def opencv(
     ] = 1.0,
     sigma_px: SigmaPx = 0.1,
 ) -> None:
-    size = None if image_size is None else _size_px(image_size)
+    size = None if image_size is None else options.size_px("--image-size", image_size, ",")
     chosen = options.split_names(names) or ("left", "right")
     _import_cameras(
         "opencv", files, out, sigma_px, names=chosen, image_size_px=size, unit_mm=unit_mm
@@ -73,7 +73,9 @@ def openptv(
     if ptv_par is not None:
         sensor = read_ptv_par(ptv_par)
     elif image_size is not None and pixel_mm is not None:
-        sensor = Sensor(_size_px(image_size), _pair("--pixel-mm", pixel_mm))
+        todo = "give two numbers: width,height"
+        wide, high = options.numbers_of("--pixel-mm", pixel_mm, 2, ",", todo)
+        sensor = Sensor(options.size_px("--image-size", image_size, ","), (wide, high))
     else:
         raise InputError(
             "the sensor is not known", todo="give --ptv-par, or --image-size and --pixel-mm"
@@ -264,16 +266,6 @@ def _record_words(sensor: str, table: pd.DataFrame, frames_t_s: Array | None) ->
                 "in rig.toml, or bring it to the run's clock with --start-s"
             )
     return "\n".join(lines)
-
-
-def _pair(option: str, text: str) -> tuple[float, float]:
-    width, height = options.numbers_of(option, text, 2, ",", "give two numbers: width,height")
-    return width, height
-
-
-def _size_px(text: str) -> tuple[int, int]:
-    width, height = _pair("--image-size", text)
-    return int(width), int(height)
 
 
 def _import_cameras(

@@ -79,11 +79,8 @@ def init(
                 todo="add --from-images, or write pitch_mm into rig.toml",
             )
         names = options.split_names(cameras) or []
-        todo = "give width x height, like 1280x800"
-        width, height = options.numbers_of("--size", size, 2, "x", todo)
-        if not (width.is_integer() and height.is_integer()):
-            raise InputError(f"--size {size}: these are no whole numbers", todo=todo)
-        rig = [NewCamera(name, (int(width), int(height)), scale) for name in names]
+        size_px = options.size_px("--size", size, "x")
+        rig = [NewCamera(name, size_px, scale) for name in names]
         made = new_dataset(dataset, rig, angle_deg=angle, target=PRACTICE_TARGET)
         first = f"put the images of the target into {dataset / 'calibration'}/CAMERA"
         missing = "the target and its size, the cameras"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -134,12 +135,21 @@ def split_names(text: str | None) -> list[str] | None:
 def numbers_of(option: str, text: str, count: int, separator: str, todo: str) -> list[float]:
     """Return the numbers in the text of an option.
 
-    Raises InputError, with the advice ``todo``, if there are not ``count`` of them.
+    Raises InputError, with the advice ``todo``, if there are not ``count`` finite ones.
     """
     try:
         numbers = [float(word) for word in text.lower().split(separator)]
     except ValueError:
         numbers = []
-    if len(numbers) != count:
+    if len(numbers) != count or not all(map(isfinite, numbers)):
         raise InputError(f"{option} {text}: {count} numbers are needed", todo=todo)
     return numbers
+
+
+def size_px(option: str, text: str, separator: str) -> tuple[int, int]:
+    """Return the width and height in px in the text of an option, which are whole numbers."""
+    todo = f"give width and height, like 1280{separator}800"
+    width, height = numbers_of(option, text, 2, separator, todo)
+    if not (width.is_integer() and height.is_integer()):
+        raise InputError(f"{option} {text}: whole numbers are needed", todo=todo)
+    return int(width), int(height)

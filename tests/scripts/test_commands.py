@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
 import json
 import re
@@ -240,6 +241,8 @@ def test_only_telerigs_own_command_line_is_taken(monkeypatch: pytest.MonkeyPatch
     [
         (["report", "TANK", "--run", "x"], "add --film"),
         (["init", "new", "--pitch", "7"], "add --from-images"),
+        (["init", "new", "--size", "640.5x480"], "whole numbers are needed"),
+        (["import", "opencv", "x", "--out", "new", "--image-size", "nan,480"], "2 numbers are"),
         (["view", "TANK", "--web", "--save", "a.rrd"], "give only one of them"),
         (["simulate", "paper", "--devices"], "give only one of them"),
         (["simulate", "paper", "--out", "new", "--seconds", "5"], "is for --devices"),
@@ -257,3 +260,8 @@ def test_options_without_effect_and_impossible_ones(
     shown = run(*(word.replace("TANK", str(paper_images)) for word in words), code=2)
     assert said in " ".join(shown.replace("│", " ").split())
     assert not list(tmp_path.iterdir())
+
+
+def test_a_name_that_is_too_long_is_no_fault_of_telerig() -> None:
+    error = OSError(errno.ENAMETOOLONG, "File name too long")
+    assert "give a shorter name" in console._words_of_system(error)

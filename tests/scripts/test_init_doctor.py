@@ -126,7 +126,7 @@ def test_init_never_writes_over_a_rig_file(tmp_path):
         (["--cameras", "a,b,c,d,e"], "name one to 4"),
         (["--cameras", "left,left"], "two cameras have one name"),
         (["--cameras", "left,carriage"], "'carriage'"),
-        (["--size", "512"], "give width x height"),
+        (["--size", "512"], "give width and height"),
         (["--scale", "0"], "give a positive number"),
     ],
 )

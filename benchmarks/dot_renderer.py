@@ -51,11 +51,12 @@ def render(scene: Scene) -> Array:
     v, u = np.mgrid[: scene.height, : scene.width].astype(float)
     image = scene.ground_level * scene.light(u, v)
     for centre in scene.centres_px:
-        _add_disc(image, scene, centre)
+        add_disc(image, scene, centre)
     return image
 
 
-def _add_disc(image: Array, scene: Scene, centre: Array) -> None:
+def add_disc(image: Array, scene: Scene, centre: Array) -> None:
+    """Add the light of one disc to an image, in place."""
     half = np.linalg.norm(scene.image_from_disc, axis=1) + 6.0 * scene.blur_px + 2.0
     low = np.maximum(np.floor(centre - half).astype(int), 0)
     high = np.minimum(np.ceil(centre + half).astype(int) + 1, [scene.width, scene.height])

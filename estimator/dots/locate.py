@@ -3,7 +3,8 @@
 A luminance model is fitted to every candidate (after Lavest, Viala, Dhome 1999), twice: the first
 fits yield the contrast of every dot and so the illumination across the image; the second fits use
 it as a prior for each dot's own contrast gradient, and take the neighbours' blur away. Dots that
-are smaller than the others, or that one disc fits badly, are fitted once more with a heart.
+are smaller than the others, or that one disc fits badly, are fitted once more with a heart, and all
+dots of an image in which most have one.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     PIXEL_VARIANCE_PX2,
     axes_from_shape,
     matrix_from_shape,
+    semi_axes,
 )
 from telerig.estimator.dots.fit.candidates import (
     Candidate,
@@ -40,6 +42,7 @@ from telerig.estimator.dots.fit.hearts import (
     FEWEST_DOTS,
     FEWEST_PIXELS,
     of_other_size,
+    show_hearts,
     too_small_sd,
     with_hearts,
 )
@@ -51,6 +54,7 @@ from telerig.estimator.dots.fit.surroundings import (
     priors_from,
     without_neighbours,
 )
+from telerig.estimator.dots.thresholds import LOG_FITTED
 from telerig.estimator.images.noise import (
     NoiseModel,
     agreed_factor,
@@ -173,8 +177,11 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
             blobs.append(blob)
     scene = _Scene(grey, found.labels, blobs)
     fits = scene.first_fits(noise)
-    noise = _noise_with_inner_level(noise, fits)
-    fits = scene.with_hearts(scene.second_fits(fits, noise), noise, look)
+    if scene.show_hearts(fits, noise):
+        fits = scene.second_fits(scene.with_hearts(fits, noise, look, usual=True), noise)
+    else:
+        noise = _noise_with_inner_level(noise, fits)
+        fits = scene.with_hearts(scene.second_fits(fits, noise), noise, look, usual=False)
     factor = agreed_factor(
         noise, np.array([fit.chi2_dof for fit in fits]), np.array([fit.dof for fit in fits])
     )
@@ -182,7 +189,10 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     look = look.with_fits(fits)
     rough = _roughness(fits)
     accepted: list[tuple[Any, ...]] = []
+    hearts = any(fit.heart is not None for fit in fits)
     for blob, fit, smaller in zip(blobs, fits, too_small_sd(fits)):
+        # Where no dot has a heart, a disc that fits as well as the others is a smaller dot.
+        smaller = smaller if hearts or look.misfit_sd(fit) > 1.0 else 0.0
         reason = reason_against_fit(blob, fit, grey.shape, found.polarity, look, smaller)
         if reason:
             rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
@@ -259,7 +269,9 @@ class _Scene:
         for _ in range(rounds):
             moved: set[int] = set()
             for i in again:
-                window = self._window(i, fits[i].start, fits, neighbours[i])
+                window = self._window(
+                    i, fits[i].start, fits, neighbours[i], whole=fits[i].heart is not None
+                )
                 if np.count_nonzero(window.mask) < FEWEST_PIXELS:
                     continue
                 fit = fit_dot(window, fits[i].start, noise, priors[i], edges=True)
@@ -271,24 +283,49 @@ class _Scene:
                 break
         return fits
 
-    def with_hearts(self, fits: list[DotFit], noise: NoiseModel, look: Look) -> list[DotFit]:
-        """Fit dots of another size than most, or with larger residuals, again with a heart."""
-        look = look.with_fits(fits)
-        unlike = [i for i, fit in enumerate(fits) if is_unlike([look.misfit_sd(fit)])]
-        doubtful = sorted({*unlike, *of_other_size(fits)})
-        doubtful = [i for i in doubtful if not is_ring(self.blobs[i])]
-        if not doubtful or len(fits) < FEWEST_DOTS:
-            return fits
-        priors, neighbours = priors_from(fits, self.grey.shape), close_neighbours(fits)
+    def show_hearts(self, fits: list[DotFit], noise: NoiseModel) -> bool:
+        """Return whether the dots have hearts, which one in four pixels tells."""
+        if len(fits) < FEWEST_DOTS:
+            return False
 
         def window(dot: int, start: Start) -> Window:
-            return self._window(dot, start, fits, neighbours[dot])
+            return dot_window(
+                self.grey, self.labels, self.blobs[dot], start, coarse=True, whole=True
+            )
 
-        return with_hearts(fits, noise, priors, window, doubtful)
+        return show_hearts(fits, noise, priors_from(fits, self.grey.shape), window)
 
-    def _window(self, dot: int, start: Start, fits: list[DotFit], near: list[int]) -> Window:
+    def with_hearts(
+        self, fits: list[DotFit], noise: NoiseModel, look: Look, *, usual: bool
+    ) -> list[DotFit]:
+        """Fit dots that are smaller than most or larger than their blobs, or that have larger
+        residuals, again with a heart.
+
+        usual : whether all may have one.
+        """
+        look = look.with_fits(fits)
+        doubtful = {*range(len(fits))} if usual else {*of_other_size(fits)}
+        for i, (blob, fit) in enumerate(zip(self.blobs, fits)):
+            larger = float(np.log(semi_axes(fit.shape_px)[1] / semi_axes(blob.shape_px)[1]))
+            if np.any(is_unlike([[look.misfit_sd(fit)], [max(larger, 0.0) / LOG_FITTED]])):
+                doubtful.add(i)
+        which = [i for i in sorted(doubtful) if not is_ring(self.blobs[i])]
+        if not which or len(fits) < FEWEST_DOTS:
+            return fits
+        priors = priors_from(fits, self.grey.shape)
+        # Single discs that are fitted to hearts have so much blur that all would be neighbours.
+        neighbours = [[] for _ in fits] if usual else close_neighbours(fits)
+
+        def window(dot: int, start: Start) -> Window:
+            return self._window(dot, start, fits, neighbours[dot], whole=True)
+
+        return with_hearts(fits, noise, priors, window, which, usual=usual)
+
+    def _window(
+        self, dot: int, start: Start, fits: list[DotFit], near: list[int], *, whole: bool = False
+    ) -> Window:
         """Return the pixels of a dot after the light of its neighbours is subtracted."""
         blobs = self.blobs
         known = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
-        window = dot_window(self.grey, self.labels, blobs[dot], start, known=known)
+        window = dot_window(self.grey, self.labels, blobs[dot], start, known=known, whole=whole)
         return without_neighbours(window, [fits[k] for k in near])

@@ -445,9 +445,11 @@ def reason_against_fit(
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
         return Reason.TOUCHES_BORDER
     axes, own = (np.add(semi_axes(shape), 1.0) for shape in (fit.shape_px, blob.shape_px))
-    # The blob of a dot that is thinner than the blur is up to the blur wide.
+    # The blob of a dot that is thinner than the blur is up to the blur wide, and that of a dot with
+    # a heart may be the heart.
     blurred = np.hypot(axes, BLOB_BLUR * fit.sigma_px)
-    misshapen = float(np.log(np.maximum(axes / own, own / blurred)).max())
+    inner = axes if fit.heart is None else np.minimum(axes, fit.heart[2] * (axes - 1.0) + 1.0)
+    misshapen = float(np.log(np.maximum(inner / own, own / blurred)).max())
     way = float(np.linalg.norm(fit.centre_px - blob.centre_px) / np.mean(own))
     sign = 1.0 if polarity == "white_on_black" else -1.0
     faint = np.log(max(sign * fit.contrast, 1e-12)) - look.log_contrast

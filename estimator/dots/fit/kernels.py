@@ -111,8 +111,9 @@ def predict(
     """Compute the grey levels of the luminance model and their derivatives; see `luminance`.
 
     at : (P, 2) row and column of each pixel in the window. first : (1, 2) u and v of the window's
-    first pixel, from its middle. parameters : (12,) theta and the levels.
-    value, gradient : (1, V, U), (1, 6, V, U) work space. grey, jacobian : (P,), (12, P), filled.
+    first pixel, from its middle. parameters : (12,) theta and the levels, or (16,) with a heart.
+    value, gradient : (1, V, U), (1, 6, V, U) work space. grey, jacobian : (P,), (12 or 16, P),
+    filled.
     """
     theta = np.empty((1, 6))
     for i in range(6):
@@ -135,13 +136,35 @@ def predict(
         grey[p] = 0.0
         for i in range(6, 12):
             grey[p] += parameters[i] * jacobian[i, p]
+    if len(parameters) == 12:
+        return
+    scale, extra = parameters[14], parameters[15]
+    for i in range(5):
+        theta[0, i] = parameters[12 + i] if i < 2 else scale * parameters[i]
+    value[:] = 0.0
+    gradient[:] = 0.0
+    coverages(first, theta, value, gradient)
+    for p in range(len(at)):
+        v, u = at[p, 0], at[p, 1]
+        jacobian[14, p] = 0.0
+        for i in range(6):
+            slope = extra * gradient[0, i, v, u]
+            if i < 2:
+                jacobian[12 + i, p] = slope
+            elif i < 5:
+                jacobian[14, p] += parameters[i] * slope
+                jacobian[i, p] += scale * slope
+            else:
+                jacobian[5, p] += slope
+        jacobian[15, p] = value[0, v, u]
+        grey[p] += extra * value[0, v, u]
 
 
 @compiled
 def prior_rows(prior: Array, radius: float, parameters: Array, rows: Array, gap: Array) -> float:
     """Fill in the whitened equations of the priors on two contrast gradients and the edge's blur.
 
-    prior : (5,) the fields of `luminance.Prior`. rows : (3, 12), which must be 0. gap : (3,) prior
+    prior : (5,) the fields of `luminance.Prior`. rows : (3, N), which must be 0. gap : (3,) prior
     minus present value. Returns the sum of its squares.
     """
     weight = 1.0 / (prior[2] * radius * max(abs(parameters[9]), 1e-12))
@@ -152,7 +175,7 @@ def prior_rows(prior: Array, radius: float, parameters: Array, rows: Array, gap:
     total = 0.0
     for k in range(3):
         gap[k] = prior[3] / prior[4] if k == 2 else 0.0
-        for i in range(12):
+        for i in range(len(parameters)):
             gap[k] -= rows[k, i] * parameters[i]
         total += gap[k] ** 2
     return total
@@ -163,12 +186,13 @@ def normal_equations(
     prior: Array, radius: float, parameters: Array, residual: Array, weight: Array,
     jacobian: Array, information: Array, pull: Array,
 ) -> float:  # fmt: skip
-    """Fill in information (12, 12) and gradient (12,) of a fit, and return its chi-square."""
-    rows, gap, weighted = np.zeros((3, 12)), np.zeros(3), np.empty(len(residual))
+    """Fill in information (N, N) and gradient (N,) of a fit, and return its chi-square."""
+    count = len(parameters)
+    rows, gap, weighted = np.zeros((3, count)), np.zeros(3), np.empty(len(residual))
     chi2 = prior_rows(prior, radius, parameters, rows, gap)
     for p in range(len(residual)):
         chi2 += weight[p] * residual[p] ** 2
-    for i in range(12):
+    for i in range(count):
         total = 0.0
         for p in range(len(residual)):
             weighted[p] = weight[p] * jacobian[i, p]
@@ -189,10 +213,11 @@ def normal_equations(
 @compiled
 def damped_step(information: Array, pull: Array, damping: float, step: Array) -> None:
     """Solve the normal equations, scaled to a unit diagonal and damped, by Cholesky factors."""
-    root, scale = np.zeros((12, 12)), np.empty(12)
-    for i in range(12):
+    count = len(pull)
+    root, scale = np.zeros((count, count)), np.empty(count)
+    for i in range(count):
         scale[i] = sqrt(max(information[i, i], 1e-300))
-    for i in range(12):
+    for i in range(count):
         for j in range(i + 1):
             total = information[i, j] / (scale[i] * scale[j])
             if i == j:
@@ -200,26 +225,27 @@ def damped_step(information: Array, pull: Array, damping: float, step: Array) ->
             for k in range(j):
                 total -= root[i, k] * root[j, k]
             root[i, j] = sqrt(max(total, 1e-14)) if i == j else total / root[j, j]
-    for i in range(12):
+    for i in range(count):
         total = pull[i] / scale[i]
         for k in range(i):
             total -= root[i, k] * step[k]
         step[i] = total / root[i, i]
-    for i in range(11, -1, -1):
+    for i in range(count - 1, -1, -1):
         total = step[i]
-        for k in range(i + 1, 12):
+        for k in range(i + 1, count):
             total -= root[k, i] * step[k]
         step[i] = total / root[i, i]
-    for i in range(12):
+    for i in range(count):
         step[i] /= scale[i]
 
 
 @compiled
 def covariance_of(information: Array, which: Ints, out: Array) -> None:
-    """Fill in the covariance (k, k) of some of the 12 parameters, the k ones in ``which``."""
-    pull, step = np.empty(12), np.empty(12)
+    """Fill in the covariance (k, k) of some of the N parameters, the k ones in ``which``."""
+    count = len(information)
+    pull, step = np.empty(count), np.empty(count)
     for k in range(len(which)):
-        for i in range(12):
+        for i in range(count):
             pull[i] = 1.0 if i == which[k] else 0.0
         damped_step(information, pull, 0.0, step)
         for j in range(len(which)):
@@ -262,10 +288,15 @@ def residual_sums(
 
 @compiled
 def is_admissible(parameters: Array, radius: float) -> bool:
-    """Return whether a fit is near its start; none may run away over the image."""
+    """Return whether a fit is near its start, none may run away over the image, and whether its
+    heart is inside the dot."""
     m11, m12, m22, sigma = parameters[2], parameters[3], parameters[4], parameters[5]
     mean, half = 0.5 * (m11 + m22), sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12)
     near = max(abs(parameters[0]), abs(parameters[1])) < radius + 2.0
+    if len(parameters) > 12:
+        way = sqrt((parameters[12] - parameters[0]) ** 2 + (parameters[13] - parameters[1]) ** 2)
+        least = parameters[14] * (mean - half)
+        near &= least > _MIN_SEMI_AXIS_PX and way + least < mean - half
     size = mean + half < 2.0 * radius + 3.0 and mean - half > _MIN_SEMI_AXIS_PX
     return bool(near and size and _MIN_SIGMA_PX <= sigma <= 1.5 * (mean + half) + 1.0)
 
@@ -282,8 +313,10 @@ def descend(
     per pixel above 1; that step is taken without another evaluation. ``parameters``, ``residual``
     and ``jacobian`` are those of the start, and are replaced by those of the end.
     """
-    information, pull, step, moved = np.empty((12, 12)), np.empty(12), np.empty(12), np.empty(12)
-    model, slopes = np.empty(len(residual)), np.empty((12, len(residual)))
+    count = len(parameters)
+    information, pull = np.empty((count, count)), np.empty(count)
+    step, moved = np.empty(count), np.empty(count)
+    model, slopes = np.empty(len(residual)), np.empty((count, len(residual)))
     damping, gap = 1e-4, np.zeros(3)
     for _ in range(iterations):
         chi2 = normal_equations(
@@ -291,25 +324,25 @@ def descend(
         )
         damped_step(information, pull, damping, step)
         gain = 0.0
-        for i in range(12):
+        for i in range(count):
             moved[i] = parameters[i] + step[i]
             gain += step[i] * pull[i]
         better = False
         if is_admissible(moved, radius):
             small = gain < tolerance * max(1.0, chi2 / max(len(residual), 1))
             if small and damping <= 1e-3:
-                for i in range(12):
+                for i in range(count):
                     parameters[i] = moved[i]
                     for p in range(len(residual)):
                         residual[p] -= step[i] * jacobian[i, p]
                 return True
             predict(at, first, radius, moved, value, gradient, model, slopes)
-            trial = prior_rows(prior, radius, moved, np.zeros((3, 12)), gap)
+            trial = prior_rows(prior, radius, moved, np.zeros((3, count)), gap)
             for p in range(len(residual)):
                 trial += weight[p] * (grey[p] - model[p]) ** 2
             better = trial <= chi2 * (1.0 + 1e-12)
         if better:
-            for i in range(12):
+            for i in range(count):
                 parameters[i] = moved[i]
                 for p in range(len(residual)):
                     jacobian[i, p] = slopes[i, p]
@@ -331,7 +364,7 @@ def edge_equations(
     """Add up the normal equations of a dot's edge; see `rim.edge_harmonics`.
 
     first : the lowest harmonic. shape : (3,). offset : (2, P). jacobian, weight, residual : those
-    of the fit. own, mixed, right : (2 K, 2 K), (2 K, 12), (2 K,), which must be 0 and are filled:
+    of the fit. own, mixed, right : (2 K, 2 K), (2 K, N), (2 K,), which must be 0 and are filled:
     the harmonics' information, the one they share with the parameters, and the gradient.
     """
     m11, m12, m22 = shape[0], shape[1], shape[2]
@@ -355,5 +388,5 @@ def edge_equations(
             right[i] += weighted * residual[p]
             for j in range(len(right)):
                 own[i, j] += weighted * row[j]
-            for j in range(12):
+            for j in range(len(jacobian)):
                 mixed[i, j] += weighted * jacobian[j, p]

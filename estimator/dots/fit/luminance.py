@@ -10,6 +10,10 @@ The parameters (12,) are theta, which has centre (2), shape (3) and sigma, and t
 B2, C, C1, C2. The contrast gradient acts before the blur: the Gaussian blur of x F_sharp is x F +
 sigma^2 dF/dx. Without the second term a centre would shift by sigma^2 times the relative gradient;
 its derivatives with respect to theta are neglected. The loops over pixels are in `kernels`.
+
+A dot may have a heart, a disc inside it that is brighter or darker (:mod:`.hearts`). Four more
+parameters are its centre (2), its size relative to the dot, and its contrast; it is as tilted and
+as blurred as the dot.
 """
 
 from __future__ import annotations
@@ -36,7 +40,7 @@ from telerig.estimator.images.noise import NoiseModel
 from telerig.statistics import NORMAL_FROM_MEDIAN
 
 _MOVED_SD = 0.1
-PARAMETERS = 10
+PARAMETERS, HEART_PARAMETERS = 10, 4
 """Free parameters of a fit; the two of the contrast gradient are held by their prior."""
 
 
@@ -100,12 +104,14 @@ class Start:
     shape_px : (3,), see ``blurred_ellipse``.
     sigma_px : standard deviation of the edge's blur.
     previous : an earlier fit, whose grey levels are the start values of the levels.
+    heart : (4,) centre, relative size and contrast of the dot's heart; None if it has none.
     """
 
     centre_px: Array
     shape_px: Array
     sigma_px: float
     previous: DotFit | None = None
+    heart: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -122,11 +128,12 @@ class DotFit:
     log_radius_sd : standard deviation of ln of the mean radius.
     chi2_dof : chi-square per degree of freedom.
     pixels : number of pixels in the mask.
-    dropped : how many of these were left out as outliers or as clipped.
+    dof : degrees of freedom: pixels that were used less free parameters, at least 1.
     edge_residual : RMS residual near the edge, divided by C.
     inner_chi2 : mean squared whitened residual of the inner_pixels pixels that the dot covers.
     edge, edge_variance : harmonics of the edge in the residuals, see `rim.edge_harmonics`;
         `NO_EDGE` if they were not asked for.
+    heart : (4,) as in `Start`.
     """
 
     centre_px: Array
@@ -140,18 +147,19 @@ class DotFit:
     log_radius_sd: float
     chi2_dof: float
     pixels: int
-    dropped: int
+    dof: int
     edge_residual: float
     inner_chi2: float
     inner_pixels: int
     converged: bool
     edge: Array
     edge_variance: Array
+    heart: Array | None = None
 
     @property
     def start(self) -> Start:
         """Return the start of another fit of the dot."""
-        return Start(self.centre_px, self.shape_px, self.sigma_px, previous=self)
+        return Start(self.centre_px, self.shape_px, self.sigma_px, self, self.heart)
 
     def has_moved_from(self, before: DotFit) -> bool:
         """Return whether the dot has moved so far that what depends on it is fitted again."""
@@ -159,16 +167,15 @@ class DotFit:
         return bool(step > _MOVED_SD * np.sqrt(np.trace(self.covariance_px2)))
 
     @property
-    def dof(self) -> int:
-        """Return the degrees of freedom of the fit: pixels used less parameters, at least 1."""
-        return max(self.pixels - self.dropped - PARAMETERS, 1)
-
-    @property
     def inflated_covariance_px2(self) -> Array:
         """The centre's covariance (2, 2), multiplied by chi2_dof if chi2_dof is significantly above
         1."""
-        significant = self.chi2_dof > self._by_chance
-        return self.covariance_px2 * (self.chi2_dof if significant else 1.0)
+        return self.covariance_px2 * (self.chi2_dof if self.is_misfit else 1.0)
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether chi2_dof is significantly above 1."""
+        return self.chi2_dof > self._by_chance
 
     @property
     def misfit(self) -> float:
@@ -228,8 +235,10 @@ class _Fit:
     """The fit of one dot to P pixels.
 
     x, y : (P,) offsets in px from the middle of the window. grey, weight : (P,) grey levels and
-        inverse variances. parameters : (12,) theta and the levels.
-    residual, jacobian : (P,) grey levels less predicted ones, and (12, P) the derivatives of these.
+        inverse variances. parameters : (12,) theta and the levels, or (16,) with a heart.
+    free : number of free parameters.
+    residual, jacobian : (P,) grey levels less predicted ones, and (12 or 16, P) the derivatives of
+        these.
     """
 
     def __init__(self, window: Window, start: Start, noise: NoiseModel, prior: Prior) -> None:
@@ -246,8 +255,11 @@ class _Fit:
         self.gradient = np.empty((1, 6, *window.grey.shape))
         theta = [*(start.centre_px - self.origin), *start.shape_px, start.sigma_px]
         levels = np.eye(6)[3] if before is None else before.levels
-        self.parameters = np.array([*theta, *levels], np.float64)
-        self.jacobian, model = np.empty((12, len(self.at))), np.empty(len(self.at))
+        heart = [] if start.heart is None else start.heart - np.r_[self.origin, 0.0, 0.0]
+        self.parameters = np.array([*theta, *levels, *heart], np.float64)
+        self.free = PARAMETERS + len(heart)
+        self.jacobian = np.empty((len(self.parameters), len(self.at)))
+        model = np.empty(len(self.at))
         predict(self.at, self.first, self.radius, self.parameters, self.value, self.gradient,
                 model, self.jacobian)  # fmt: skip
         if before is None:
@@ -271,7 +283,7 @@ class _Fit:
 
     def minimise(self, iterations: int, tolerance: float, outlier_rounds: int) -> bool:
         """Bring the fit to its minimum; return whether it converged."""
-        converged, enough = self._descend(iterations, tolerance), len(self.grey) > PARAMETERS
+        converged, enough = self._descend(iterations, tolerance), len(self.grey) > self.free
         for _ in range(outlier_rounds if enough else 0):
             variance = self.noise.variance(self.model)
             bad = self._outliers(variance)
@@ -299,7 +311,8 @@ class _Fit:
 
     def result(self, converged: bool, edges: bool) -> DotFit:
         """Return the fit with its covariance and, if ``edges``, the harmonics of its edge."""
-        information, pull = np.empty((12, 12)), np.empty(12)
+        size = len(self.parameters)
+        information, pull = np.empty((size, size)), np.empty(size)
         normal_equations(self.prior, self.radius, self.parameters, self.residual, self.weight,
                          self.jacobian, information, pull)  # fmt: skip
         covariance = np.empty((6, 6))
@@ -317,24 +330,27 @@ class _Fit:
         # Pixels left out as outliers count here: they are where an edge is farthest off.
         rows = self.jacobian, 1.0 / self.noise.variance(self.model), self.residual
         rim = edge_harmonics(*rows, information, theta[2:5], offset) if edges else NO_EDGE
+        heart = None if size == 12 else self.parameters[12:] + np.r_[self.origin, 0.0, 0.0]
         return DotFit(
             theta[:2] + self.origin,
             theta[2:5],
             float(theta[5]),
-            self.parameters[6:],
+            self.parameters[6:12],
             self.origin,
             self.radius,
             covariance[:2, :2],
             float(np.sqrt(max(covariance[5, 5], 0.0))),
             _log_radius_sd(theta[2:5], covariance[2:5, 2:5]),
-            chi2 / max(count - PARAMETERS, 1),
+            chi2 / max(count - self.free, 1),
             len(self.grey),
-            len(self.grey) - int(count),
+            max(int(count) - self.free, 1),
             float(np.sqrt(edge_squares / edge) / contrast) if edge else np.inf,
             inner_chi2 / inner if inner else 1.0,
             int(inner),
             converged,
-            *rim,
+            rim[0],
+            rim[1],
+            heart,
         )
 
 

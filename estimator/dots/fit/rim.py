@@ -48,8 +48,8 @@ def edge_harmonics(
 ) -> tuple[Array, Array]:
     """Return the harmonics of one dot's edge in its residuals, relative to its semi-axes.
 
-    jacobian : (12, P) derivatives of the grey levels by the parameters of the fit, at its minimum.
-    weight, residual : (P,). information : (12, 12) of the fit.
+    jacobian : (N, P) derivatives of the grey levels by the parameters of the fit, at its minimum.
+    weight, residual : (P,). information : (N, N) of the fit.
     shape_px : (3,). offset_px : (2, P) pixels less the centre.
 
     Returns the coefficients (2 K,) cos 3 phi, sin 3 phi, cos 4 phi ... and their variances (2 K,),
@@ -58,7 +58,11 @@ def edge_harmonics(
     if np.count_nonzero(weight) <= len(information):
         return NO_EDGE
     count = 2 * len(HARMONICS)
-    own, mixed, right = np.zeros((count, count)), np.zeros((count, 12)), np.zeros(count)
+    own, mixed, right = (
+        np.zeros((count, count)),
+        np.zeros((count, len(information))),
+        np.zeros(count),
+    )
     edge_equations(HARMONICS[0], shape_px, offset_px, jacobian, weight, residual, own, mixed, right)
     own -= mixed @ np.linalg.solve(information, mixed.T)
     try:

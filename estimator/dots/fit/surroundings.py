@@ -37,6 +37,7 @@ def dot_window(
     *,
     coarse: bool = False,
     known: Sequence[int] = (),
+    whole: bool = False,
 ) -> Window:
     """Return the part of an image to which one dot is fitted: its edge, inside, and background.
 
@@ -48,6 +49,7 @@ def dot_window(
     known : labels of neighbouring blobs whose light is subtracted before the fit. Pixels that are
         blurred together with these blobs stay in the mask; without them a third of the precision
         would be lost.
+    whole : whether the inside of a large dot is used, too.
 
     Pixels that are nearer to another blob, or near a hole, are left out. Of a large dot only the
     surroundings of the edge are used, and beyond the edge's blur one pixel in four.
@@ -64,7 +66,9 @@ def dot_window(
     distance = approximate_distance_px(
         start.shape_px, np.tile(du, len(dv)), np.repeat(dv, len(du))
     ).reshape(len(dv), len(du))
-    mask: Bools = (distance < outer) & (distance > -max(8.0, reach))
+    mask: Bools = distance < outer
+    if not whole:
+        mask &= distance > -max(8.0, reach)
     clear = CLEAR_SIGMA * start.sigma_px
     around = (low, high, int(np.ceil(max(clear, outer))) + 1)
     gap = _distance_to_others(labels, (blob.label,), *around)

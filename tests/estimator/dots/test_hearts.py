@@ -1,4 +1,4 @@
-"""Dots with a brighter or darker heart: the fit is at the rim, not on the heart, or is refused."""
+"""Dots with a brighter or darker heart: the fit is at the rim, and its covariance is true."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ RADIUS_PX, BLUR_PX, NOISE, SIDE = 8.0, 1.0, 2.0, 9
 
 class Hearts(NamedTuple):
     """share : of the dots that have a heart. least, most : its extra light, relative to the dot.
-    size : its radius relative to the dot. dark : whether the image is inverted."""
+    size : its radius relative to the dot. dark : whether the image is inverted. small : relative
+    radius of every ninth dot."""
 
     share: float
     least: float
     most: float
     size: float = 0.5
     dark: bool = False
+    small: float = 1.0
 
 
 def plate(hearts: Hearts, seed: int) -> tuple[Array, Array]:
@@ -36,11 +38,12 @@ def plate(hearts: Hearts, seed: int) -> tuple[Array, Array]:
     size = int(pitch * (SIDE + 0.5))
     at = (np.arange(size * FINE) + 0.5) / FINE - 0.5
     covered = np.zeros((size * FINE, size * FINE), np.float32)
-    for u, v in centres:
+    for number, (u, v) in enumerate(centres):
+        whole = RADIUS_PX * (hearts.small if number % SIDE == 0 else 1.0)
         near = [slice(*np.searchsorted(at, [c - 1.5 * RADIUS_PX, c + 1.5 * RADIUS_PX]))
                 for c in (u, v)]  # fmt: skip
         du, dv = at[near[0]] - u, (at[near[1]] - v)[:, None]
-        covered[near[1], near[0]] += np.hypot(du, dv) < RADIUS_PX
+        covered[near[1], near[0]] += np.hypot(du, dv) < whole
         if rng.uniform() < hearts.share:
             way, turn = rng.uniform(0, 0.25) * RADIUS_PX, rng.uniform(0, 2 * np.pi)
             radius = hearts.size * RADIUS_PX * rng.uniform(0.8, 1.2)
@@ -60,8 +63,20 @@ def plate(hearts: Hearts, seed: int) -> tuple[Array, Array]:
         (Hearts(1.0, 0.5, 3.0), 0.95),
         (Hearts(0.27, -0.7, -0.3), 0.98),
         (Hearts(1.0, 0.3, 2.0, dark=True), 0.95),
+        (Hearts(1.0, 1.5, 1.5), 0.98),
+        (Hearts(1.0, 0.4, 0.4, 0.6), 0.98),
+        (Hearts(1.0, -0.4, -0.4, 0.6), 0.98),
     ],
-    ids=["some, bright", "all, moderate", "all, bright", "some, dark", "dark dots"],
+    ids=[
+        "some, bright",
+        "all, moderate",
+        "all, bright",
+        "some, dark",
+        "dark dots",
+        "all alike",
+        "wide, faint",
+        "wide, dark",
+    ],
 )
 def test_dots_with_hearts_are_measured_at_their_rim(hearts: Hearts, found: float) -> None:
     image, centres = plate(hearts, 5)
@@ -73,12 +88,24 @@ def test_dots_with_hearts_are_measured_at_their_rim(hearts: Hearts, found: float
     radius = np.sqrt(dots["a_px"] * dots["b_px"])
     assert radius.between(0.9 * RADIUS_PX, 1.1 * RADIUS_PX).all()
     # A single disc is off by 0.1 to 0.5 px RMS here, 0.9 to 1.7 px at most.
-    assert np.sqrt(np.mean(error**2)) < 0.03
+    assert np.sqrt(np.mean(error**2)) < 0.04
     assert np.abs(error).max() < 0.2
     parts = dots[["suu_px2", "suv_px2", "svv_px2"]].to_numpy()
     covariance = parts[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     nees = np.mean(error[:, None] @ np.linalg.solve(covariance, error[:, :, None])) / 2
-    assert 0.5 < nees < 2.5
+    # The mean of 81 pairs of squares scatters by 11 %.
+    assert 0.6 < nees < 1.6
+
+
+@pytest.mark.parametrize("small", [0.86, 0.7])
+def test_smaller_dots_are_found_with_their_own_size(small: float) -> None:
+    image, centres = plate(Hearts(0.0, 0.0, 0.0, small=small), 5)
+    dots = measure_dots(image).dots
+    assert len(dots) == len(centres)
+    points = dots[["u_px", "v_px"]].to_numpy()
+    nearest = np.argmin(np.linalg.norm(centres[::SIDE, None] - points, axis=-1), 1)
+    radius = np.sqrt(dots["a_px"] * dots["b_px"]).to_numpy()[nearest]
+    assert np.abs(radius / RADIUS_PX - small).max() < 0.01
 
 
 def test_a_plate_without_hearts_is_measured_as_before(monkeypatch: pytest.MonkeyPatch) -> None:

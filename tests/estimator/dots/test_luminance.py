@@ -110,6 +110,22 @@ def test_jacobian_of_the_model() -> None:
         np.testing.assert_allclose(jacobian[i], quotient, atol=0.1)
 
 
+def test_jacobian_of_a_dot_with_a_heart() -> None:
+    at, first, radius = np.argwhere(np.ones((22, 22), bool)), np.array([[-11.0, -11.0]]), 7.0
+    place = np.array([0.3, -0.2, 7.0, 0.4, 6.0, 0.9, 40, 1, 2, 100, 0, 0, 0.8, 0.1, 0.55, 60.0])
+
+    def model(parameters: Array) -> tuple[Array, Array]:
+        grey, slopes = np.empty(len(at)), np.empty((16, len(at)))
+        work = np.empty((1, 22, 22)), np.empty((1, 6, 22, 22))
+        predict(at, first, radius, parameters, *work, grey, slopes)
+        return grey, slopes
+
+    for k, step in enumerate(1e-5 * np.eye(16)):
+        change = (model(place + step)[0] - model(place - step)[0]) / 2e-5
+        if k not in (10, 11):
+            assert np.abs(change - model(place)[1][k]).max() < 1e-4 * np.abs(change).max()
+
+
 def test_damped_steps_are_those_of_numpy() -> None:
     rng = np.random.default_rng(0)
     rows, step = rng.standard_normal((30, 12)) * 10.0 ** rng.uniform(-3, 3, 12), np.empty(12)

@@ -389,18 +389,18 @@ def _travel(solution: Solution) -> dict[str, Any]:
 
 def sensors_of(solution: Solution) -> dict[str, Any]:
     """Return the estimates of bias, scale and clock of each sensor by its name."""
-    graph = solution.graph
+    graph, known = solution.graph, solution.covariances
     names = ["bias_x_mm_s2", "bias_y_mm_s2", "bias_z_mm_s2"]
     names += ["scale"] * graph.sensor_flags[0]
     out = {}
     for i, sensor in enumerate(graph.problem.accelerometers):
-        block, clocks = _block(solution, "sensors"), _block(solution, "clocks")
-        found = _with_sd(names, solution.state.sensors[i], None if block is None else block[i])
-        found["delay_s"] = float(solution.delays_s[i])
-        if clocks is not None and graph.sensor_flags[1]:
-            found["sdelay_s"] = float(np.sqrt(clocks[graph.clock_of[i], 0, 0]))
-        found["delay_s"] += sensor.offset_s
-        found["offset_s"] = found["delay_s"]
+        found: dict[str, Any] = dict(zip(names, solution.state.sensors[i].tolist()))
+        if known is not None:
+            sds = np.sqrt(np.diagonal(known.sensors[i])).tolist()
+            found |= {f"s{name}": sd for name, sd in zip(names, sds)}
+        if known is not None and graph.sensor_flags[1]:
+            found["sdelay_s"] = float(np.sqrt(known.clocks[graph.clock_of[i], 0, 0]))
+        found["delay_s"] = found["offset_s"] = float(solution.delays_s[i]) + sensor.offset_s
         found["offset_sd_s"] = found.get("sdelay_s", sensor.offset_sd_s)
         found["drift_ppm"] = sensor.drift_ppm
         found["confirmed"] = sensor.confirmed
@@ -418,18 +418,6 @@ def _means(evidence: Evidence) -> dict[str, Any]:
             found |= {"frames": mean.frames, "way_sd_mm": mean.way_sigma_mm.tolist()}
             found["length_sd_mm"] = mean.length_sigma_mm
         out[str(particle)] = found
-    return out
-
-
-def _block(solution: Solution, name: str) -> Array | None:
-    found = solution.covariances
-    return None if found is None else np.asarray(getattr(found, name))
-
-
-def _with_sd(names: list[str], values: Array, covariance: Array | None) -> dict[str, Any]:
-    out = {n: float(v) for n, v in zip(names, values)}
-    if covariance is not None:
-        out |= {f"s{n}": float(np.sqrt(covariance[i, i])) for i, n in enumerate(names)}
     return out
 
 

@@ -30,7 +30,6 @@ from telerig.estimator.smoothing.graph.elimination import (
     units,
 )
 from telerig.estimator.smoothing.graph.layout import (
-    Families,
     GraphLayout,
     State,
     first_guess,
@@ -77,17 +76,12 @@ def jointly(graph: GraphLayout) -> bool:
     With a few bubbles that costs no more. The mean bubble's covariances are not good enough for
     short tracks that nothing but images separates from the shake.
     """
-    sight, problem = most_in_sight(graph), graph.problem
+    sight, problem = int(np.bincount(graph.frame_of_row).max(initial=0)), graph.problem
     if sight <= _FEW:
         return True
     lasting = [float(problem.t_s[b.last] - problem.t_s[b.first]) for b in problem.bubbles]
     short = float(np.median(lasting)) < _SHORT_S
     return sight <= _MORE and short and not problem.measures_shake
-
-
-def most_in_sight(graph: GraphLayout) -> int:
-    """Return the largest number of bubbles that are in sight in one frame."""
-    return int(np.bincount(graph.frame_of_row).max(initial=0))
 
 
 @dataclass(frozen=True)
@@ -133,7 +127,7 @@ class EliminatedCrowd:
     def columns(self, at: Ints) -> Array:
         """Return columns (D, n) of the covariance at variables of the rig; each as good as the
         variance on its diagonal, which may be far smaller than `_LEFT`."""
-        return self.solved_in_steps(units(at, _size(self.graph)), relative=True)[0]
+        return self.solved_in_steps(units(at, self.graph.columns().clocks.stop), relative=True)[0]
 
     def solved_in_steps(self, side: Array, *, relative: bool = False) -> tuple[Array, int]:
         """Return what `solved` returns, and the number of conjugate-gradient steps.
@@ -187,13 +181,9 @@ class EliminatedCrowd:
         return product(self.images_by_bubble, self.starts[1], flat)
 
     def _preconditioned(self, side: Array) -> Array:
-        out = self.mean.solved(side)
-        out[self._of_mean_bubble()] = 0.0
+        out, theirs = self.mean.solved(side), self.mean.graph.columns()
+        out[theirs.bubbles.start : theirs.means.stop] = 0.0
         return out
-
-    def _of_mean_bubble(self) -> slice:
-        starts = _starts(self.mean.graph)
-        return slice(starts.bubbles, starts.sensors)
 
     def _bubbles(self, rows: Array, means: Array | None) -> tuple[Array, Array]:
         if means is None:
@@ -211,26 +201,24 @@ class EliminatedCrowd:
 
     def _split(self, side: Array) -> tuple[Array, Array, Array]:
         """Split a vector (D, N) of the graph into rig (R, N), rows and means of the chains."""
-        ours, theirs = _starts(self.graph), _starts(self.mean.graph)
+        ours, theirs = self.graph.columns(), self.mean.graph.columns()
         size, places = self.graph.bubble.size, self.chains.places
-        rig = np.zeros((_size(self.mean.graph), side.shape[1]))
-        rig[: ours.bubbles] = side[: ours.bubbles]
-        rig[theirs.sensors :] = side[ours.sensors :]
+        rig = np.zeros((theirs.clocks.stop, side.shape[1]))
+        rig[theirs.shake], rig[theirs.means.stop :] = side[ours.shake], side[ours.means.stop :]
         rows = np.empty((self.graph.rows, size, side.shape[1]))
-        rows[places.place_of_row] = side[ours.bubbles : ours.means].reshape(rows.shape)
-        means = side[ours.means : ours.sensors].reshape(-1, 3, side.shape[1])
+        rows[places.place_of_row] = side[ours.bubbles].reshape(rows.shape)
+        means = side[ours.means].reshape(-1, 3, side.shape[1])
         return rig, rows, means[places.order]
 
     def _joined(self, rig: Array, rows: Array, means: Array) -> Array:
-        ours, theirs = _starts(self.graph), _starts(self.mean.graph)
+        ours, theirs = self.graph.columns(), self.mean.graph.columns()
         places, count = self.chains.places, rig.shape[1]
-        out = np.empty((_size(self.graph), count))
-        out[: ours.bubbles] = rig[: ours.bubbles]
-        out[ours.sensors :] = rig[theirs.sensors :]
-        out[ours.bubbles : ours.means] = rows[places.place_of_row].reshape(-1, count)
+        out = np.empty((ours.clocks.stop, count))
+        out[ours.shake], out[ours.means.stop :] = rig[theirs.shake], rig[theirs.means.stop :]
+        out[ours.bubbles] = rows[places.place_of_row].reshape(-1, count)
         back = np.empty_like(means)
         back[places.order] = means
-        out[ours.means : ours.sensors] = back.reshape(-1, count)
+        out[ours.means] = back.reshape(-1, count)
         return out
 
     def blocks(self) -> list[Array]:
@@ -298,7 +286,7 @@ def eliminate_crowd(
         (starts_of(mean), graph.bubble.size * np.arange(graph.rows + 1)), np.zeros(0),
     )  # fmt: skip
     starts, rest = starts_of(graph), [f.rhs[..., None] for f in factors]
-    total, steps = np.zeros((_size(graph), 1)), 0
+    total, steps = np.zeros((int(starts[-1]), 1)), 0
     for _ in range(_MOST_REFINEMENTS):
         side = transposed_product(factors, starts, rest)
         found, more = out.solved_in_steps(side)
@@ -308,15 +296,6 @@ def eliminate_crowd(
         fitted = product(factors, starts, total)
         rest = [linear.rhs[..., None] - one for linear, one in zip(factors, fitted)]
     return replace(out, vector=total[:, 0], steps=steps)
-
-
-def _size(graph: GraphLayout) -> int:
-    return sum(n * d for n, d in graph.counts())
-
-
-def _starts(graph: GraphLayout) -> Families[int]:
-    """Return the first column of each family of keys."""
-    return Families(0, *np.cumsum([n * d for n, d in graph.counts()])[:-1].tolist())
 
 
 def _mean_row(mean: GraphLayout) -> Ints:

@@ -47,12 +47,8 @@ class Draws:
 
         family : its index in `graph.counts()`.
         """
-        counts = graph.counts()
-        first = sum(n * d for n, d in counts[:family])
-        number, size = counts[family]
-        return self.errors[first : first + number * size].reshape(
-            number, size, self.errors.shape[1]
-        )
+        mine = self.errors[graph.columns()[family]]
+        return mine.reshape(*graph.counts()[family], mine.shape[1])
 
 
 def draws_of(

@@ -546,6 +546,11 @@ class GraphLayout:
         numbers = [family.number for family in self.counts()]
         return Families(0, *np.cumsum(numbers)[:-1].tolist())
 
+    def columns(self) -> Families[slice]:
+        """Return the place of each family in the vector of all variables."""
+        ends = [0, *np.cumsum([n * d for n, d in self.counts()]).tolist()]
+        return Families(*map(slice, ends[:-1], ends[1:]))
+
 
 def graph_layout(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> GraphLayout:
     """Return the layout of a problem's graph for given delays of the accelerometers (A,)."""
@@ -619,10 +624,8 @@ def _guess_carriage(graph: GraphLayout, shake: Array) -> None:
 
 def moved(graph: GraphLayout, state: State, step: Array) -> State:
     """Return the values of all variables after an increment (D,), in the order of their keys."""
-    families = graph.counts()
-    parts = np.split(step, np.cumsum([n * d for n, d in families])[:-1])
     shake, bubbles, means, sensors, constants, marks, clocks = (
-        p.reshape(family) for p, family in zip(parts, families)
+        step[mine].reshape(family) for mine, family in zip(graph.columns(), graph.counts())
     )
     encoder, calibration = np.split(constants[0], [graph.encoder_size])
     return State(

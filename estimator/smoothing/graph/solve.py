@@ -354,15 +354,12 @@ def _linear_solve(
 
 def _squared(graph: GraphLayout, factors: list[LinearFactors], vector: Array) -> float:
     """Sum of squares of all factors after the step."""
-    base, counts = np.array(graph.base()), graph.counts()
-    sizes = [n * d for n, d in counts]
-    starts = np.r_[0, np.cumsum(sizes)]
+    base, columns = np.array(graph.base()), graph.columns()
 
     def of_keys(keys: ArrayLike, size: int) -> Array:
         key = np.asarray(keys)
         family = int(np.searchsorted(base, key.flat[0], "right")) - 1
-        part = vector[starts[family] : starts[family + 1]].reshape(-1, size)
-        return np.asarray(part[key - base[family]])
+        return np.asarray(vector[columns[family]].reshape(-1, size)[key - base[family]])
 
     return sum(f.squared(of_keys) for f in factors)
 
@@ -377,10 +374,8 @@ def _log_norm(graph: GraphLayout, factors: list[LinearFactors]) -> float:
 
 def _largest_shift_px(graph: GraphLayout, vector: Array) -> float:
     """Return how far bubbles moved in this pass, in pixels of the finest camera."""
-    layout, (nodes, size) = graph.bubble, graph.counts()[0]
-    start = nodes * size
-    states = vector[start : start + graph.rows * layout.size].reshape(-1, layout.size)
-    moves = graph.bubbles_moved(states) @ layout.position.T
+    states = vector[graph.columns().bubbles].reshape(-1, graph.bubble.size)
+    moves = graph.bubbles_moved(states) @ graph.bubble.position.T
     scale = max(c["scale_px_per_mm"] for c in graph.problem.cameras)
     return float(np.max(np.abs(moves), initial=0.0) * scale)
 
@@ -398,8 +393,8 @@ def _finish(
 
     fitted : weights and residuals, of bubbles and of marks.
     """
-    dimension = sum(n * d for n, d in graph.counts())
-    evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
+    evidence = last.log_norm - last.squared / 2
+    evidence += len(last.done.vector) / 2 * np.log(2 * np.pi)
     evidence -= last.done.log_det()
     draws = draws_of(graph, last.factors, last.done) if options.draws else None
     constants = _joint_covariance(graph, last.done, (3, 4, 5, 6)) if options.constants else None
@@ -439,8 +434,8 @@ def _joint_covariance(
 ) -> Array:
     """Return the joint covariance of some families of variables, such as what does not change along
     a run."""
-    ends = np.cumsum([0, *(n * d for n, d in graph.counts())])
-    rows = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in families])
+    columns = graph.columns()
+    rows = np.r_[tuple(columns[i] for i in families)]
     out = np.zeros((len(rows), len(rows)))
     for first in range(0, len(rows), _COLUMNS_AT_ONCE):
         mine = np.arange(first, min(first + _COLUMNS_AT_ONCE, len(rows)))
@@ -453,10 +448,10 @@ def _scale_variances(graph: GraphLayout, done: EliminatedGraph | EliminatedCrowd
 
     It is the square of their covariance with the scale over the variance of the scale.
     """
-    (nodes, shake), (rows, size) = graph.counts()[:2]
-    at = sum(n * d for n, d in graph.counts()[:4])
+    columns = graph.columns()
+    at = columns.constants.start
     column = done.columns(np.array([at]))[:, 0]
-    states = column[nodes * shake : nodes * shake + rows * size].reshape(rows, size)
+    states = column[columns.bubbles].reshape(-1, graph.bubble.size)
     moves = graph.bubbles_moved(states) @ graph.bubble.position.T
     return np.asarray(moves**2 / column[at])
 
@@ -477,7 +472,9 @@ def _covariances(graph: GraphLayout, own: list[Array]) -> Covariances:
     """Marginals in physical units."""
     shake, bubbles = own[:2]
     for mine in _parts(len(shake)):
-        basis = _frame_basis(graph, mine)
+        basis = graph.shake_basis(graph.nodes.of_frame[mine])
+        if graph.to_frames is not None:
+            basis = graph.to_frames[mine] @ basis
         shake[mine] = basis @ shake[mine] @ np.swapaxes(basis, -1, -2)
     graph.bubble_covariances(bubbles)
     encoder = graph.encoder_size
@@ -490,12 +487,6 @@ def _covariances(graph: GraphLayout, own: list[Array]) -> Covariances:
 def _parts(count: int) -> list[Ints]:
     """Yield parts of some thousand numbers, to limit the memory for intermediate results."""
     return [np.arange(i, min(i + _AT_ONCE, count)) for i in range(0, count, _AT_ONCE)]
-
-
-def _frame_basis(graph: GraphLayout, frame: Ints) -> Array:
-    """Return (n, D, D) from increments of the shake at its nodes to its states at frames (n,)."""
-    basis = graph.shake_basis(graph.nodes.of_frame[frame])
-    return basis if graph.to_frames is None else graph.to_frames[frame] @ basis
 
 
 class Truncation:

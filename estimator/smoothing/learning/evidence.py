@@ -149,36 +149,21 @@ def _carry_on(values: Array, gain: Array) -> None:
 def eliminated(own: Array, following: Array, sides: Array) -> Chain:
     """Factorise a block tridiagonal precision matrix.
 
+    Where consecutive frames have equal blocks, the recursion converges; from then on only the
+    right-hand sides are updated.
+
     own : (F, D, D) diagonal blocks; overwritten.
     following : (F - 1, D, D) blocks below the diagonal.
     sides : (F, S, D) right-hand sides.
 
     Raises numpy.linalg.LinAlgError if the matrix is not positive definite.
     """
-    count = sides.shape[1]
-    joined = np.zeros((len(own), count + own.shape[-1], own.shape[-1]))
-    joined[:, :count], joined[:-1, count:] = sides, following
-    steady = eliminate_forward(own, joined)
-    return Chain(own, joined[:, :count], joined[:-1, count:], steady)
-
-
-def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
-    """Factorise a block tridiagonal precision matrix in place; return `Chain.steady`.
-
-    Where consecutive frames have equal blocks, the recursion converges; from then on only the
-    right-hand sides are updated.
-
-    own : (F, D, D) diagonal blocks; becomes L_t^T.
-    joined : (F, S + D, D) right-hand sides, then the coupling to the next frame; becomes the same
-        times L_t^-T.
-
-    Raises numpy.linalg.LinAlgError if the matrix is not positive definite.
-    """
     from scipy.linalg.blas import dtrsm
     from scipy.linalg.lapack import dpotrf, dtrtri
 
-    width, last = own.shape[-1], len(own) - 1
-    after = joined.shape[1] - width
+    after, last = sides.shape[1], len(own) - 1
+    joined = np.zeros((len(own), after + own.shape[-1], own.shape[-1]))
+    joined[:, :after], joined[:-1, after:] = sides, following
     product = np.empty(joined.shape[1:])
     ends = _ends_of_alike(own, joined[:, after:])
     steady, t = (0, 0), 0
@@ -202,7 +187,7 @@ def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
             own[t + 1] -= product[after:]
             joined[t + 1, :after] -= product[:after]
         t += 1
-    return steady
+    return Chain(own, joined[:, :after], joined[:-1, after:], steady)
 
 
 def _ends_of_alike(own: Array, following: Array) -> list[int]:

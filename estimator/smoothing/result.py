@@ -12,7 +12,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.accelerations import Accelerations
-from telerig.estimator.smoothing.graph.layout import points_in_rig
+from telerig.estimator.smoothing.graph.layout import points_in_rig, variances
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     carriage,
@@ -557,11 +557,8 @@ def _named(values: Array, pattern: str) -> dict[str, Array]:
 
 
 def _sigma(rows: Array, covariance: Array) -> Array:
-    """Return the standard deviations (n, 3) of linear combinations of n states with d components.
-
-    rows : (3, d) or (n, 3, d) coefficients.  covariance : (n, d, d) covariances of the states.
-    """
-    return np.asarray(np.sqrt(((rows @ covariance) * rows).sum(-1).clip(0)))
+    """Return the roots of `variances`."""
+    return np.asarray(np.sqrt(variances(rows, covariance).clip(0)))
 
 
 def _observed(solution: Solution) -> Ints:

@@ -14,7 +14,7 @@ from telerig.arrays import Array
 from telerig.estimator.smoothing.graph.accelerations import add_slow_noise
 from telerig.estimator.smoothing.graph.bubble_chains import BubbleChains, bubble_chains
 from telerig.estimator.smoothing.graph.draws import Draws
-from telerig.estimator.smoothing.graph.layout import GraphLayout, State
+from telerig.estimator.smoothing.graph.layout import GraphLayout, State, variances
 from telerig.estimator.smoothing.graph.linear import SampleWeights, all_factors
 from telerig.factors.linear_factors import LinearFactors
 
@@ -36,9 +36,9 @@ def shake_known_variances(
     known = graph.bubble_covariances(chains.covariances(chains.places.place_of_row))
     add_slow_noise(graph, state, known)
     at = graph.bubble.position
-    variance = np.einsum("id,nde,ie->ni", at, known, at, optimize=True)
+    variance = variances(at, known)
     if not graph.share_size:
-        return np.asarray(variance)
+        return variance
     pushed = np.zeros((graph.rows, graph.bubble.size, graph.share_size))
     information = np.eye(graph.share_size)
     for linear in _bubbles_images(graph, factors):

@@ -436,6 +436,11 @@ class GraphLayout:
             return np.asarray(states)
         return np.asarray((self.to_frames @ states[..., None])[..., 0])
 
+    def offsets(self, shake: Array) -> Array:
+        """Return the cameras' offsets (F, C, 3) at the frames. shake : as in `shake_at_frames`."""
+        states = self.shake_at_frames(shake)
+        return np.asarray(np.einsum("cid,fd->fci", self.shake.offset[:-1], states))
+
     def in_shake_basis(self, block: Array, node: Ints) -> Array:
         """Return derivatives (n, r, D) with respect to increments of the shake at nodes (n,).
 
@@ -652,9 +657,12 @@ def points_in_rig(graph: GraphLayout, state: State) -> Array:
     return np.asarray(state.bubbles @ graph.bubble.position.T - moved[graph.frame_of_row])
 
 
-def times(matrices: Array, vectors: Array) -> Array:
-    """Return the products (..., n) of matrices (..., n, m) and vectors (..., m)."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
+def variances(rows: Array, covariance: Array) -> Array:
+    """Return the variances (n, k) of k linear combinations of n states.
+
+    rows : (k, D) or (n, k, D) coefficients.  covariance : (n, D, D) of the states.
+    """
+    return np.asarray(((rows @ covariance) * rows).sum(-1))
 
 
 def times_chosen(blocks: Array, matrices: Array, which: Ints) -> Array:

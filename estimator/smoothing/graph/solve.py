@@ -34,6 +34,7 @@ from telerig.estimator.smoothing.graph.layout import (
     first_guess,
     graph_layout,
     moved,
+    variances,
 )
 from telerig.estimator.smoothing.graph.linear import (
     SampleWeights,
@@ -168,7 +169,7 @@ class Solution:
             return np.full((self.graph.rows, 3), np.nan)
         inertia = self.graph.model.bubble.inertia
         unseen = (0.0,) * 3 if inertia is None else inertia.unseen
-        return np.asarray(((rows @ found.bubbles) * rows).sum(-1).clip(0) + unseen)
+        return np.asarray(variances(rows, found.bubbles).clip(0) + unseen)
 
     @cached_property
     def accelerations(self) -> Accelerations | None:
@@ -230,7 +231,9 @@ def _solve(
         leap = 0.0 if exact else last.largest_px
         state = moved(graph, state, last.done.vector)
         if due("shake"):
-            publish("shake", t_s=problem.t_s, shake_mm=_shake_mm(graph, state))
+            names = (camera.name for camera in problem.cameras)
+            offsets = graph.offsets(state.shake).swapaxes(0, 1)
+            publish("shake", t_s=problem.t_s, shake_mm=dict(zip(names, offsets)))
         residuals = pixel_residuals(graph, state)
         samples, changed = rejection.update(samples, sample_residuals(graph, state))
         fresh = weights
@@ -255,13 +258,6 @@ def _solve(
     found = _finish(graph, state, (weights, residuals), last, options, done, progress)
     _check_variances(found.covariances)
     return replace(found, sample_weights=samples)
-
-
-def _shake_mm(graph: GraphLayout, state: State) -> dict[str, Array]:
-    """Return the shake (F, 3) by camera."""
-    states, offset = graph.shake_at_frames(state.shake), graph.shake.offset
-    cameras = graph.problem.cameras
-    return {camera.name: states @ rows.T for camera, rows in zip(cameras, offset)}
 
 
 def _check_converged(graph: GraphLayout, state: State, largest_px: float) -> None:

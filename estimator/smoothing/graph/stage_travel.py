@@ -108,9 +108,7 @@ def offset_sigma(solution: Solution) -> Array:
     """
     graph = solution.graph
     problem, half = graph.problem, len(graph.problem.t_s) // 2
-    shake = graph.shake_at_frames(solution.state.shake)
-    offsets = np.einsum("cid,fd->fci", graph.shake.offset[:-1], shake)
-    moved = np.zeros(3)
+    offsets, moved = graph.offsets(solution.state.shake), np.zeros(3)
     if half:
         moved = np.abs(offsets[half:].mean(0) - offsets[:half].mean(0)).max(0) / 2
     if problem.stage is None:

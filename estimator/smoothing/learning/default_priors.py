@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.smoothing.graph.layout import BROAD_BAND, directed
+from telerig.estimator.smoothing.graph.layout import BROAD_BAND, directed, variances
 from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
@@ -298,7 +298,9 @@ def adapted(solution: Solution, start: ShakeModel | None = None) -> ShakeModel |
     if model.broad_bands:
         factor = _size_of_bands(solution, (start or model).broad_bands)
         fresh = rescaled(better, factor, _dominant_hz(solution))
-        floor = fitted_floor(solution.graph.problem.t_s, _offsets(solution), fresh.broad_bands)
+        graph = solution.graph
+        offsets = graph.offsets(solution.state.shake)
+        floor = fitted_floor(graph.problem.t_s, offsets, fresh.broad_bands)
         moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
         if max(np.max(np.abs(np.log(factor))), moved) > _RESCALE_BEYOND:
             bands = (b if floor is None else replace(b, floor=floor) for b in fresh.broad_bands)
@@ -354,10 +356,11 @@ def _size_of_offsets(solution: Solution) -> Array:
         prior[slice(None) if mode.camera == CARRIAGE else mode.camera] += np.square(mode.rms_mm)
     if found is None:
         return np.ones(3)
-    left = np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True).mean(0)
+    left = np.stack([variances(row, found.shake).mean(0) for row in rows])
     reduction = np.sum(prior - left, axis=0)
     known = reduction > _LEAST_REDUCTION * prior.sum(0)
-    square = (_offsets(solution) ** 2).mean(0).sum(0) / np.where(known, reduction, 1.0)
+    square = (graph.offsets(solution.state.shake) ** 2).mean(0).sum(0)
+    square /= np.where(known, reduction, 1.0)
     samples = 2 * (t[-1] - t[0]) * graph.model.modes[0].frequency_hz
     square = (samples * square + _PRIOR_SAMPLES) / (samples + _PRIOR_SAMPLES)
     factor = np.where(known, np.clip(np.sqrt(square), *_SCALED), 1.0)
@@ -410,12 +413,6 @@ def _periodogram(series: Array, step_s: float) -> Array:
 
     taper: Any = np.hanning(len(series))
     return np.asarray(periodogram(series, 1 / step_s, window=taper, detrend=detrend)[1])
-
-
-def _offsets(solution: Solution) -> Array:
-    """Return the offsets (F, C, 3) of each camera in mm."""
-    states = solution.graph.shake_at_frames(solution.state.shake)
-    return np.asarray(np.einsum("cid,fd->fci", solution.graph.shake.offset[:-1], states))
 
 
 def _size_of_bands(solution: Solution, defaults: Sequence[BroadBand]) -> Array:
@@ -472,7 +469,7 @@ def fitted_variance(
 
 def _dominant_hz(solution: Solution) -> float:
     """Return the RMS of the offsets' velocity over 2 pi times that of the offsets."""
-    graph, place = solution.graph, _offsets(solution)
+    graph, place = solution.graph, solution.graph.offsets(solution.state.shake)
     states = graph.shake_at_frames(solution.state.shake)
     speed = np.einsum("cid,fd->fci", graph.shake.offset_velocity[:-1], states)
     return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))

@@ -21,6 +21,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
+from telerig.estimator.smoothing.graph.layout import variances
 from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.learning.default_priors import default_model
@@ -252,11 +253,10 @@ def _spread(solution: Solution, other: Solution) -> tuple[float, float, float]:
         return 1.0, 1.0, 1.0
     row = ours.bubble.position, theirs.bubble.position
     off = other.state.bubbles @ row[1].T - solution.state.bubbles @ row[0].T
-    variances = [
-        np.einsum("id,nde,ie->ni", a, s.covariances.bubbles, a, optimize=True)
-        + considered_variance(s)[0]
+    own, their = (
+        variances(a, s.covariances.bubbles) + considered_variance(s)[0]
         for a, s in zip(row, (solution, other))
         if s.covariances is not None
-    ]
-    x, y, z = np.sqrt(np.median((off**2 + variances[1]) / variances[0], axis=0)).clip(1.0).tolist()
+    )
+    x, y, z = np.sqrt(np.median((off**2 + their) / own, axis=0)).clip(1.0).tolist()
     return x, y, z

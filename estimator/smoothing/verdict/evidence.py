@@ -15,6 +15,7 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.smoothing.graph.draws import Draws
+from telerig.estimator.smoothing.graph.layout import variances
 from telerig.estimator.smoothing.graph.linear import encoder, white_noise
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
@@ -399,13 +400,12 @@ def shake_of(solution: Solution, span: Span | None = None) -> Shake | None:
         max(span.own.start, edge - span.first), min(span.own.stop, count - edge - span.first)
     )
     states = graph.shake_at_frames(solution.state.shake)[inner]
-    variances, squares = [], []
+    left, squares = list[Array](), list[Array]()
     for camera, seen in enumerate(graph.shake.seen):
         rows = seen @ graph.shake.offset[camera]
-        variance = np.einsum("kd,fde,ke->k", rows, found.shake[inner], rows, optimize=True)
-        variances.append(variance)
-        squares.append(((states @ rows.T) ** 2).sum(0) + variance)
-    return Shake(len(inner), tuple(variances), tuple(squares))
+        left.append(variances(rows, found.shake[inner]).sum(0))
+        squares.append(((states @ rows.T) ** 2).sum(0) + left[-1])
+    return Shake(len(inner), tuple(left), tuple(squares))
 
 
 def evidence_of(parts: Sequence[Evidence]) -> Evidence:

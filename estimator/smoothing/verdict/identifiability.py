@@ -18,7 +18,7 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.smoothing.graph.known_rig import shake_known_variances
-from telerig.estimator.smoothing.graph.layout import GraphLayout
+from telerig.estimator.smoothing.graph.layout import GraphLayout, variances
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance, offset_sigma
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, FEWEST_BUBBLES
@@ -188,7 +188,7 @@ def _sigmas(solution: Solution) -> tuple[Array, Array, Array]:
     samples = solution.sample_weights or None
     known = shake_known_variances(graph, solution.state, solution.weights, samples)[rows]
     at = graph.bubble.position
-    whole = np.einsum("id,nde,ie->ni", at, found.bubbles[rows], at, optimize=True)
+    whole = variances(at, found.bubbles[rows])
     by_scale = np.zeros_like(whole) if found.by_scale is None else found.by_scale[rows]
     own = np.maximum(whole - by_scale, np.minimum(known, whole))
     more = whole - own + considered_variance(solution)[0][rows]
@@ -211,10 +211,8 @@ def shake_share(solution: Solution, shake: Shake | None) -> list[float | None]:
     least: list[float | None] = [None, None, None]
     if shake is None:
         return least
-    for seen, variances, squares in zip(
-        solution.graph.shake.seen, shake.variance, shake.square, strict=True
-    ):
-        for direction, variance, square in zip(seen, variances, squares, strict=True):
+    for seen, *sums in zip(solution.graph.shake.seen, shake.variance, shake.square, strict=True):
+        for direction, variance, square in zip(seen, *sums, strict=True):
             if square <= 0:
                 continue
             for axis in np.flatnonzero(direction**2 > _SEEN):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from telerig.arrays import Array, Bools
+from telerig.estimator.smoothing.graph.layout import variances
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
 from telerig.io.results.smoothing import Mode, Place
@@ -63,11 +64,10 @@ def _from_offsets(solution: Solution, names: Sequence[str]) -> list[Mode]:
     if not graph.shake.size or not graph.model.broad_bands:
         return []
     rows = graph.shake.offset[:-1]
-    offsets = np.einsum("cid,fd->cfi", rows, graph.shake_at_frames(solution.state.shake))
+    offsets = graph.offsets(solution.state.shake).swapaxes(0, 1)
     noise = 0.0
     if found is not None:
-        variance = np.einsum("cid,fde,cie->", rows, found.shake, rows, optimize=True)
-        noise = float(variance) / len(rows) / len(graph.problem.t_s)
+        noise = float(np.mean([variances(row, found.shake).sum(1) for row in rows]))
     spectra = _spectra(graph.problem.t_s, offsets)
     if spectra is None:
         return []

@@ -14,6 +14,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.estimator.physics.oscillation import zigzag
 from telerig.estimator.smoothing.graph.draws import DRAWS, Draws
+from telerig.estimator.smoothing.graph.layout import variances
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance, offset_sigma
 from telerig.io.results.smoothing import Grade, Quantity, Use
@@ -87,7 +88,7 @@ class _Path:
         row = graph.bubble.position
         drawn = graph.bubble_basis(rows) @ errors[rows]
         error = np.einsum("id,ndk->nik", row, drawn)
-        variance = np.einsum("id,nde,ie->ni", row, found.bubbles[rows], row, optimize=True)
+        variance = variances(row, found.bubbles[rows])
         scale = np.sqrt(variance.mean(0) / (error**2).mean((0, 2)).clip(1e-300))
         self.errors = error * (scale * widen)[None, :, None]
         self.place = states @ row.T

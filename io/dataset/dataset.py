@@ -198,10 +198,6 @@ def load_dataset(
 
 def _dataset_folder(path: Path) -> Path:
     where = str(path)
-    if path.is_file():
-        raise InputError(
-            "is a file, not a dataset folder", where=where, todo=f"give its folder, {path.parent}"
-        )
     if not path.is_dir():
         otherwise = "check the path, or make one with `telerig init` or `telerig simulate`"
         raise absent(path, "dataset folder", otherwise)

@@ -266,10 +266,6 @@ def run_folder(path: Path) -> Path:
     """Return the absolute path of a run's folder. Raises InputError if it is none."""
     if path.is_dir():
         return path.resolve()
-    if path.exists():
-        raise InputError(
-            "is a file, not a run's folder", where=str(path), todo=f"give its folder, {path.parent}"
-        )
     raise absent(path, "run", "check the path")
 
 

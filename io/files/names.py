@@ -39,10 +39,13 @@ def fault_of_name(name: str) -> str:
 
 
 def absent(path: Path, thing: str, otherwise: str) -> InputError:
-    """Return the error for a file or folder that does not exist.
+    """Return the error for a file or folder that does not exist, or for a file in a folder's place.
 
     thing : what it should have been. otherwise : what to do if there is no similar name.
     """
+    if path.is_file():
+        todo = f"give its folder, {path.parent}"
+        return InputError("is a file, not a folder", where=str(path), todo=todo)
     first = next((p for p in [*path.parents[::-1], path] if not p.exists()), path)
     beside = sorted(p.name for p in first.parent.iterdir()) if first.parent.is_dir() else []
     near = nearest(first.name, beside)

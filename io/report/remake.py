@@ -37,10 +37,7 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
     """
     place = Path(folder)
     if not place.is_dir():
-        todo = "give a folder of results, or a dataset's"
-        if not place.exists():
-            raise absent(place, "folder", todo)
-        raise InputError("is a file, not a folder", where=str(place), todo=todo)
+        raise absent(place, "folder", "give a folder of results, or a dataset's")
     own = _of(place)
     if own:
         return (own,)

@@ -178,6 +178,7 @@ def test_a_folder_that_this_machine_does_not_see_is_named(tmp_path):
     ("arguments", "words"),
     [
         (["nowhere"], "there is no such folder"),
+        (["{0}/rig.toml"], "is a file, not a folder"),
         (["{0}", "{0}"], "named twice"),
         (["{0}", "--share", "3/2"], "--share 3/2"),
         (["{0}", "--workers", "0"], "0 workers"),

@@ -159,7 +159,7 @@ def test_default_run_is_the_only_one(place: Path, to: str) -> None:
         ("telerig export data --to netcdf --calibration x", "opencv, hdf5, mat"),
         ("telerig import opencv extrinsics.yml --out x", "no matrix with one of the names M1"),
         ("telerig import openptv cam1.tif.ori --out x", "sensor is not known"),
-        ("telerig import openptv cam1.tif.ori --image-size 3 --pixel-mm 1,1 --out x", "two num"),
+        ("telerig import openptv cam1.tif.ori --image-size 3 --pixel-mm 1,1 --out x", "2 num"),
         ("telerig import accelerometer arm.wav --run data/runs/rise --sensor a", "the unit"),
         ("telerig import accelerometer arm.wav --run nowhere --sensor a", "no such run"),
     ],

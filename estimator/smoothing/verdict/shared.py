@@ -192,16 +192,17 @@ def strongest(scores: Scores) -> Iterator[Found]:
     excess = power / level / np.log(2)  # its median is 1
 
     start = np.linspace(0, frames, _CUTS + 1)[1:-1].astype(int)
-    seen, drawn, full = (np.cumsum(x[::-1], 0)[::-1][start] for x in (seen, drawn, scores.full))
-    full = (full * (1 - full / total)).clip(_ROUNDING * total)
-    variance = (drawn**2).mean(1).clip(_LEAST)
+    after = np.arange(frames) >= start[:, None]
+    along = after - (after @ scores.full / total)[:, None]
+    variance, share = _variance(along, drawn, scores.full)
     correlated = max(1.0, float(np.median(excess[:_CUTS])))
-    sigmas = np.abs(seen) / np.sqrt(variance * correlated)
-    chance = 2 * len(start) * student.sf(sigmas, draws)
-    left = np.flatnonzero(variance / full >= _LEAST_OF_STEP)
+    step = along @ seen
+    sigmas = np.abs(step) / np.sqrt(variance * correlated)
+    chance = 2 * len(start) * student.sf(sigmas, 2 * draws * _NEAR)
+    left = np.flatnonzero(share >= _LEAST_OF_STEP)
     if len(left):
         i = left[chance[left].argmin()]
-        size = abs(float(seen[i] / variance[i]))
+        size = abs(float(step[i] / variance[i]))
         yield Found(int(start[i]), None, size, float(sigmas[i]), float(chance[i]))
 
     near = np.abs(np.arange(-_CUTS // 2, _CUTS // 2 + 1)) > _NEAR // 2
@@ -214,6 +215,23 @@ def strongest(scores: Scores) -> Iterator[Found]:
         i = left[chance[left].argmin()]
         size = 2 * float(np.sqrt(power[i]) / level[i])
         yield Found(0, (1 + float(i)) / frames, size, float(sigmas[i]), float(chance[i]))
+
+
+def _variance(along: Array, drawn: Array, full: Array) -> tuple[Array, Array]:
+    """Return the variances (n,) of sums of scores with weights (n, F), by draws (F, K), and the
+    shares (n,) that the fit has left of them.
+
+    Few draws show a sum's square badly, and the level of neighbouring frequencies well: the scores
+    over the square root of their full variance have a spectrum that is the same in all of the run.
+    Where that is not so, and the squares of the sums are larger, these count.
+    """
+    root = np.sqrt(full)
+    white = np.divide(drawn, root[:, None], out=np.zeros_like(drawn), where=root[:, None] > 0)
+    level = (np.abs(np.fft.rfft(white, axis=0)) ** 2).mean(1) / max(np.count_nonzero(full), 1)
+    weight = 2 / len(full) * np.abs(np.fft.rfft(along * root)) ** 2
+    share = weight @ level / (along**2 @ full).clip(_ROUNDING * max(full.sum(), _LEAST))
+    variance = np.maximum(weight @ _averaged(level), ((along @ drawn) ** 2).mean(1))
+    return variance.clip(_LEAST), share
 
 
 def _averaged(values: Array) -> Array:

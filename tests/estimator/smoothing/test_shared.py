@@ -23,19 +23,22 @@ from telerig.io.results.verdict_words import words_of_contradiction
 FRAMES, DRAWS = 400, 16
 
 
-def noise(rng: np.random.Generator, share: float, memory: float = 0.0) -> Scores:
+def noise(
+    rng: np.random.Generator, share: float, memory: float = 0.0, draws: int = DRAWS
+) -> Scores:
     """Scores of unit variance in each frame, of which the fit leaves a share."""
     from scipy.signal import lfilter
 
     seen = rng.standard_normal(FRAMES) * np.sqrt(1 - memory**2)
-    drawn_ones = rng.standard_normal((FRAMES, DRAWS))
+    drawn_ones = rng.standard_normal((FRAMES, draws))
     seen = np.asarray(lfilter([1.0], [1.0, -memory], seen))
     return Scores(share**0.5 * seen, share**0.5 * drawn_ones, np.ones(FRAMES))
 
 
-def test_noise_is_as_improbable_as_it_is_said_to_be() -> None:
+@pytest.mark.parametrize("draws", [DRAWS, 2])
+def test_noise_is_as_improbable_as_it_is_said_to_be(draws: int) -> None:
     rng = np.random.default_rng(1)
-    found = [one for _ in range(400) for one in strongest(noise(rng, 0.5))]
+    found = [one for _ in range(400) for one in strongest(noise(rng, 0.5, draws=draws))]
     for step in (True, False):
         chance = np.array([one.chance for one in found if (one.hz is None) == step])
         assert len(chance) == 400
@@ -50,15 +53,16 @@ def test_correlated_noise_is_no_motion() -> None:
     assert min(chance) > FALSE_ALARMS / 64
 
 
-@pytest.mark.parametrize("share", [1.0, 0.3])
-def test_a_step_and_a_line_have_their_size(share: float) -> None:
+@pytest.mark.parametrize(("share", "draws"), [(1.0, DRAWS), (0.3, DRAWS), (1.0, 2)])
+def test_a_step_and_a_line_have_their_size(share: float, draws: int) -> None:
+    """Long runs with many bubbles have two draws."""
     rng, t = np.random.default_rng(2), np.arange(FRAMES)
     step, line = np.where(t >= 200, 1.0, 0.0), np.sin(2 * np.pi * 40 / FRAMES * t)
-    clean = noise(rng, share)
+    clean = noise(rng, share, draws=draws)
     moved = clean._replace(seen=clean.seen + share * 1.5 * (step - step.mean()))
     one = next(f for f in strongest(moved) if f.hz is None)
     assert one.start == 200 and one.size_px == pytest.approx(1.5, abs=0.8)
-    assert one.chance < 1e-3
+    assert one.chance < 1e-6
     swung = clean._replace(seen=clean.seen + share * 1.5 * line)
     one = next(f for f in strongest(swung) if f.hz is not None)
     assert one.hz == pytest.approx(40 / FRAMES) and one.size_px == pytest.approx(1.5, abs=0.5)

@@ -55,8 +55,17 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
 
 
 def remake_report(results: ResultsFolder, out: Path | None = None) -> Path:
-    """Write the page of a results folder into it, or into ``out``; return its path."""
+    """Write the page of a results folder into it, or into ``out``; return its path.
+
+    Raises InputError for an ``out`` with results of its own.
+    """
     if out is not None:
+        if _of(out) is not None and out.resolve() != results.folder.resolve():
+            raise InputError(
+                "holds other results, whose page would be replaced",
+                where=str(out),
+                todo="choose another --out",
+            )
         return _write_page(results, out, out)
     again = f"telerig report {shlex.quote(str(results.folder))}"
     with replaced_results(results.folder, "report", again=again, inputs={}) as staged:

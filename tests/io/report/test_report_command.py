@@ -196,6 +196,10 @@ def test_bad_input_is_told_in_words(dataset: Path, tmp_path: Path) -> None:
         ([tmp_path / "none"], "there is no such folder"),
         ([dataset / "reslts" / "batch"], "did you mean results?"),
         ([dataset / "results" / "batch", "--film"], "films are made of runs"),
+        (
+            [dataset / "results" / "batch", "--out", dataset / "results" / "calibration"],
+            "holds other results",
+        ),
     ):
         said = command(*arguments, code=2)
         assert words in said and "->" in said

@@ -85,14 +85,19 @@ def check_encoder(
     """Return which readings (E,) can be used, and what is wrong with the others.
 
     Single wrong readings are masked. A jump that affects the frames is refused (`ENCODER_JUMP`).
+    What looks like a wrong end of the record may be a stage that starts or stops between two
+    readings, where these are far apart.
     """
     t, frames = np.asarray(t_s, float), np.asarray(frames_t_s, float)
     faults = encoder_faults(t, position_mm)
     kept = np.ones(len(t), bool)
-    spikes = [f for f in faults if f.kind == "spike"]
-    for fault in spikes:
+    spikes = []
+    for fault in (f for f in faults if f.kind == "spike"):
         first = int(np.searchsorted(t, fault.t_s))
-        kept[first : first + fault.readings] = False
+        end = first + fault.readings
+        if (first > 0 and end < len(t)) or fault.acceleration_m_s2 > _REAL_M_S2:
+            kept[first:end] = False
+            spikes.append(fault)
     jumps = [f for f in faults if f.kind != "spike"]
     grave = [
         f

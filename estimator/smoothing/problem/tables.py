@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.sensors.checks import Encoder
 from telerig.estimator.sensors.findings import Finding
@@ -44,17 +44,25 @@ _VISIBLE_PX = 2e-3
 
 
 def stage_of(encoder: Encoder | None, t_s: Array, described: Any = None) -> Stage | None:
-    """Return the encoder's readings during the frames, with a margin; None without an encoder.
+    """Return the encoder's readings near the frames; None without an encoder.
 
     t_s : (F,) times of the frames.
     described : what rig.toml states of the stage; None for nothing.
     """
     if encoder is None:
         return None
-    near = _near(encoder.t_s, t_s)
     stated = getattr(described, "delay_sigma_s", None)
     sigma = DELAY_SIGMA_S if stated is None else float(stated)
-    return Stage(encoder.t_s[near], encoder.position_mm[near], sigma)
+    return stage_near(Stage(encoder.t_s, encoder.position_mm, sigma), t_s)
+
+
+def stage_near(stage: Stage, t_s: Array) -> Stage:
+    """Return the readings near frames at t_s (F,), and one more on each side: the frames of a slow
+    encoder lie between two readings."""
+    low = int(np.searchsorted(stage.t_s, t_s[0] - MARGIN_S)) - 1
+    high = int(np.searchsorted(stage.t_s, t_s[-1] + MARGIN_S)) + 1
+    near = slice(max(low, 0), high)
+    return replace(stage, t_s=stage.t_s[near], position_mm=stage.position_mm[near])
 
 
 def accelerometers_of(
@@ -84,7 +92,8 @@ def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = MARGIN_S) -
     t_s : (F,) times of the frames.
     margin_s : how long before and after. If there is no such sample, the result has none.
     """
-    return sensor.of(_near(sensor.t_s - sensor.delay_s, t_s, margin_s))
+    t = sensor.t_s - sensor.delay_s
+    return sensor.of((t >= t_s[0] - margin_s) & (t <= t_s[-1] + margin_s))
 
 
 def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelerometer, ...]:
@@ -230,10 +239,6 @@ def calibration_share(
     if not visible.any():
         return None
     return CalibrationShare(root @ turn[visible].T, free, covariance, drift)
-
-
-def _near(t: Array, t_s: Array, margin_s: float = MARGIN_S) -> Bools:
-    return np.asarray((t >= t_s[0] - margin_s) & (t <= t_s[-1] + margin_s))
 
 
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")

@@ -11,9 +11,8 @@ from telerig.estimator.smoothing.problem.problem import (
     Bubble,
     Observations,
     SmoothingProblem,
-    Stage,
 )
-from telerig.estimator.smoothing.problem.tables import MARGIN_S, near_frames
+from telerig.estimator.smoothing.problem.tables import near_frames, stage_near
 
 
 @dataclass(frozen=True)
@@ -86,19 +85,12 @@ def all_of(problem: SmoothingProblem, first: int, end: int) -> Window:
         t_s=t_s,
         bubbles=tuple(_cut(problem.bubbles[b], first, end) for b in chosen),
         observations=_renumbered(seen, chosen),
-        stage=None if problem.stage is None else _stage_near(problem.stage, t_s),
+        stage=None if problem.stage is None else stage_near(problem.stage, t_s),
         accelerometers=tuple(sensor for sensor in sensors if len(sensor.t_s) > 1),
         marks=tuple(problem.marks[m] for m in known),
         references=_renumbered(marks, known),
     )
     return Window(cut, first, chosen)
-
-
-def _stage_near(stage: Stage, t_s: Array) -> Stage:
-    low = int(np.searchsorted(stage.t_s, t_s[0] - MARGIN_S)) - 1
-    high = int(np.searchsorted(stage.t_s, t_s[-1] + MARGIN_S)) + 1
-    near = slice(max(low, 0), high)
-    return replace(stage, t_s=stage.t_s[near], position_mm=stage.position_mm[near])
 
 
 def _renumbered(obs: Observations, chosen: Ints) -> Observations:

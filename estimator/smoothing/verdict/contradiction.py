@@ -3,9 +3,9 @@
 If they do, no standard deviation of the result can be right. Tested are the squared residuals
 against those expected from the model (`graph.draws`), by source, axis and time window; biases and
 delays against their priors; the bubbles' speed against a limit; and what the residuals of one
-camera share (`shared`). If a test fails, the run is solved again with each source left out in turn.
-The source whose removal resolves the contradiction is named, and the standard deviations are
-enlarged to cover the difference of the two results.
+camera share (`shared`). If a test fails, the run is solved again with each accelerometer, and the
+marks, left out in turn. The source whose removal resolves the contradiction is named, and the
+standard deviations are enlarged to cover the difference of the two results.
 
 Only the residuals of pixels and encoder readings are tested. Bubbles that are livelier than their
 prior (20 instead of 10 mm/s) raise the squared residuals of the motion prior to 2.3 times the

@@ -18,6 +18,7 @@ import pytest
 from shake_runs import Run, run_of, true_model_of
 
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.sensors.checks import Encoder
 from telerig.estimator.smoothing.graph.solve import (
     Covariances,
     Options,
@@ -26,7 +27,7 @@ from telerig.estimator.smoothing.graph.solve import (
     solve,
 )
 from telerig.estimator.smoothing.problem.problem import CarriageModel
-from telerig.estimator.smoothing.problem.tables import read_tracks
+from telerig.estimator.smoothing.problem.tables import read_tracks, stage_of
 from telerig.estimator.smoothing.result import Smoothing
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.smoothing.verdict.evidence import shake_of
@@ -311,6 +312,12 @@ def test_the_calibrations_uncertainty_is_carried_in(marked: Smoothing) -> None:
     unsure_x = smoothed(run, "references", given=True, calibration=unsure).trajectories["sx_mm"]
     sure_x = marked.trajectories["sx_mm"]
     np.testing.assert_allclose(np.sqrt(unsure_x**2 - sure_x**2), 0.03, rtol=0.02)
+
+
+def test_frames_lie_between_two_readings_of_a_slow_encoder() -> None:
+    t_s, encoder = np.array([0.1, 0.2]), Encoder(np.array([-1.0, -0.3, 0.6, 2.0]), np.arange(4.0))
+    found = stage_of(encoder, t_s)
+    assert found is not None and found.t_s.tolist() == [-0.3, 0.6]
 
 
 def test_two_frames_and_a_bubble_seen_once() -> None:

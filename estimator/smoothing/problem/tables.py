@@ -516,9 +516,9 @@ def _single(
     ]
     kept = np.array(inside, bool) if inside else np.zeros(0, bool)
     rows, ids = rows[kept], ids[kept]
-    values = rows[list(_PIXELS)].to_numpy(float)
-    values = np.where(np.isfinite(values), values, np.array([np.nan, np.nan, 1.0, 0.0, 1.0]))
-    good = np.isfinite(values).all(1)
+    values = np.array(rows[list(_PIXELS)], float)
+    values[~np.isfinite(values).all(1), 2:] = 1.0, 0.0, 1.0
+    good = np.isfinite(values[:, :2]).all(1)
     values, ids = values[good], ids[good]
     frame = rows["frame"].to_numpy(np.int64)[good]
     item = np.array([number[int(p)] for p in ids], np.int64)

@@ -314,6 +314,17 @@ def test_the_calibrations_uncertainty_is_carried_in(marked: Smoothing) -> None:
     np.testing.assert_allclose(np.sqrt(unsure_x**2 - sure_x**2), 0.03, rtol=0.02)
 
 
+def test_a_covariance_that_one_camera_states_in_part_is_not_mixed_with_another() -> None:
+    run = s2()
+    tracks = run.inputs("one")["tracks"]
+    lone = {"frame": [1], "camera": "left", "particle": 0.0, "u_px": 5.0, "v_px": 6.0}
+    lone |= {"suu_px2": np.nan, "suv_px2": 0.3, "svv_px2": 0.04}
+    both = SimpleNamespace(table=tracks[tracks["frame"] != 1], detections=pd.DataFrame(lone))
+    seen = read_tracks(both, run.calibration.cameras, run.t_s).observations
+    (found,) = seen.covariance_px2[seen.frame == 1]
+    np.testing.assert_allclose(found, np.eye(2), atol=2e-4)
+
+
 def test_frames_lie_between_two_readings_of_a_slow_encoder() -> None:
     t_s, encoder = np.array([0.1, 0.2]), Encoder(np.array([-1.0, -0.3, 0.6, 2.0]), np.arange(4.0))
     found = stage_of(encoder, t_s)

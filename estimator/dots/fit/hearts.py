@@ -66,7 +66,14 @@ Windows = Callable[[int, Start], Window]
 def show_hearts(
     fits: Sequence[DotFit], noise: NoiseModel, priors: Sequence[Prior], window: Windows
 ) -> bool:
-    """Return whether most dots of a sample have a heart; arguments as in `with_hearts`."""
+    """Return whether most dots of a sample have a heart; arguments as in `with_hearts`.
+
+    Where dots or ground are clipped, they are flat as if dots had hearts, and none is seen.
+    """
+    for level in np.median([(fit.background, fit.background + fit.contrast) for fit in fits], 0):
+        near = 2.0 * noise.sigma_at(level)
+        if not noise.black + near < level < noise.white - near:
+            return False
     gain, shown = 0.0, []
     reach = _reach_px(fits)
     for dot in range(0, len(fits), max(1, len(fits) // _SAMPLE)):

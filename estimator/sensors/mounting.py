@@ -6,8 +6,9 @@ is a hypothesis about its coefficients; axes and exchanged records are compared 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import permutations, product
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.alignment import effective_size, filtered, whitening_filter
 
-CLEAR_LOG_RATIO = 8.0
+_CLEAR_LOG_RATIO = 8.0
 _SHIFTS = 24
 _CHANCE = 1.5
 _UPRIGHT_DEG = 30.0
@@ -93,7 +94,7 @@ def mounting(
         found = axes if len(stated) else candidates[0]
         return Mounting(found, not len(stated), 0.0)
 
-    def scores(axes: Array, shift: int = 0) -> Array:
+    def scores(axes: Array, shift: float = 0.0) -> Array:
         each = [r.log_ratios(axes @ f.direction, shift) for f, r in fits]
         return np.asarray(np.sum(each, axis=0))
 
@@ -103,12 +104,19 @@ def mounting(
     if not len(stated):
         return Mounting(candidates[best], True, float("inf"))
     own = int(stated[0])
-    shifts = np.linspace(0.1, 0.9, _SHIFTS) * len(fits[0][1].x)
-    both = candidates[[best, own]]
-    chance = [float(np.ptp(scores(both, int(s)))) for s in shifts]
-    lead = float(score[best] - score[own])
-    clear = best != own and lead > max(CLEAR_LOG_RATIO, _CHANCE * max(chance))
-    return Mounting(candidates[best], bool(clear), lead)
+    clear = best != own and is_clear(partial(scores, candidates[[best, own]]))
+    return Mounting(candidates[best], clear, float(score[best] - score[own]))
+
+
+def is_clear(log_ratios: Callable[[float], Array]) -> bool:
+    """Return whether the first of two hypotheses is better than the second by more than chance.
+
+    log_ratios : function from a shift of the readings, as a share of the record, to the
+        log-likelihood ratios (2,) of both. How they differ at any shift but 0 is due to chance.
+    """
+    first, second = log_ratios(0.0)
+    chance = max(float(np.ptp(log_ratios(s))) for s in np.linspace(0.1, 0.9, _SHIFTS))
+    return bool(first - second > max(_CLEAR_LOG_RATIO, _CHANCE * chance))
 
 
 @dataclass(frozen=True)
@@ -138,13 +146,14 @@ class Regression:
         fit = x @ np.linalg.lstsq(x, y, rcond=None)[0]
         return cls(y, x, effective_size(y - fit, fit))
 
-    def log_ratios(self, hypotheses: Array, shift: int = 0) -> Array:
+    def log_ratios(self, hypotheses: Array, shift: float = 0.0) -> Array:
         """Return the log-likelihood ratio (h,) of each hypothesis to none.
 
         hypotheses : (h, k) the measured acceleration is a multiple, not negative, of x times them.
-        shift : by so many samples x is shifted.
+        shift : by this share of the samples x is shifted.
         """
-        predicted = hypotheses @ np.roll(self.x, shift, axis=0).T
+        shifted = np.roll(self.x, int(shift * len(self.x)), axis=0)
+        predicted = hypotheses @ shifted.T
         gain = np.clip((predicted @ self.y) / np.maximum((predicted**2).sum(1), 1e-12), 0.0, None)
         rest = ((self.y - gain[:, None] * predicted) ** 2).sum(1)
         total = max(float(self.y @ self.y), 1e-12)

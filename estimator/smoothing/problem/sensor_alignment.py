@@ -26,10 +26,10 @@ from telerig.estimator.sensors.drift import LEAST_PARTS, drift_of
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
 from telerig.estimator.sensors.mounting import (
-    CLEAR_LOG_RATIO,
     Expected,
     Mounting,
     Regression,
+    is_clear,
     mounting,
 )
 from telerig.estimator.sensors.response import CommonGain, Response
@@ -641,7 +641,7 @@ def _mountings(
         if s.confirmed and not s.unused_axes and s.name not in without
     ]
     read = {s.name: _at_frames(images, s) for s in sensors}
-    exchanged = _exchanged(problem, images, sensors, read)
+    exchanged = _exchanged(problem, images, sensors, read, log_evidence)
     if exchanged is not None:
         return [exchanged]
     axes = {s.name: s.axes for s in sensors}
@@ -718,13 +718,27 @@ def _exchanged(
     images: _Images,
     sensors: Sequence[Accelerometer],
     read: dict[str, tuple[Array, Bools]],
+    log_evidence: LogEvidence,
 ) -> Finding | None:
-    """Return a finding if the records of two cameras' sensors fit better when exchanged."""
+    """Return a finding if the records of two cameras' sensors fit better when exchanged.
+
+    In a short record a bubble's own motion fits either; all measurements together have to, too.
+    """
+
+    def log_evidence_of(*exchanged: Accelerometer) -> float:
+        others = {s.name: s for s in (*sensors, *exchanged)}
+        return log_evidence(_with(problem, list(others.values())))
+
     for i, one in enumerate(sensors):
         for two in sensors[i + 1 :]:
             if CARRIAGE in (one.camera, two.camera) or one.camera == two.camera:
                 continue
-            if _lead_of_exchange(problem, images, one, two, read) > CLEAR_LOG_RATIO:
+            new_one = replace(one, camera=two.camera, axes=two.axes)
+            new_two = replace(two, camera=one.camera, axes=one.axes)
+            if (
+                _fits_exchanged(problem, images, one, two, read)
+                and log_evidence_of(new_one, new_two) >= log_evidence_of()
+            ):
                 names = f"{one.name} and {two.name}"
                 return Finding(
                     "the images of each camera fit the readings of the other camera's sensor",
@@ -736,14 +750,14 @@ def _exchanged(
     return None
 
 
-def _lead_of_exchange(
+def _fits_exchanged(
     problem: SmoothingProblem,
     images: _Images,
     one: Accelerometer,
     two: Accelerometer,
     read: dict[str, tuple[Array, Bools]],
-) -> float:
-    """Return the log-likelihood ratio of exchanged to stated records of two cameras' sensors."""
+) -> bool:
+    """Return whether two cameras' sensors fit clearly better with their records exchanged."""
     known = read[one.name][1] & read[two.name][1]
     readings = np.concatenate([read[one.name][0], read[two.name][0]], 1)
     axes = {one.camera: one.axes, two.camera: two.axes}
@@ -759,14 +773,13 @@ def _lead_of_exchange(
                 weights = np.split(shared_rows(problem, *pair), 2)
                 rows = (w @ directions(problem.cameras[c]) for c, w in zip(pair, weights))
                 seen.append((differences, there, dict(zip(pair, rows))))
-    lead = 0.0
+    fits = []
     for values, there, along in seen:
         fit = Regression.of(values, there & known, readings)
         if fit is not None:
             mounts = [axes[c] @ along.get(c, np.zeros(3)) for c in (one.camera, two.camera)]
-            hypotheses = np.array([np.concatenate(mounts), np.concatenate(mounts[::-1])])
-            lead += float(np.diff(fit.log_ratios(hypotheses))[0])
-    return lead
+            fits.append((fit, np.array([np.concatenate(mounts[::-1]), np.concatenate(mounts)])))
+    return is_clear(lambda shift: sum((f.log_ratios(h, shift) for f, h in fits), np.zeros(2)))
 
 
 def _encoder(

@@ -87,7 +87,8 @@ def shared_motion(
 
     It counts if it is found in fewer than `FALSE_ALARMS` of all right runs, and if it is larger
     than the noise that is stated of a bubble's pixel: standard deviations of places hold what is
-    smaller. A camera whose shake nothing but the bubbles shows is not tested for a shift.
+    smaller. A camera whose shake nothing but the bubbles shows is not tested for a shift, and marks
+    of one whose arm has no sensor not for one at a frequency: the arm may swing like that.
 
     source : "bubbles" or "marks".  drawn : (M, 2, K) its residuals in K draws of a right model.
     own : frames of the solution that count.  pieces : how many times as many the run has.
@@ -102,6 +103,9 @@ def shared_motion(
             if kind == "shift" and camera not in measured:
                 continue
             for one in strongest(scores):
+                swings = source == "marks" and kind == "shift" and one.hz is not None
+                if swings and camera not in problem.arms_with_sensor:
+                    continue
                 if one.chance < least and one.size_px > _stated_px(problem.observations, camera):
                     least, best = one.chance, (one, camera, kind)
     if best is None:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from seeds import first_or_all
 from shake_learning_data import run, true_model
+from sound_runs import drawn as sound_run
 
+import telerig
 from telerig.arrays import Array
 from telerig.estimator.sensors.response import FALSE_ALARMS
 from telerig.estimator.smoothing.graph.draws import Draws
@@ -124,6 +126,11 @@ def test_a_rolled_camera_and_swinging_images_are_named(seed: int) -> None:
         else:
             assert one.camera == problem.cameras[1].name
             assert one.from_s == pytest.approx(problem.t_s[len(problem.t_s) // 2], abs=0.2)
+
+
+def test_the_harmonic_of_a_pump_that_marks_show_is_no_contradiction() -> None:
+    """The prior of the arm's shake is too small at its frequency, and no sensor measures it."""
+    assert telerig.smooth(**sound_run(20582).inputs).verdict["verdict"] == "RESOLVED"
 
 
 def test_a_shift_is_not_tested_where_only_bubbles_show_the_shake() -> None:

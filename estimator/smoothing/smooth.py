@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.errors import LOAD, InputError, need_kind
+from telerig.errors import LOAD, CalibrationError, InputError, need_kind
 from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
 from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
@@ -439,14 +439,20 @@ def _with_held_scale(problem: SmoothingProblem, model: ShakeModel) -> SmoothingP
 
 
 def _log_evidence(problem: SmoothingProblem) -> float:
-    """Return the log marginal likelihood of the middle of a run by the default hyper-parameters."""
+    """Return the log marginal likelihood of the middle of a run by the default hyper-parameters.
+
+    It is -inf if there is no solution: sensors that are wrong may not let one converge.
+    """
     first = max((len(problem.t_s) - _MOST_COMPARED) // 2, 0)
     part = cut_out(problem, first, first + _MOST_COMPARED, most_bubbles=_BUBBLES_COMPARED).problem
     near = (near_frames(s, part.t_s) for s in part.accelerometers)
     sensors = tuple(s for s in near if len(s.t_s) > 1)
     part = replace(part, accelerometers=thinned(sensors, _COARSE_STEP_S))
     options = Options(covariances=False, robust=False)
-    return solve(part, default_model(part), options).log_evidence
+    try:
+        return solve(part, default_model(part), options).log_evidence
+    except CalibrationError:
+        return -np.inf
 
 
 def _smoothing_words(problem: SmoothingProblem) -> str:

@@ -737,7 +737,7 @@ def _exchanged(
             new_two = replace(two, camera=one.camera, axes=one.axes)
             if (
                 _fits_exchanged(problem, images, one, two, read)
-                and log_evidence_of(new_one, new_two) >= log_evidence_of()
+                and log_evidence_of(new_one, new_two) > log_evidence_of()
             ):
                 names = f"{one.name} and {two.name}"
                 return Finding(

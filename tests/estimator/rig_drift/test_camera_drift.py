@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -410,14 +412,15 @@ def test_a_long_run_is_collected_in_bounded_memory(monkeypatch: pytest.MonkeyPat
 
 
 def test_smoothing_refuses_the_calibration_of_fewer_cameras() -> None:
-    from telerig.estimator.smoothing.results_folder import _check_cameras
+    from telerig.estimator.smoothing.results_folder import _check_tracks
 
-    known = calibration(rig())
+    known, file = calibration(rig()), Path("tracks.csv")
+    run: Any = SimpleNamespace(name="rise", path=Path("runs") / "rise")
     tracks = SimpleNamespace(summary={"image_size_px": {"left": [1, 1], "right": [1, 1]}})
-    _check_cameras(tracks, known)
-    _check_cameras(object(), known)
+    _check_tracks(tracks, file, run, known)
+    _check_tracks(object(), file, run, known)
     with pytest.raises(InputError, match="tracked with cameras left, right, the calibration has"):
-        _check_cameras(tracks, replace(known, cameras=known.cameras[:1]))
+        _check_tracks(tracks, file, run, replace(known, cameras=known.cameras[:1]))
 
 
 def test_refused() -> None:

@@ -11,12 +11,13 @@ priors as such a motion, and it is not tested.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.sensors.response import FALSE_ALARMS
 from telerig.estimator.smoothing.graph.linear import pixel_whiteners, white_noise
 from telerig.estimator.smoothing.graph.solve import Solution
@@ -34,6 +35,8 @@ line in a shake that it follows it leaves the error of the prior, up to six stan
 sound runs."""
 _NEAR = 5
 """Neighbouring frequencies at which draws have the same level, which few show badly."""
+_LEAST_OF_OTHERS = 0.5
+"""Of the least number of bubbles or marks, three that share a motion alike leave two thirds."""
 _LEAST, _ROUNDING = 1e-300, 1e-6
 
 
@@ -42,11 +45,14 @@ class Scores(NamedTuple):
 
     seen, drawn : (F,) of the run, and (F, K) of K draws of a right model.
     full : (F,) their variance if nothing were fitted.
+    shares : function from weights (F,) of the frames to whether all bubbles or marks have a share
+        in the weighted sum of ``seen``.
     """
 
     seen: Array
     drawn: Array
     full: Array
+    shares: Callable[[Array], bool] = lambda weight: True
 
 
 class Shared(NamedTuple):
@@ -137,12 +143,23 @@ def _scores(
     reach = max(problem.cameras[camera].image_size_px) / 2
     for by in _derivatives(seen, reach):
         along = np.einsum("mij,mj->mi", whitener, by)
-        each = (
-            (along * residual).sum(1),
-            np.einsum("mi,mik->mk", along, drawn[mine]),
-            (along**2).sum(1),
+        score = (along * residual).sum(1)
+        of_draws = np.einsum("mi,mik->mk", along, drawn[mine])
+        seen_by, drawn_by, full = (
+            _by_frame(frame, values, len(own)) for values in (score, of_draws, (along**2).sum(1))
         )
-        yield Scores(*(_by_frame(frame, values, len(own)) for values in each))
+        yield Scores(seen_by, drawn_by, full, partial(_is_shared, seen.item, frame, score))
+
+
+def _is_shared(item: Ints, frame: Ints, score: Array, weight: Array) -> bool:
+    """Return whether no bubble or mark alone makes half of the weighted sum of scores (M,).
+
+    A bubble that oscillates has lines of its own, and a mark may be lost: no camera's motion.
+    """
+    each = np.zeros(item.max() + 1, weight.dtype)
+    np.add.at(each, item, score * weight[frame])
+    whole = each.sum()
+    return bool((np.abs(whole - each) >= _LEAST_OF_OTHERS * np.abs(whole)).all())
 
 
 def _derivatives(obs: Observations, reach_px: float) -> Array:
@@ -203,9 +220,7 @@ def strongest(scores: Scores) -> Iterator[Found]:
     step = along @ seen
     sigmas = np.abs(step) / np.sqrt(variance * correlated)
     chance = 2 * len(start) * student.sf(sigmas, 2 * draws * _NEAR)
-    left = np.flatnonzero(share >= _LEAST_OF_STEP)
-    if len(left):
-        i = left[chance[left].argmin()]
+    for i in _least_probable(chance, share >= _LEAST_OF_STEP, lambda i: scores.shares(along[i])):
         size = abs(float(step[i] / variance[i]))
         yield Found(int(start[i]), None, size, float(sigmas[i]), float(chance[i]))
 
@@ -214,11 +229,22 @@ def strongest(scores: Scores) -> Iterator[Found]:
     sigmas = np.sqrt(power / level / correlated)
     chance = len(power) * fisher.sf(sigmas**2, 2, 2 * draws * _NEAR)
     slow = np.arange(len(level)) + 1 < _LEAST_CYCLES
-    left = np.flatnonzero((level / total >= _LEAST_OF_LINE) & ~slow)
-    if len(left):
-        i = left[chance[left].argmin()]
+    turn = -2j * np.pi * np.arange(frames) / frames
+    left = (level / total >= _LEAST_OF_LINE) & ~slow
+    for i in _least_probable(chance, left, lambda i: scores.shares(np.exp((1 + i) * turn))):
         size = 2 * float(np.sqrt(power[i]) / level[i])
-        yield Found(0, (1 + float(i)) / frames, size, float(sigmas[i]), float(chance[i]))
+        yield Found(0, (1 + i) / frames, size, float(sigmas[i]), float(chance[i]))
+
+
+def _least_probable(chance: Array, left: Bools, shared: Callable[[int], bool]) -> Iterator[int]:
+    """Yield the index of the least chance (n,) of those that are left (n,), if there is one.
+
+    What counts as found has to be shared, too.
+    """
+    for i in np.flatnonzero(left)[np.argsort(chance[left], kind="stable")].tolist():
+        if chance[i] >= FALSE_ALARMS or shared(i):
+            yield i
+            return
 
 
 def _variance(along: Array, drawn: Array, full: Array) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from telerig.estimator.sensors.response import FALSE_ALARMS
 from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.solve import drawn, solve
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
+from telerig.estimator.smoothing.verdict import shared
 from telerig.estimator.smoothing.verdict.contradiction import contradictions
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span
 from telerig.estimator.smoothing.verdict.shared import Scores, strongest
@@ -102,10 +103,14 @@ def rolled(problem: SmoothingProblem) -> SmoothingProblem:
     return problem
 
 
-def swinging(problem: SmoothingProblem) -> SmoothingProblem:
-    """The bubbles of the second camera swing by 3 px at 9 Hz."""
+def swinging(
+    problem: SmoothingProblem, px: float = 3.0, hz: float = 9.0, item: int | None = None
+) -> SmoothingProblem:
+    """The bubbles of the second camera swing, or one of them."""
     seen = problem.observations
-    swing = 3 * np.sin(2 * np.pi * 9 * problem.t_s[seen.frame])
+    swing = px * np.sin(2 * np.pi * hz * problem.t_s[seen.frame])
+    if item is not None:
+        swing = swing * (seen.item == item)
     return with_right_pixels(problem, "observations", seen.uv_px + swing[:, None])
 
 
@@ -126,6 +131,16 @@ def test_a_rolled_camera_and_swinging_images_are_named(seed: int) -> None:
         else:
             assert one.camera == problem.cameras[1].name
             assert one.from_s == pytest.approx(problem.t_s[len(problem.t_s) // 2], abs=0.2)
+
+
+def test_a_line_of_one_bubble_is_no_motion_of_its_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = swinging(
+        run(np.random.default_rng(0), bubbles=5, marks=4)[0], px=1.0, hz=40.0, item=0
+    )
+    solution = solve(problem, true_model())
+    assert not Evidence.of(solution, drawn(solution)).shared
+    monkeypatch.setattr(shared, "_LEAST_OF_OTHERS", 0.0)
+    assert Evidence.of(solution, drawn(solution)).shared
 
 
 def test_the_harmonic_of_a_pump_that_marks_show_is_no_contradiction() -> None:

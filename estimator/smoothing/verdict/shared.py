@@ -36,7 +36,7 @@ sound runs."""
 _NEAR = 5
 """Neighbouring frequencies at which draws have the same level, which few show badly."""
 _LEAST_OF_OTHERS = 0.5
-"""Of the least number of bubbles or marks, three that share a motion alike leave two thirds."""
+"""Without one bubble or mark at least this share of what is expected of the others is left."""
 _LEAST, _ROUNDING = 1e-300, 1e-6
 
 
@@ -145,21 +145,27 @@ def _scores(
         along = np.einsum("mij,mj->mi", whitener, by)
         score = (along * residual).sum(1)
         of_draws = np.einsum("mi,mik->mk", along, drawn[mine])
+        squares = (along**2).sum(1)
         seen_by, drawn_by, full = (
-            _by_frame(frame, values, len(own)) for values in (score, of_draws, (along**2).sum(1))
+            _by_frame(frame, values, len(own)) for values in (score, of_draws, squares)
         )
-        yield Scores(seen_by, drawn_by, full, partial(_is_shared, seen.item, frame, score))
+        shares = partial(_is_shared, seen.item, frame, score, squares)
+        yield Scores(seen_by, drawn_by, full, shares)
 
 
-def _is_shared(item: Ints, frame: Ints, score: Array, weight: Array) -> bool:
-    """Return whether no bubble or mark alone makes half of the weighted sum of scores (M,).
+def _is_shared(item: Ints, frame: Ints, score: Array, squares: Array, weight: Array) -> bool:
+    """Return whether a motion is that of the others, too, without any one bubble or mark.
 
     A bubble that oscillates has lines of its own, and a mark may be lost: no camera's motion.
+
+    score, squares : (M,) of each sighting, and its variance. Of a motion that all share the
+        weighted sum of scores is as the sum of these.
     """
     each = np.zeros(item.max() + 1, weight.dtype)
     np.add.at(each, item, score * weight[frame])
-    whole = each.sum()
-    return bool((np.abs(whole - each) >= _LEAST_OF_OTHERS * np.abs(whole)).all())
+    part = np.bincount(item, squares * np.abs(weight[frame]) ** 2)
+    expected = np.abs(each.sum()) * (1 - part / part.sum().clip(_LEAST))
+    return bool((np.abs(each.sum() - each) >= _LEAST_OF_OTHERS * expected).all())
 
 
 def _derivatives(obs: Observations, reach_px: float) -> Array:

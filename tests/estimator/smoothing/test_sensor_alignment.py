@@ -11,6 +11,7 @@ import pytest
 from shake_runs import run_of
 from sound_runs import drawn
 
+import telerig
 from telerig.estimator.sensors.findings import Finding
 from telerig.estimator.smoothing.problem.problem import Accelerometer
 from telerig.estimator.smoothing.smooth import _log_evidence, problem_of, with_sensors_aligned
@@ -189,6 +190,11 @@ def test_a_sound_run_of_an_unusual_rig_is_no_fault(number: int) -> None:
     the frames' times fit as well, and which the other arm's sensor fits better beside a bubble."""
     problem, _, _, known = problem_of(**drawn(number).inputs)
     assert all(f.code is None for f in with_sensors_aligned(problem, known)[1])
+
+
+def test_the_harmonic_of_a_pump_that_marks_show_is_no_contradiction() -> None:
+    """The prior of the arm's shake is too small at its frequency, and no sensor measures it."""
+    assert telerig.smooth(**drawn(20582).inputs).verdict["verdict"] == "RESOLVED"
 
 
 def test_a_sensor_without_a_sample_in_the_middle_of_a_run_is_left_out_of_its_likelihood() -> None:

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from seeds import first_or_all
 from shake_learning_data import run, true_model
-from sound_runs import drawn as sound_run
 
-import telerig
 from telerig.arrays import Array
 from telerig.estimator.sensors.response import FALSE_ALARMS
 from telerig.estimator.smoothing.graph.draws import Draws
@@ -141,11 +139,6 @@ def test_a_line_of_one_bubble_is_no_motion_of_its_camera(monkeypatch: pytest.Mon
     assert not Evidence.of(solution, drawn(solution)).shared
     monkeypatch.setattr(shared, "_LEAST_OF_OTHERS", 0.0)
     assert Evidence.of(solution, drawn(solution)).shared
-
-
-def test_the_harmonic_of_a_pump_that_marks_show_is_no_contradiction() -> None:
-    """The prior of the arm's shake is too small at its frequency, and no sensor measures it."""
-    assert telerig.smooth(**sound_run(20582).inputs).verdict["verdict"] == "RESOLVED"
 
 
 def test_a_shift_is_not_tested_where_only_bubbles_show_the_shake() -> None:

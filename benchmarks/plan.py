@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ from telerig.io.simulation.config import RunConfig
 from telerig.io.simulation.presets import run_preset
 
 SENSORS = {"marks": (4, ()), "arms": (0, ("left", "right")), "both": (4, ("left", "right"))}
-SCENARIOS = {"S2": 250, "S1": 375, "S0": 59}
+SCENARIOS = {"S2": (250,), "S1": (375,), "S0": (59,), "S6": (250, 750)}
+"""Numbers of frames. S6 has accelerometers alone, over four and over twelve periods of shake."""
 
 
 def config_of(name: str, sensors: str, frames: int) -> RunConfig:
@@ -76,10 +78,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     lines = []
-    for name, frames in SCENARIOS.items():
-        if options.only not in (None, name):
-            continue
-        for sensors in SENSORS:
+    for name in [options.only] if options.only else SCENARIOS:
+        for frames, sensors in product(SCENARIOS[name], ["arms"] if name == "S6" else SENSORS):
             config = config_of(name, sensors, frames)
             runs, refused = [], 0
             for seed in range(options.seeds):
@@ -98,7 +98,7 @@ def main() -> None:
             verdicts = [run[2] for run in runs], [run[3] for run in runs]
             same = f"{verdicts[0][0]}; {verdicts[1].count(verdicts[0][0])} of {len(runs)}"
             same += f", {refused} refused" if refused else ""
-            lines.append(f"| {name} | {sensors} | " + " | ".join(cells) + f" | {same} |")
+            lines.append(f"| {name} | {frames} | {sensors} | " + " | ".join(cells) + f" | {same} |")
             print(lines[-1], flush=True)
     text = f"""# What `telerig plan` expects, and what runs reach
 
@@ -106,8 +106,8 @@ Printed by `benchmarks/plan.py`: expected standard deviation / RMS error of {opt
 simulated runs (root mean square over frames and runs, without the first and last tenth) = their
 ratio. Position µm, velocity mm/s. Last: the expected verdict, and how many runs got it.
 
-| scenario | sensors | x | y | z | vx | vy | vz | verdict |
-|---|---|---|---|---|---|---|---|---|
+| scenario | frames | sensors | x | y | z | vx | vy | vz | verdict |
+|---|---|---|---|---|---|---|---|---|---|
 {chr(10).join(lines)}
 """
     if options.out:

@@ -1,7 +1,7 @@
 """A long run is smoothed in pieces: which frames each is solved with, and what they share.
 
-Each piece is solved with more frames on both sides, which are not taken from its solution: twice
-as long as the slowest process remembers. What is constant along the run (biases, delays and
+Each piece is solved with more frames on both sides, which are not taken from its solution: 1.5
+times as long as the slowest process remembers. What is constant along the run (biases, delays and
 scales of sensors, the encoder's scale, the calibration, marks) is known to a piece from all others:
 a first round, of pieces without margins, collects the information of each on them
 (docs/decisions/032). A run that fits into one piece is solved as it is.
@@ -32,11 +32,11 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.estimator.smoothing.problem.window import Window, all_of
 
-MOST_ROWS, MOST_FRAMES = 90_000, 12_000
+MOST_ROWS, MOST_FRAMES = 60_000, 12_000
 """Frames of all bubbles together, and frames, that are solved in one piece."""
-_ROWS, _FRAMES = 60_000, 10_000
-"""Of a piece of a run that has more."""
-_DECAY_TIMES = 2.0
+_ROWS, _FRAMES = 32_000, 10_000
+"""Of a piece of a run that has more. With the margins of 20 bubbles it takes less than 1 GB."""
+_DECAY_TIMES = 1.5
 _CONSTANT = 1e-6
 Sizes = dict[ConstantFamily, tuple[int, int]]
 _FAMILIES: tuple[ConstantFamily, ...] = ("sensors", "constants", "marks", "clocks")
@@ -139,9 +139,10 @@ def solved_pieces(
     constants : the run's information about them; None where there are none.
     chosen : which pieces; None for all.
     """
-    for number in range(len(pieces)) if chosen is None else chosen:
+    numbers = range(len(pieces)) if chosen is None else chosen
+    for done, number in enumerate(numbers):
         piece = pieces[number]
-        progress(f"piece {number + 1} of {len(pieces)}", number / len(pieces))
+        progress(f"piece {done + 1} of {len(numbers)}", done / len(numbers))
         window = piece.cut(problem)
         known = (
             replace(window.problem, known=())

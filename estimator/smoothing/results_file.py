@@ -89,15 +89,19 @@ class ResultsFile:
         self.file.attrs["inflation"] = tuple(inflation)
         self.file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"
 
-    def widen(self, inflation: Sequence[float]) -> None:
-        """Multiply the standard deviations of the tables by factors (3,) along each axis."""
-        for name in TABLES:
-            table = self.file.get(name, {})
-            for column, data in table.items():
-                factor = _factor(column, inflation) if column[1:] in table else 1.0
-                for first in range(0, len(data) * (factor != 1), _ROWS_AT_ONCE):
-                    mine = slice(first, first + _ROWS_AT_ONCE)
-                    data[mine] = data[mine] * factor
+    def append_piece(self, piece: h5py.File, inflation: Sequence[float]) -> None:
+        """Append what another such file holds, its tables' standard deviations multiplied by
+        factors (3,) along each axis."""
+        for name in (*TABLES, "bodies", "states"):
+            group = piece.get(name, {})
+            if name in piece and name not in self.file:
+                self.file.create_group(name, track_order=True)
+            for column, data in group.items():
+                widened = name in TABLES and column[1:] in group
+                factor = _factor(column, inflation) if widened else 1.0
+                if not (column.endswith("_rows") and f"{name}/{column}" in self.file):
+                    self._add(f"{name}/{column}", data[()] * factor if factor != 1 else data[()])
+        self.rows += list(map(int, piece.attrs["rows_of_pieces"]))
 
 
 def _factor(column: str, inflation: Sequence[float]) -> float:

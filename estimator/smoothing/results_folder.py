@@ -16,12 +16,14 @@ from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import of_run
 from telerig.estimator.smoothing.results_file import StoredTables
 from telerig.estimator.smoothing.smooth import smooth
+from telerig.estimator.smoothing.unfinished import UnfinishedPieces
 from telerig.estimator.tracking.tracks import StoredTracks, Tracks, open_track_table, open_tracks
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import reading, replaced_results
 from telerig.io.results.record import RunFile, run_record
 from telerig.io.results.stale import stale
+from telerig.io.results.work_folder import work_key
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -76,10 +78,13 @@ def smooth_run(
         *([] if options.refine_rig else _moved(followed)),
     ]
     again = again or f"telerig smooth {shlex.quote(str(run.path))}"
+    kept = UnfinishedPieces(
+        folder.parent / f".{folder.name}.smoothing", work_key(options.record(), fingerprint)
+    )
     with replaced_results(folder, "smooth", again=again, inputs=fingerprint) as staged:
         found = smooth(
             followed, calibration, stage=run, progress=stage or False, folder=staged,
-            **options.keywords,
+            unfinished=kept, **options.keywords,
         )  # fmt: skip
         found = replace(
             found, summary={**found.summary, "warnings": [*warnings, *found.summary["warnings"]]}
@@ -92,6 +97,7 @@ def smooth_run(
         write_json_atomic(staged / "run.json", record)
         if report:
             _report(staged, folder, source.parent)
+    kept.end()
     if isinstance(found.tables, StoredTables):
         found = replace(found, tables=StoredTables(folder))
     return found

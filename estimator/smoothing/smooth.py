@@ -79,6 +79,7 @@ from telerig.estimator.smoothing.result import (
 )
 from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.results_file import StoredTables, Tables, results_file
+from telerig.estimator.smoothing.unfinished import Notes, UnfinishedPieces
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
 from telerig.factors.bubble_motion import INERTIA_S, Inertia
 from telerig.io.results.calibration_words import NO_COVARIANCE
@@ -123,6 +124,7 @@ def smooth(
     refine_rig: bool | DriftPrior = False,
     accept: Iterable[str] = (),
     folder: Path | None = None,
+    unfinished: UnfinishedPieces | None = None,
 ) -> Smoothing:
     """Smooth a run: estimate every bubble's motion in the laboratory frame and every camera's
     shake.
@@ -169,8 +171,10 @@ def smooth(
         ENCODER_JUMP, ENCODER_CLOCK, STAGE_AXIS, CAMERA_SCALE, FRAME_TIMES, RISE_SPEED.
     folder : an existing folder for results.h5 of a run that is too long for memory; None for a
         temporary one, which lasts as long as what is returned.
+    unfinished : where the finished pieces of such a run are kept, so that an interrupted call with
+        the same arguments goes on; None for a temporary folder.
 
-    A run of more than 12,000 frames, or of more than 90,000 of all bubbles together, is smoothed
+    A run of more than 12,000 frames, or of more than 60,000 of all bubbles together, is smoothed
     in pieces; its tables are read from results.h5 when they are asked for.
 
     Returns a `Smoothing`: the table ``trajectories`` (t_s, x_mm, vx_mm_s, their standard deviations
@@ -215,7 +219,11 @@ def smooth(
         done = run.smoothed()
     else:
         keep = None if folder else TemporaryDirectory(prefix="telerig-")
-        done = run.in_pieces(pieces, StoredTables(folder or Path(keep.name if keep else ""), keep))
+        place = folder or Path(keep.name if keep else "")
+        kept = unfinished or UnfinishedPieces(place / ".pieces")
+        done = run.in_pieces(pieces, StoredTables(place, keep), kept)
+        if unfinished is None:
+            kept.end()
     from telerig.estimator.smoothing.verdict.contradiction import sample_warnings, speed_warnings
 
     verdict, evidence, solution = done.verdict, done.evidence, done.solution
@@ -326,18 +334,21 @@ class _Run:
             problem.cameras, Lasting.of(_shapes_of(self.tracks)),
         )  # fmt: skip
 
-    def in_pieces(self, pieces: Sequence[Piece], tables: StoredTables) -> _Done:
+    def in_pieces(
+        self, pieces: Sequence[Piece], tables: StoredTables, kept: UnfinishedPieces
+    ) -> _Done:
         """Smooth it piece by piece, each of which is written as it comes.
 
         Hyper-parameters that are not given are set by the piece in the middle, which is solved
-        again at the end for what the verdict takes from the middle of a run. If far more is seen in
-        another piece, it takes the place of that in the middle.
+        last: the verdict takes from its solution what does not add up over pieces. If far more is
+        seen in another piece, it takes the place of that in the middle.
+
+        kept : other pieces that an interrupted call has finished are not solved again.
         """
         from telerig.estimator.smoothing.verdict.judge import judge
 
-        problem, model, parts = self.problem, self.model, list[Evidence]()
-        sensors = dict[str, Any]()
-        swarm = None
+        problem, model = self.problem, self.model
+        kept.begin()
         with self.phases.phase("smoothing", _smoothing_words(problem)) as step:
             middle = piece_with_most(problem, pieces)
             step("a piece in the middle", 0.0)
@@ -346,33 +357,40 @@ class _Run:
                 given=self.given,
             ).graph.model  # fmt: skip
             step("what is constant along the run", 0.0)
-            constants = Constants.of(problem, model, pieces, self.options, step)
+            constants = kept.constants(problem, pieces)
+            if constants is None:
+                constants = Constants.of(problem, model, pieces, self.options, step)
+                if constants is not None:
+                    kept.keep_constants(constants)
+            swarm, rest = None, [n for n in kept.missing(pieces) if n != middle]
+            for piece, window, solution in solved_pieces(
+                problem, model, pieces, self.options, step, constants, [*rest, middle]
+            ):
+                solution = with_hyperparameter_uncertainty(solution)
+                span = Span(piece.own, piece.low, problem.t_s)
+                evidence = Evidence.of(solution, drawn(solution), span)
+                paths, offsets = self._tables(piece, window, solution, span)
+                bodies = self._bodies(frames_between(self.tracks, piece.first, piece.end))
+                last = piece == pieces[middle]
+                if last:
+                    swarm = self._swarm(solution, paths, bodies, span)
+                kept.keep(
+                    piece, Notes(evidence, sensors_of(solution)), (paths, offsets),
+                    states_of(solution, span), _beside(paths, bodies),
+                )  # fmt: skip
+                del paths, offsets, bodies
+                if not last:
+                    del window, solution
+        with self.phases.phase("verdict", "judging the result"):
+            notes = [kept.notes(piece) for piece in pieces]
+            evidence = evidence_of([one.evidence for one in notes])
+            verdict = judge(window.problem, model, solution, evidence)
+        with self.phases.phase("tables", "writing the tables"):
+            inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
             with results_file(tables.folder) as file:
-                for piece, window, solution in solved_pieces(
-                    problem, model, pieces, self.options, step, constants
-                ):
-                    solution = with_hyperparameter_uncertainty(solution)
-                    span = Span(piece.own, piece.low, problem.t_s)
-                    parts.append(Evidence.of(solution, drawn(solution), span))
-                    sensors |= sensors_of(solution)
-                    paths, offsets = self._tables(piece, window, solution, span)
-                    bodies = self._bodies(frames_between(self.tracks, piece.first, piece.end))
-                    file.append(paths, offsets, states_of(solution, span), _beside(paths, bodies))
-                    if piece == pieces[middle]:
-                        swarm = self._swarm(solution, paths, bodies, span)
-                    del window, solution, paths, offsets, bodies
-                with self.phases.phase("verdict", "judging the result"):
-                    evidence = evidence_of(parts)
-                    _, window, solution = next(
-                        solved_pieces(
-                            problem, model, pieces, self.options, _silent, constants, [middle]
-                        )
-                    )
-                    solution = with_hyperparameter_uncertainty(solution)
-                    verdict = judge(window.problem, model, solution, evidence)
-                inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
-                file.widen(inflation)
+                kept.append_to(file, pieces, inflation)
                 file.finish(inflation)
+        sensors = {name: found for one in notes for name, found in one.sensors.items()}
         solution = replace(solution, draws=None)
         return _Done(verdict, evidence, solution, tables, swarm, sensors)
 

@@ -7,10 +7,7 @@ run goes on where it stopped.
 from __future__ import annotations
 
 import hashlib
-import json
-import os
 import pickle
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field
@@ -23,7 +20,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig import version
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background.from_run import (
@@ -36,11 +32,11 @@ from telerig.estimator.bubbles.field import described_field
 from telerig.estimator.bubbles.outline.blobs import Rejected
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
-from telerig.io.files.atomic import atomic_path, write_json_atomic
+from telerig.io.files.atomic import atomic_path
 from telerig.io.files.csv_table import write_table
-from telerig.io.files.hashing import hashed
 from telerig.io.machine.parallel import cores, keep_freed_memory, ordered_map, quick_workers
 from telerig.io.results.inputs import Source, fingerprints
+from telerig.io.results.work_folder import empty_unless, work_key
 from telerig.live import due, publish
 from telerig.rig.camera import Camera
 
@@ -197,11 +193,7 @@ class DetectionStore:
         self.folder, self.frame_count = folder, frame_count
         size = int(np.clip(frame_count // _BATCHES, _LEAST_BATCH, _LARGEST_BATCH))
         self.batches = list(pairwise([*range(0, frame_count, size), frame_count]))
-        state = {"fingerprint": fingerprint}
-        mark = folder / "work.json"
-        if not (mark.is_file() and json.loads(mark.read_bytes()) == state):
-            shutil.rmtree(folder, ignore_errors=True)
-            write_json_atomic(mark, state)
+        empty_unless(folder, fingerprint)
 
     def path(self, batch: Batch, kind: str = "detections") -> Path:
         """Return the file of a batch of frames."""
@@ -318,16 +310,7 @@ def fingerprint(run: RunData, options: dict[str, Any]) -> str:
             *sorted(p for p in tables if CORRECTIONS not in p.name),
         ],
     )
-    stated = [version.VERSION, options, {k: v.model_dump() for k, v in recorded.items()}]
-    found = hashlib.sha256(json.dumps(stated, default=str).encode())
-    for file in sorted(_program_files()):
-        found.update(hashed(file).sha256.encode())
-    return found.hexdigest()
-
-
-def _program_files() -> Iterator[Path]:
-    for folder, _, names in os.walk(Path(version.__file__).parent, followlinks=True):
-        yield from (Path(folder) / name for name in names if name.endswith(".py"))
+    return work_key(options, recorded)
 
 
 def detect_missing(

@@ -47,7 +47,7 @@ from telerig.estimator.dots.fit.hearts import (
     with_hearts,
 )
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dot
-from telerig.estimator.dots.fit.rim import centre_shift
+from telerig.estimator.dots.fit.rim import EdgeErrors, edge_errors
 from telerig.estimator.dots.fit.surroundings import (
     close_neighbours,
     dot_window,
@@ -187,7 +187,8 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     )
     fits, noise = [fit.under_noise(factor) for fit in fits], noise.scaled(factor)
     look = look.with_fits(fits)
-    rough = _roughness(fits)
+    edges = _edge_errors(fits)
+    usual_chi2 = float(np.median([fit.chi2_dof for fit in fits])) if edges else 1.0
     accepted: list[tuple[Any, ...]] = []
     hearts = any(fit.heart is not None for fit in fits)
     for blob, fit, smaller in zip(blobs, fits, too_small_sd(fits)):
@@ -197,7 +198,7 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
         if reason:
             rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
         else:
-            accepted.append(_row(blob, fit, noise, rough))
+            accepted.append(_row(blob, fit, noise, edges, usual_chi2))
     return DotMeasurement(
         pd.DataFrame(accepted, columns=COLUMNS),
         pd.DataFrame(rejected, columns=REJECTED),
@@ -207,25 +208,31 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     )
 
 
-def _row(blob: Candidate, fit: DotFit, noise: NoiseModel, rough: float) -> tuple[Any, ...]:
-    """Return the values of the columns `COLUMNS` of an accepted dot."""
+def _row(
+    blob: Candidate, fit: DotFit, noise: NoiseModel, edges: EdgeErrors | None, usual_chi2: float
+) -> tuple[Any, ...]:
+    """Return the values of the columns `COLUMNS` of an accepted dot.
+
+    usual_chi2 : chi2_dof of the image's dots, of which `edges` tells what it means for centres.
+    """
+    rough, at_edge = edges or (0.0, 1.0)
     blur = float(np.sqrt(max(fit.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0)))
     axes = rough * matrix_from_shape(fit.shape_px)
     edge = axes @ axes
-    (suu, suv), (_, svv) = fit.inflated_covariance_px2 + edge
+    (suu, suv), (_, svv) = at_edge * fit.inflated_covariance_px2(usual_chi2) + edge
     place = (*fit.centre_px, suu, suv, svv, *axes_from_shape(fit.shape_px), fit.chi2_dof)
     levels = (fit.background + fit.contrast, fit.background)
     own = edge[[0, 0, 1], [0, 1, 1]]
     return (*place, *levels, blur, is_ring(blob), noise.sigma_at(fit.background), *own)
 
 
-def _roughness(fits: list[DotFit]) -> float:
-    """Return `centre_shift` of fitted dots."""
+def _edge_errors(fits: list[DotFit]) -> EdgeErrors | None:
+    """Return `edge_errors` of fitted dots."""
     seen = [fit for fit in fits if fit.converged and np.all(np.isfinite(fit.edge_variance))]
     if not seen:
-        return 0.0
+        return None
     names = ("edge", "edge_variance", "centre_px", "shape_px", "sigma_px")
-    return centre_shift(*(np.array([getattr(fit, name) for fit in seen]) for name in names))
+    return edge_errors(*(np.array([getattr(fit, name) for fit in seen]) for name in names))
 
 
 def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel:

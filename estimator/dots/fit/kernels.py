@@ -358,14 +358,15 @@ def descend(
 
 @compiled
 def edge_equations(
-    first: int, shape: Array, offset: Array, jacobian: Array, weight: Array, residual: Array,
+    orders: Ints, shape: Array, offset: Array, jacobian: Array, weight: Array, residual: Array,
     own: Array, mixed: Array, right: Array,
 ) -> None:  # fmt: skip
     """Add up the normal equations of a dot's edge; see `rim.edge_harmonics`.
 
-    first : the lowest harmonic. shape : (3,). offset : (2, P). jacobian, weight, residual : those
-    of the fit. own, mixed, right : (2 K, 2 K), (2 K, N), (2 K,), which must be 0 and are filled:
-    the harmonics' information, the one they share with the parameters, and the gradient.
+    orders : (K,) the harmonics, in ascending order. shape : (3,). offset : (2, P). jacobian,
+    weight, residual : those of the fit. own, mixed, right : (2 K, 2 K), (2 K, N), (2 K,), which
+    must be 0 and are filled: the harmonics' information, the one they share with the parameters,
+    and the gradient.
     """
     m11, m12, m22 = shape[0], shape[1], shape[2]
     row = np.empty(len(right))
@@ -377,16 +378,18 @@ def edge_equations(
             continue
         x, y = x / length, y / length
         out = jacobian[0, p] * (m11 * x + m12 * y) + jacobian[1, p] * (m12 * x + m22 * y)
-        c, s = 1.0, 0.0
-        for _ in range(first):
-            c, s = c * x - s * y, s * x + c * y
-        for k in range(0, len(right), 2):
-            row[k], row[k + 1] = out * c, out * s
-            c, s = c * x - s * y, s * x + c * y
+        c, s, order = 1.0, 0.0, 0
+        for k in range(len(orders)):
+            while order < orders[k]:
+                c, s, order = c * x - s * y, s * x + c * y, order + 1
+            row[2 * k], row[2 * k + 1] = out * c, out * s
         for i in range(len(right)):
             weighted = weight[p] * row[i]
             right[i] += weighted * residual[p]
-            for j in range(len(right)):
+            for j in range(i + 1):
                 own[i, j] += weighted * row[j]
             for j in range(len(jacobian)):
                 mixed[i, j] += weighted * jacobian[j, p]
+    for i in range(len(right)):
+        for j in range(i):
+            own[j, i] = own[i, j]

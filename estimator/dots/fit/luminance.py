@@ -166,11 +166,11 @@ class DotFit:
         step = float(np.linalg.norm(self.centre_px - before.centre_px))
         return bool(step > _MOVED_SD * np.sqrt(np.trace(self.covariance_px2)))
 
-    @property
-    def inflated_covariance_px2(self) -> Array:
-        """The centre's covariance (2, 2), multiplied by chi2_dof if chi2_dof is significantly above
-        1."""
-        return self.covariance_px2 * (self.chi2_dof if self.is_misfit else 1.0)
+    def inflated_covariance_px2(self, usual_chi2: float = 1.0) -> Array:
+        """Return the centre's covariance (2, 2), multiplied by chi2_dof relative to that which is
+        usual, if this is significantly above 1."""
+        ratio = self.chi2_dof / usual_chi2
+        return self.covariance_px2 * (ratio if ratio > self._by_chance else 1.0)
 
     @property
     def is_misfit(self) -> bool:
@@ -329,7 +329,7 @@ class _Fit:
         offset = np.stack([self.x - theta[0], self.y - theta[1]])
         # Pixels left out as outliers count here: they are where an edge is farthest off.
         rows = self.jacobian, 1.0 / self.noise.variance(self.model), self.residual
-        rim = edge_harmonics(*rows, information, theta[2:5], offset) if edges else NO_EDGE
+        rim = edge_harmonics(*rows, information, theta, offset) if edges else NO_EDGE
         heart = None if size == 12 else self.parameters[12:] + np.r_[self.origin, 0.0, 0.0]
         return DotFit(
             theta[:2] + self.origin,

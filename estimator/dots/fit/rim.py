@@ -1,4 +1,4 @@
-"""How far the rough edge of printed dots moves their centres, from the harmonics of the edge.
+"""How far noise and rough printed edges move the centres of dots, from harmonics of their edges.
 
 In the dot's own circle (its ellipse divided by its semi-axes) an edge at the radius
 1 + sum_k a_k cos(k phi) + b_k sin(k phi) has its centre at (a_1, b_1), so the variance of a_1 is
@@ -6,9 +6,16 @@ that of the centre. a_0 to b_2 are parameters of the luminance model and not see
 those of k = 2 show in how the shapes of neighbouring dots differ, and those of k = 3 to 5 in the
 residuals at the edge. ln of their power is continued to k = 1 as a parabola in k, which is exact
 for a Gaussian correlation along the edge, and 9 % low where power is (1 + k^2)^-1.5.
+
+Noise is in all harmonics alike, in units of their variance, and roughness is gone from the short
+ones, because the lens blurs them: those tell what noise is at the edge, whatever the fit leaves
+elsewhere. The noise of a compression is not that of flat areas, and light around a dot or a curved
+response of the camera raise chi-square but move no centre.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,19 +23,24 @@ from telerig.arrays import Array
 from telerig.estimator.dots.fit.blurred_ellipse import matrix_from_shape, semi_axes
 from telerig.estimator.dots.fit.kernels import edge_equations
 
-HARMONICS = (3, 4, 5)
-NO_EDGE = np.zeros(2 * len(HARMONICS)), np.full(2 * len(HARMONICS), np.inf)
+HARMONICS, NOISE_HARMONICS = (3, 4, 5), 3
+"""The harmonics that show roughness, and how many higher ones show the noise at the edge."""
+NOISE_WAVE, LEAST_BLUR_PX = 2.0, 0.8
+"""The harmonics of the noise are those near R / sigma times `NOISE_WAVE`: the blur sigma takes
+98 % of their power in an edge away. Half of the wave is more than a pixel long."""
+_ROWS = 2 * (len(HARMONICS) + NOISE_HARMONICS)
+NO_EDGE = np.zeros(_ROWS), np.full(_ROWS, np.inf)
 """Harmonics of an edge of which nothing is known, with their variances."""
 FEWEST_DOTS = 8
 """Fewer dots do not tell how their edges are."""
 SIGNIFICANT_SD = 4.0
-"""The median power at the edges counts as roughness if it is so far above that of noise."""
+"""Power is more than that of noise, and noise is not as expected, if it is so far off."""
 DOTS_PER_TERM = 4
 """The shapes' trend has terms up to the third degree (perspective and distortion), if so many dots
 are there for each of them; else fewer."""
-CURVATURE_SD = 0.5
-"""Prior standard deviation of the second difference of ln power by k: it is -0.64 for a Gaussian
-correlation along 0.8 rad of the edge, 0.24 where power is (1 + k^2)^-1.5."""
+CURVATURE, CURVATURE_SD = -0.2, 0.45
+"""Prior of the second difference of ln power by k: it is -0.64 for a Gaussian correlation along
+0.8 rad of the edge, 0.24 where power is (1 + k^2)^-1.5."""
 SLOPE_SD = 10.0
 PARABOLA_SD = 0.05
 """By so much ln power differs from a parabola, relative to its noise."""
@@ -38,75 +50,100 @@ CLIPPED = 4.0
 """The power of one dot counts as at most so many times the mean: some edges have a nick."""
 
 
+class EdgeErrors(NamedTuple):
+    """What moves the centres of an image's dots.
+
+    rough : standard deviation of what their rough edges do, relative to the semi-axes.
+    noise : the variance of the noise at their edges, relative to what the fits took it for.
+    """
+
+    rough: float
+    noise: float
+
+
 def edge_harmonics(
     jacobian: Array,
     weight: Array,
     residual: Array,
     information: Array,
-    shape_px: Array,
+    theta: Array,
     offset_px: Array,
 ) -> tuple[Array, Array]:
     """Return the harmonics of one dot's edge in its residuals, relative to its semi-axes.
 
     jacobian : (N, P) derivatives of the grey levels by the parameters of the fit, at its minimum.
     weight, residual : (P,). information : (N, N) of the fit.
-    shape_px : (3,). offset_px : (2, P) pixels less the centre.
+    theta : (6,) centre, shape and blur. offset_px : (2, P) pixels less the centre.
 
     Returns the coefficients (2 K,) cos 3 phi, sin 3 phi, cos 4 phi ... and their variances (2 K,),
-    infinite where too few pixels are seen.
+    infinite where too few pixels are seen. The last `NOISE_HARMONICS` are those of the noise.
     """
     if np.count_nonzero(weight) <= len(information):
         return NO_EDGE
-    count = 2 * len(HARMONICS)
     own, mixed, right = (
-        np.zeros((count, count)),
-        np.zeros((count, len(information))),
-        np.zeros(count),
+        np.zeros((_ROWS, _ROWS)),
+        np.zeros((_ROWS, len(information))),
+        np.zeros(_ROWS),
     )
-    edge_equations(HARMONICS[0], shape_px, offset_px, jacobian, weight, residual, own, mixed, right)
+    radius = float(np.prod(semi_axes(theta[2:5]))) ** 0.5
+    middle = round(NOISE_WAVE * radius / max(float(theta[5]), LEAST_BLUR_PX))
+    first = max(middle - NOISE_HARMONICS // 2, HARMONICS[-1] + 1)
+    orders = np.array([*HARMONICS, *range(first, first + NOISE_HARMONICS)])
+    edge_equations(orders, theta[2:5], offset_px, jacobian, weight, residual, own, mixed, right)
     own -= mixed @ np.linalg.solve(information, mixed.T)
     try:
         covariance = np.linalg.inv(own)
     except np.linalg.LinAlgError:
         return NO_EDGE
-    return covariance @ right, np.diag(covariance).copy()
+    variance = np.diag(covariance).copy()
+    return (covariance @ right, variance) if variance.min() > 0.0 else NO_EDGE
 
 
-def centre_shift(
+def edge_errors(
     edge: Array, variance: Array, centre_px: Array, shape_px: Array, sigma_px: Array
-) -> float:
-    """Return the standard deviation by which their edges move the centres of an image's dots.
+) -> EdgeErrors | None:
+    """Return what the edges of an image's dots and the noise there do to their centres.
 
-    It is relative to the semi-axes, and 0 if the edges are not significantly rough or if there are
-    fewer than `FEWEST_DOTS` dots.
+    The harmonics' power in units of their variance is that of the noise, as long as the lower
+    harmonics do not have significantly more than the higher ones: then the edges are rough, and the
+    noise is what the higher ones have. Fewer than `FEWEST_DOTS` dots tell nothing (None).
 
     edge, variance : (N, 2 K) as `edge_harmonics` returns them; finite.
     centre_px, shape_px, sigma_px : (N, 2), (N, 3), (N,) of the N dots.
     """
     if len(edge) < FEWEST_DOTS:
-        return 0.0
-    power = np.median(np.mean(edge**2 / variance, -1))
-    if power < 1.0 + SIGNIFICANT_SD * np.sqrt(2.0 / edge.size):
-        return 0.0
+        return None
+    count = len(HARMONICS)
+    power = _mean_power(np.mean((edge**2 / variance).reshape(len(edge), -1, 2), -1))
+    low, high = float(power[:count].mean()), float(power[count:].mean())
+    by_chance = SIGNIFICANT_SD / np.sqrt(count * len(edge))
+    rough = low > high * (1.0 + np.sqrt(2.0) * by_chance)
+    noise = high if rough else low
+    noise = noise if abs(noise - 1.0) > by_chance else 1.0
+    if not rough:
+        return EdgeErrors(0.0, noise)
     # Blur along the edge takes part of the higher harmonics away.
     blur = sigma_px / np.prod(semi_axes(shape_px), 0) ** 0.5
     shown = np.exp(-0.5 * np.square(np.multiply.outer(blur, HARMONICS)))
-    third = edge.reshape(len(edge), -1, 2) / shown[..., None]
-    noise = np.median(variance.reshape(third.shape).mean(-1) / shown**2, 0)
+    third = edge[:, : 2 * count].reshape(len(edge), -1, 2) / shown[..., None]
+    own = variance[:, : 2 * count].reshape(third.shape).mean(-1) / shown**2
+    own = noise * np.median(own, 0)
     harmonics = np.concatenate([_second_harmonic(centre_px, shape_px)[:, None], third], 1)
     whole = _mean_power(np.mean(harmonics**2, -1))
-    excess = whole - np.concatenate([noise[:1], noise])
+    excess = whole - np.concatenate([own[:1], own])
     good = excess > LEAST_SHARE * whole
     if not good[0]:
-        return 0.0
+        return EdgeErrors(0.0, noise)
     steps = 1.0 + np.flatnonzero(good)
     sigma = np.hypot(whole[good] / excess[good] / np.sqrt(len(edge)), PARABOLA_SD)
     parabola = np.stack([np.ones_like(steps), steps, 0.5 * steps * (steps - 1.0)], -1)
     rows = np.concatenate(
         [parabola / sigma[:, None], np.diag([0.0, 1.0 / SLOPE_SD, 1.0 / CURVATURE_SD])]
     )
-    right = np.concatenate([np.log(excess[good]) / sigma, np.zeros(3)])
-    return float(np.exp(0.5 * np.linalg.lstsq(rows, right, rcond=None)[0][0]))
+    prior = np.array([0.0, 0.0, CURVATURE / CURVATURE_SD])
+    right = np.concatenate([np.log(excess[good]) / sigma, prior])
+    rough_sd = float(np.exp(0.5 * np.linalg.lstsq(rows, right, rcond=None)[0][0]))
+    return EdgeErrors(rough_sd, noise)
 
 
 def _mean_power(power: Array) -> Array:

@@ -218,10 +218,10 @@ def test_misfit_widens_the_covariance() -> None:
     rng = np.random.default_rng(4)
     result = fit(picture(shape) + 3.0 * rng.standard_normal((SIZE, SIZE)), shape, 1.0)
     assert result.chi2_dof == pytest.approx(9.0, rel=0.1)
-    widened = np.trace(result.inflated_covariance_px2) / np.trace(result.covariance_px2)
+    widened = np.trace(result.inflated_covariance_px2()) / np.trace(result.covariance_px2)
     assert widened == pytest.approx(result.chi2_dof)
     honest = replace(result, chi2_dof=1.01)
-    np.testing.assert_array_equal(honest.inflated_covariance_px2, honest.covariance_px2)
+    np.testing.assert_array_equal(honest.inflated_covariance_px2(), honest.covariance_px2)
 
 
 def noise_in(image: Array, flat: NDArray[np.bool_], step: float) -> NoiseModel:

@@ -1,6 +1,8 @@
-"""Dots whose printed edges are rough: they are found, and their covariance holds the roughness."""
+"""Dots with rough printed edges, and compressed ones: their covariance is that of their errors."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -81,3 +83,30 @@ def test_the_share_of_the_edges_stands_apart_and_is_small_on_smooth_dots() -> No
     dots = measure_dots(smooth).dots
     assert (dots["edge_suu_px2"] / dots["suu_px2"]).max() < 0.3
     assert 0.7 < nees(dots, centres) < 1.7
+
+
+def compressed(picture: Array) -> Array:
+    return np.asarray(
+        cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 75])[1], 0)
+    )
+
+
+def brightened(picture: Array) -> Array:
+    return np.rint(255.0 * (picture / 255.0) ** 0.45).astype(np.uint8)
+
+
+@pytest.mark.parametrize("spoil", [compressed, brightened])
+@pytest.mark.parametrize("radius_px", [3.5, 6.0])
+def test_chi_square_is_split_into_what_moves_centres_and_what_does_not(
+    spoil: Callable[[Array], Array], radius_px: float
+) -> None:
+    squares, chi2 = [], []
+    for seed in (1, 2, 3):
+        picture, centres = rough_plate(0.0, 0.5, radius_px, seed)
+        dots = measure_dots(spoil(picture)).dots
+        assert len(dots) == 81
+        squares.append(nees(dots, centres))
+        chi2.append(dots["chi2_dof"].median())
+    assert spoil is brightened or np.mean(chi2) > 5.0
+    # 243 pairs of squares scatter by 6 %; taking chi2_dof for the noise gives 0.3 to 0.6.
+    assert 0.75 < np.mean(squares) < 1.4

@@ -5,7 +5,8 @@ disc that is fitted to them lies on the heart, or between the heart and the rim,
 the lens makes. Such a dot is fitted as two discs at once, itself and its heart, so that its
 covariance holds what the heart leaves open. The fit starts at the two steps of grey levels that
 explain most about the disc's middle. Where a sample of an image's dots shows hearts, all are fitted
-with one; elsewhere only those are whose size or residuals are unlike the others'.
+with one, and what the blur hides of a heart follows from what most hearts look like; elsewhere only
+those dots are whose size or residuals are unlike the others'.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from telerig.estimator.dots.fit.luminance import (
     Window,
     fit_dot,
 )
-from telerig.estimator.dots.fit.surroundings import BLUR_SPREAD
+from telerig.estimator.dots.fit.surroundings import BLUR_SPREAD, usual_heart
 from telerig.estimator.dots.thresholds import OTHER_SIZE_SD, RARE, SIZE_SPREAD, SIZES_SPREAD_SD
 from telerig.estimator.images.noise import NoiseModel
 from telerig.statistics import robust_sd
@@ -39,6 +40,8 @@ FEWEST_DOTS = 8
 """Fewer dots do not tell what size they have in common."""
 _SAMPLE, _CLEAR = 12, 4
 """So many dots tell whether an image shows hearts; the first ones do if none of them has one."""
+_SEEN = 2.0 * HEART_PARAMETERS
+"""A heart that gains more than this counts as one, where most dots have one."""
 _LARGEST = 5.0
 """A dot is at most so many times as large as the disc that was fitted to its heart."""
 _QUICK: dict[str, Any] = {"iterations": 10, "tolerance": 0.3, "outlier_rounds": 0}
@@ -81,7 +84,7 @@ def show_hearts(
         pair = _with_heart(dot, fits[dot], reach[dot], noise, prior, window, rough=True)
         if pair is not None:
             gain += _gain(*pair)
-            shown.append(_gain(*pair) > 2.0 * HEART_PARAMETERS and _explains(*pair))
+            shown.append(_gain(*pair) > _SEEN and _explains(*pair))
         if len(shown) == _CLEAR and not any(shown):
             return False
     return bool(
@@ -110,7 +113,7 @@ def with_hearts(
         if found is None:
             return single[dot]
         sure = _gain(*found) > chdtri(HEART_PARAMETERS, RARE) and _explains(*found)
-        likely = usual and _gain(*found) > HEART_PARAMETERS
+        likely = usual and _gain(*found) > _SEEN
         return found[0] if likely or sure else single[dot]
 
     for dot in doubtful:
@@ -121,14 +124,49 @@ def with_hearts(
         return fits
     blur = float(np.median(usual_blurs))
     spread = max(BLUR_SPREAD * blur, float(robust_sd(usual_blurs - blur)))
+    size, size_sd, light, light_sd = usual_heart(fits)
     for dot in doubtful:
         log_radius = _log_radius(fits[dot]) - off[dot]
         prior = replace(priors[dot], edge_px=blur, edge_spread_px=spread)
-        if _unlike(fits[dot], log_radius, prior) > 1.0:
+        if usual and np.isfinite(size_sd):
+            prior = replace(prior, heart_size=size, heart_size_sd=size_sd,
+                            heart_light=light, heart_light_sd=light_sd)  # fmt: skip
+            fits[dot] = _with_usual_heart(dot, fits[dot], log_radius, noise, prior, window)
+        elif _unlike(fits[dot], log_radius, prior) > 1.0:
             fit = again(dot, prior)
             if _unlike(fit, log_radius, prior) < _unlike(fits[dot], log_radius, prior):
                 fits[dot] = fit
     return fits
+
+
+def _with_usual_heart(
+    dot: int, fit: DotFit, log_radius: float, noise: NoiseModel, prior: Prior, window: Windows
+) -> DotFit:
+    """Return the better one of a dot's fit and another one that starts with the size and the heart
+    that are usual, and with the dot's light; a disc is only better if it is by more than chance."""
+    larger = float(np.exp(log_radius - _log_radius(fit)))
+    size, light = fit.heart_look if fit.heart is not None else (0.0, 0.0)
+    whole = (1.0 + light * size**2) / (1.0 + prior.heart_light * prior.heart_size**2) / larger**2
+    before = replace(fit, levels=fit.levels * np.repeat([1.0, whole], 3))
+    heart = np.r_[fit.centre_px, prior.heart_size, prior.heart_light * before.contrast]
+    usual = Start(fit.centre_px, fit.shape_px * larger, prior.edge_px, before, heart)
+    pixels = window(dot, usual)
+    found = [fit_dot(pixels, start, noise, prior, **_FULL) for start in (usual, fit.start)]
+    if min(one.pixels for one in found) < FEWEST_PIXELS:
+        return fit
+    costs = [one.chi2_dof * one.dof + _unlike_heart(one, prior) for one in found]
+    chance = float(chdtri(HEART_PARAMETERS, RARE)) if fit.heart is None else 0.0
+    return found[0] if costs[0] < costs[1] + chance else found[1]
+
+
+def _unlike_heart(fit: DotFit, prior: Prior) -> float:
+    """Return the square of the standard deviations by which blur and heart differ from usual."""
+    size, light = fit.heart_look
+    square = ((fit.sigma_px - prior.edge_px) / prior.edge_spread_px) ** 2
+    if fit.heart is not None:
+        square += ((size - prior.heart_size) / prior.heart_size_sd) ** 2
+        square += ((light - prior.heart_light) / prior.heart_light_sd) ** 2
+    return square
 
 
 def _reach_px(fits: Sequence[DotFit]) -> Array:

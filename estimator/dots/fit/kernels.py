@@ -162,9 +162,10 @@ def predict(
 
 @compiled
 def prior_rows(prior: Array, radius: float, parameters: Array, rows: Array, gap: Array) -> float:
-    """Fill in the whitened equations of the priors on two contrast gradients and the edge's blur.
+    """Fill in the whitened equations of the priors on two contrast gradients, the edge's blur, and
+    the size and light of a heart.
 
-    prior : (5,) the fields of `luminance.Prior`. rows : (3, N), which must be 0. gap : (3,) prior
+    prior : (9,) the fields of `luminance.Prior`. rows : (5, N), which must be 0. gap : (5,) prior
     minus present value. Returns the sum of its squares.
     """
     weight = 1.0 / (prior[2] * radius * max(abs(parameters[9]), 1e-12))
@@ -172,9 +173,17 @@ def prior_rows(prior: Array, radius: float, parameters: Array, rows: Array, gap:
         rows[k, 10 + k] = weight
         rows[k, 9] = -prior[k] * radius * weight
     rows[2, 5] = 1.0 / prior[4]
+    if len(parameters) > 12:
+        rows[3, 14] = 1.0 / prior[6]
+        rows[4, 15] = 1.0 / (prior[8] * max(abs(parameters[9]), 1e-12))
+        rows[4, 9] = -prior[7] * rows[4, 15]
     total = 0.0
-    for k in range(3):
-        gap[k] = prior[3] / prior[4] if k == 2 else 0.0
+    for k in range(len(rows)):
+        gap[k] = 0.0
+        if k == 2:
+            gap[k] = prior[3] * rows[2, 5]
+        elif k == 3 and len(parameters) > 12:
+            gap[k] = prior[5] * rows[3, 14]
         for i in range(len(parameters)):
             gap[k] -= rows[k, i] * parameters[i]
         total += gap[k] ** 2
@@ -188,7 +197,7 @@ def normal_equations(
 ) -> float:  # fmt: skip
     """Fill in information (N, N) and gradient (N,) of a fit, and return its chi-square."""
     count = len(parameters)
-    rows, gap, weighted = np.zeros((3, count)), np.zeros(3), np.empty(len(residual))
+    rows, gap, weighted = np.zeros((5, count)), np.zeros(5), np.empty(len(residual))
     chi2 = prior_rows(prior, radius, parameters, rows, gap)
     for p in range(len(residual)):
         chi2 += weight[p] * residual[p] ** 2
@@ -197,14 +206,14 @@ def normal_equations(
         for p in range(len(residual)):
             weighted[p] = weight[p] * jacobian[i, p]
             total += weighted[p] * residual[p]
-        for k in range(3):
+        for k in range(len(rows)):
             total += rows[k, i] * gap[k]
         pull[i] = total
         for j in range(i + 1):
             total = 0.0
             for p in range(len(residual)):
                 total += weighted[p] * jacobian[j, p]
-            for k in range(3):
+            for k in range(len(rows)):
                 total += rows[k, i] * rows[k, j]
             information[i, j] = information[j, i] = total
     return chi2
@@ -317,7 +326,7 @@ def descend(
     information, pull = np.empty((count, count)), np.empty(count)
     step, moved = np.empty(count), np.empty(count)
     model, slopes = np.empty(len(residual)), np.empty((count, len(residual)))
-    damping, gap = 1e-4, np.zeros(3)
+    damping, gap = 1e-4, np.zeros(5)
     for _ in range(iterations):
         chi2 = normal_equations(
             prior, radius, parameters, residual, weight, jacobian, information, pull
@@ -337,7 +346,7 @@ def descend(
                         residual[p] -= step[i] * jacobian[i, p]
                 return True
             predict(at, first, radius, moved, value, gradient, model, slopes)
-            trial = prior_rows(prior, radius, moved, np.zeros((3, count)), gap)
+            trial = prior_rows(prior, radius, moved, np.zeros((5, count)), gap)
             for p in range(len(residual)):
                 trial += weight[p] * (grey[p] - model[p]) ** 2
             better = trial <= chi2 * (1.0 + 1e-12)

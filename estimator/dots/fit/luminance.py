@@ -18,7 +18,7 @@ as blurred as the dot.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 
@@ -66,6 +66,8 @@ class Prior:
     sigma_per_px : standard deviation of both.
     edge_px : standard deviation of the edge's Gaussian blur.
     edge_spread_px : standard deviation of this number; infinite if it is unknown.
+    heart_size, heart_light : radius and contrast of the dots' hearts, relative to the dot.
+    heart_size_sd, heart_light_sd : their standard deviations; infinite if they are unknown.
     """
 
     u_per_px: float = 0.0
@@ -73,12 +75,15 @@ class Prior:
     sigma_per_px: float = 3e-4
     edge_px: float = 1.0
     edge_spread_px: float = np.inf
+    heart_size: float = 0.5
+    heart_size_sd: float = np.inf
+    heart_light: float = 0.0
+    heart_light_sd: float = np.inf
 
     @property
     def numbers(self) -> Array:
-        """The fields (5,)."""
-        gradient = self.u_per_px, self.v_per_px, self.sigma_per_px
-        return np.array([*gradient, self.edge_px, self.edge_spread_px], np.float64)
+        """The fields (9,)."""
+        return np.array(astuple(self), np.float64)
 
 
 @dataclass(frozen=True)
@@ -204,6 +209,13 @@ class DotFit:
     def contrast(self) -> float:
         """Contrast [grey] at the dot's centre (negative for a dark dot)."""
         return float(self.levels[3:] @ self._position)
+
+    @property
+    def heart_look(self) -> tuple[float, float]:
+        """Size and contrast of the heart, relative to the dot; NaN if it has none."""
+        if self.heart is None:
+            return np.nan, np.nan
+        return float(self.heart[2]), float(self.heart[3]) / self.contrast
 
     @cached_property
     def background(self) -> float:

@@ -1,7 +1,7 @@
 """What the rest of the image means for the fit of one dot.
 
 Its window holds the pixels without holes, neighbours and their blur. Its priors come from the other
-dots: the illumination, and the blur that all dots have in common.
+dots: the illumination, the blur that all dots have in common, and what hearts look like.
 """
 
 from __future__ import annotations
@@ -167,10 +167,12 @@ _FAR_SDS = 2.0
 _FLOOR_PER_PX = 5e-6
 BLUR_SPREAD = 0.1
 """Least relative standard deviation of the dots' blur."""
+HEART_SPREAD = 0.02
+"""Least standard deviation of the relative size and light of their hearts."""
 
 
 def priors_from(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
-    """Return a prior for each fitted dot: the contrast gradient and the blur of all dots.
+    """Return a prior for each fitted dot: the contrast gradient, and the blur and hearts of all.
 
     A cubic surface is fitted robustly to log |contrast| over the image, with a prior (the light
     changes by about a factor exp(0.4) over 1000 px). The dots' median edge blur is a prior of each
@@ -191,7 +193,19 @@ def priors_from(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]
     usual = float(np.median(sigmas))
     spread = max(BLUR_SPREAD * usual, float(robust_sd(sigmas - usual)))
     gradients = (_gradient_at(p, coefficients, covariance, reach) for p in position)
-    return [Prior(*gradient, edge_px=usual, edge_spread_px=spread) for gradient in gradients]
+    heart = usual_heart(fits)
+    return [Prior(*gradient, usual, spread, *heart) for gradient in gradients]
+
+
+def usual_heart(fits: Sequence[DotFit]) -> tuple[float, float, float, float]:
+    """Return size and light of the hearts of an image's dots, relative to the dots, each with its
+    scatter, as `Prior` has them; without knowledge where fewer than half of the dots have one."""
+    looks = np.array([fit.heart_look for fit in fits if fit.heart is not None])
+    if 2 * len(looks) <= len(fits):
+        return 0.5, np.inf, 0.0, np.inf
+    middle = np.median(looks, 0)
+    spread = [max(HEART_SPREAD, float(robust_sd(off))) for off in (looks - middle).T]
+    return float(middle[0]), spread[0], float(middle[1]), spread[1]
 
 
 _POWERS = np.array([(i, j) for i in range(4) for j in range(4 - i)])

@@ -126,3 +126,20 @@ def test_the_flat_inside_of_clipped_dots_is_no_heart(monkeypatch: pytest.MonkeyP
     assert len(dots) == len(centres)
     # 0.008 px as single discs, 0.020 with hearts.
     assert np.sqrt(np.mean(error**2) / 2) < 0.012
+
+
+def test_hearts_that_the_blur_hides_look_like_those_of_other_dots(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(globals(), "RADIUS_PX", 5.0)
+    image, centres = plate(Hearts(1.0, 1.5, 1.5, 0.65), 5)
+    dots = measure_dots(image).dots
+    gap = dots[["u_px", "v_px"]].to_numpy()[:, None] - centres
+    nearest = np.argmin(np.linalg.norm(gap, axis=-1), 1)
+    error = gap[np.arange(len(gap)), nearest]
+    assert len(set(nearest)) == len(dots) == len(centres)
+    assert np.sqrt(dots["a_px"] * dots["b_px"]).between(4.5, 5.5).all()
+    parts = dots[["suu_px2", "suv_px2", "svv_px2"]].to_numpy()
+    covariance = parts[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    nees = np.mean(error[:, None] @ np.linalg.solve(covariance, error[:, :, None])) / 2
+    assert 0.6 < nees < 1.6

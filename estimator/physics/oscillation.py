@@ -13,13 +13,13 @@ _LEAST_SAMPLES = 16
 _PADDING, _FINER = 8, 8
 _DENSEST = 16
 _SIGNIFICANT = 6.0
-_ZIGZAG = 4.5
-"""Least amplitude of a zigzag over its standard deviation, lower than for a line anywhere in a
-spectrum."""
+LIKELY = 4.5
+"""Least amplitude over its standard deviation of a line that is likely to be there, as a bubble's
+zigzag, lower than for a line anywhere in a spectrum."""
 _ANOTHER = 0.01
 """Probability of another fringe beside that of the best one, from which on no frequency is told."""
 _ROUNDING = 1e-9
-_NEAR_PERIODS, _FALL = 5.0, 2.5
+_NEAR_PERIODS, _FALL = 5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def zigzag(
     t_s : (N,).  velocity_mm_s : (N, K) components across the vertical.
     errors_mm_s : (N, M) draws of their errors, as ``alike`` of `dominant_oscillation`.
     """
-    found = dominant_oscillation(t_s, velocity_mm_s, significant=_ZIGZAG, alike=errors_mm_s)
+    found = dominant_oscillation(t_s, velocity_mm_s, significant=LIKELY, alike=errors_mm_s)
     if found is None:
         return None
     w, relative = 2 * np.pi * found.frequency_hz, found.s_frequency_hz / found.frequency_hz
@@ -111,26 +111,32 @@ def dominant_oscillation(
         return None
     f, more = _fringe(t, y, start, step, (lowest, highest))
     coefficients, left = _fitted(t, y, f)
-    density = max(_density(t, left, f, duration), 2 * noise**2 * duration / len(t))
+    stated = 2 * noise**2 * duration / len(t)
+    density = max(_density(t, left, f, duration), stated)
     if not density > (_ROUNDING * np.abs(y).max()) ** 2 * duration:
         return None
     axes = np.linalg.svd(coefficients[2:])[1]
     minor = float(axes[1]) if len(axes) > 1 else 0.0
-    s_amplitude = float(np.sqrt(density / duration))
-    if axes[0] < significant * s_amplitude or not low <= f <= high:
+    waves = _basis(t, f)
+    waves = np.concatenate([waves, (t - t.mean())[:, None] * waves[:, 2:]], -1)
+    of_each = _variances(np.linalg.pinv(waves)[2:], t, f, duration)
+    of_level, of_slope = of_each.reshape(2, 2).mean(1)
+    if axes[0] < significant * np.sqrt(density * of_level) or not low <= f <= high:
         return None
     if more * duration < -np.log(_ANOTHER) * density * len(t):
         return None
     total = float((axes**2).sum())
-    s_f = float(np.sqrt(density / (4 * np.pi**2 * total * duration * t.var())))
+    of_amplitude, of_frequency = density * of_level, density * of_slope
     if alike is not None:
+        # what the residuals show of these errors counts here alone
+        others = _density(t, _fitted(t, alike[good], f)[1], f, duration)
+        density = max(density - others, stated)
         # of unknown phase: the half of its square is in that of the sinusoid
-        waves = _basis(t, f)
-        waves = np.concatenate([waves, (t - t.mean())[:, None] * waves[:, 2:]], -1)
         level, slope = np.linalg.lstsq(waves, alike[good], rcond=None)[0][2:].reshape(2, 2, -1)
-        s_amplitude = float(np.sqrt(s_amplitude**2 + (level**2).sum(0).mean() / 2))
-        added = (slope**2).sum(0).mean() / (2 * total)
-        s_f = float(np.sqrt(s_f**2 + added / (4 * np.pi**2)))
+        of_amplitude = density * of_level + float((level**2).sum(0).mean()) / 2
+        of_frequency = density * of_slope + float((slope**2).sum(0).mean()) / 2
+    s_amplitude = float(np.sqrt(of_amplitude))
+    s_f = float(np.sqrt(of_frequency / total)) / (2 * np.pi)
     return Oscillation(
         f, s_f, float(axes[0]), minor, s_amplitude, s_amplitude * (len(axes) > 1),
         np.linalg.norm(coefficients[2:], axis=0),
@@ -205,14 +211,12 @@ def _refined(t: Array, y: Array, f: float, around: float) -> float:
 
 
 def _density(t: Array, left: Array, f: float, duration: float) -> float:
-    """Return the one-sided density at f by component, as it enters a variance.
+    """Return the one-sided density at f by component.
 
-    From the periodogram within 5 periods of the record, over the share that the fit leaves of white
-    noise there: it empties the bins about f, and others where the record has a gap. It is taken to
-    fall with the power 2.5 of the frequency, as a velocity does between the square under a white
-    force and the fourth power under a force that is correlated in time: few periods of a slow
-    oscillation look like such noise. The density is known from k squares alone: the square of an
-    error over it has the mean k / (k - 2).
+    From the periodogram within 5 periods of the record, taken to have the spectrum of `_noise`,
+    over the share that the fit leaves of white noise there: it empties the bins about f, and others
+    where the record has a gap. The density is known from k squares alone: the square of an error
+    over it has the mean k / (k - 2).
     """
     periods = np.arange(1, np.ceil(f * duration + _NEAR_PERIODS))
     frequency = periods[np.abs(periods - f * duration) < _NEAR_PERIODS] / duration
@@ -221,8 +225,30 @@ def _density(t: Array, left: Array, f: float, duration: float) -> float:
     taken = (np.abs(waves @ np.linalg.qr(_basis(t, f))[0]) ** 2).sum(-1) / len(t)
     kept = (1 - taken).clip(0).sum()
     squares = 2 * left.shape[1] * kept
-    each = periodogram * (frequency / f) ** _FALL
+    each = periodogram / _noise(frequency / f)
     return float(each.sum() / kept * squares / max(squares - 2, 1))
+
+
+def _noise(ratio: Array) -> Array:
+    """Return the density of noise at ``ratio`` times the frequency f, over that at f.
+
+    It is flat below f and falls with the power 3 above, as a bubble's velocity about its zigzag,
+    between the square under a white force and the fourth power under a force that is correlated in
+    time. Few periods of a slow oscillation look like such noise.
+    """
+    return np.asarray((2 / (1 + ratio**2)) ** (_FALL / 2))
+
+
+def _variances(rows: Array, t: Array, f: float, duration: float) -> Array:
+    """Return the variances (M,) of linear functions of the noise, over its density at f.
+
+    rows : (M, N) the weights of the samples. Of frequencies within 5 periods of the record.
+    """
+    step = 1 / (4 * duration)
+    frequency = step * np.arange(1, np.ceil(4 * (f * duration + _NEAR_PERIODS)))
+    frequency = frequency[np.abs(frequency - f) * duration < _NEAR_PERIODS]
+    passed = np.abs(rows @ np.exp(2j * np.pi * np.outer(t, frequency))) ** 2
+    return np.asarray(passed @ _noise(frequency / f) * step)
 
 
 def _periodogram(t: Array, y: Array, frequency: Array, duration: float) -> Array:

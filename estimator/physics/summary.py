@@ -10,7 +10,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.estimator.physics.means import SD, Lasting, mean_of_body, parts_of_body
-from telerig.estimator.physics.oscillation import Oscillation, dominant_oscillation, zigzag
+from telerig.estimator.physics.oscillation import LIKELY, Oscillation, dominant_oscillation, zigzag
 from telerig.io.tables.smoothing import AXES, SUMMARY
 from telerig.rig.bubble_physics import Liquid
 
@@ -158,7 +158,8 @@ def _shape_oscillation(
         if abs(half - found.frequency_hz) < 2 * _TURNING_HZ:
             continue
         for series in (stretch[:, None] / 2, lean):
-            swing = dominant_oscillation(t, series, half - _TURNING_HZ, half + _TURNING_HZ)
+            band = (half - _TURNING_HZ, half + _TURNING_HZ)
+            swing = dominant_oscillation(t, series, *band, significant=LIKELY)
             if swing is not None and swing.major > found.major:
                 return None
     return found

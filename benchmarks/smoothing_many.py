@@ -216,6 +216,9 @@ def growing(frames: list[int], bubbles: list[int], tracks: list[int]) -> list[st
         "# Smoothing many bubbles: time and memory",
         "",
         "CPU seconds of one thread; `benchmarks/smoothing_many.py`.",
+        "The rig does not shake across the vertical in these runs, which no smoother can know:",
+        "half of the shake along it is expected, so that NEES is below 1 along x and z. With",
+        "--across it does, and NEES is as it should be (docs/decisions/030-many-bubbles.md).",
         "",
         "| frames | bubbles in sight | frames a track | learning | smoothing | verdict | tables "
         "| all | peak GB | first line, s | RMS error x, y, z, µm | NEES |",

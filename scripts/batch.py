@@ -71,6 +71,7 @@ def batch(
     )
     from telerig.estimator.batch.cluster import dask_executor
     from telerig.estimator.batch.jobs import check_options, jobs_of, shake_of_model, share_of
+    from telerig.io.results.manifest import check_place
 
     def tell(job: Job, record: dict[str, Any], done: int, of: int) -> None:
         say(f"[{done}/{of}] {summary_line(job, record, whole_path=same_names)}")
@@ -92,6 +93,7 @@ def batch(
         datasets, calibration=calibration, calibrating=calibrating, tracking=tracking,
         smoothing=smoothing, tracks=tracks, report=report, only=only or (),
     )  # fmt: skip
+    check_place(out, "batch")
     mine = share_of(jobs, index, of)
     places = {job.dataset for job in mine}
     same_names = len({Path(place).name for place in places}) < len(places)

@@ -89,6 +89,7 @@ def calibrate(
     from telerig.estimator.calibration.results_folder import sources, write_report, write_results
     from telerig.io.dataset.dataset import load_dataset
     from telerig.io.results.inputs import fingerprints
+    from telerig.io.results.manifest import check_place
 
     begun = time.perf_counter()
     settings = chosen.keywords
@@ -97,7 +98,7 @@ def calibrate(
     with viewed(view, dataset.name):
         earlier = None if compare is None else _earlier(compare, dataset)
         if watch:
-            data, run = _watched(dataset, chosen.source, until_um, poll or _POLL_S, settings)
+            data, run = _watched(dataset, out, chosen.source, until_um, poll or _POLL_S, settings)
             used = None
             record |= {"watch": True, "until_um": until_um}
         else:
@@ -107,7 +108,9 @@ def calibrate(
                         f"{option} goes with --watch", todo="add --watch, or leave it out"
                     )
             data = load_dataset(dataset, source=chosen.source)
-            used = fingerprints(out or data.results / "calibration", sources(data))
+            folder = out or data.results / "calibration"
+            used = fingerprints(folder, sources(data))
+            check_place(folder, "calibrate", used)
             with progress(quiet) as stage:
                 run = run_calibration(data, **settings, stage=stage, pictures=True)
         folder = out or data.results / "calibration"
@@ -139,15 +142,22 @@ def _earlier(path: Path, dataset: Path) -> Calibration:
 
 
 def _watched(
-    dataset: Path, source: str | None, until_um: float | None, poll: float, settings: dict[str, Any]
+    dataset: Path,
+    out: Path | None,
+    source: str | None,
+    until_um: float | None,
+    poll: float,
+    settings: dict[str, Any],
 ) -> tuple[Dataset, CalibrationRun]:
     """Return the dataset with the images that arrived, and their calibration."""
     from telerig.estimator.calibration.watch import watch
     from telerig.io.dataset.dataset import load_dataset
+    from telerig.io.results.manifest import check_place
 
     if source == "dots":
         raise InputError("--watch waits for images", todo="leave out --from dots")
     data = load_dataset(dataset, need_views=False)
+    check_place(out or data.results / "calibration", "calibrate")
     say(f"watching {data.path / 'calibration'}; Ctrl-C writes the results and ends")
     with stopped_by_signals() as stop:
         return watch(data, stop=stop, tell=say, interval_s=poll, until_um=until_um, **settings)

@@ -6,6 +6,7 @@ import shlex
 
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, run_file, say, typed_command
+from telerig.short_text import counted
 
 
 @errors_in_words()
@@ -29,14 +30,16 @@ def detect(
     data = load_dataset(dataset, source="images")
     folder = out or data.results / "calibration"
     inputs = fingerprints(folder, sources(data))
-    with progress(quiet) as stage:
-        found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
     again = typed_command() or shlex.join(["telerig", "detect", str(data.path)])
     with replaced_results(folder, "detect", again=again, inputs=inputs) as staged:
+        with progress(quiet) as stage:
+            found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
         write_table(found.dots, staged / "dots.csv")
         write_detections(found, staged)
     for image in found.images:
-        result = image.failure or f"{len(image.dots)} dots, {len(image.rejected)} rejected"
+        result = (
+            image.failure or f"{counted(len(image.dots), 'dot')}, {len(image.rejected)} rejected"
+        )
         say(f"view {image.view}, camera {image.camera}: {result}")
     say(f"written: {folder}/dots.csv, rejected.csv, overlays/")
 

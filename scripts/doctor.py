@@ -12,6 +12,7 @@ import typer
 from telerig.command_options import TrackingOptions
 from telerig.scripts import options
 from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, run_file, say
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.estimator.doctor.checks import Check
@@ -34,13 +35,15 @@ def doctor(
     out: options.RunFolder = None,
     report: options.Report = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for other programs.")] = False,
-    quiet: options.Quiet = False,
+    quiet: Annotated[bool, typer.Option(help="Print only what is not ok.")] = False,
 ) -> None:
     """Check the installation, the serial ports, and a dataset or a run if one is given.
 
     Of each run of a dataset it estimates how long tracking and smoothing will take. A run that is
     given itself is taken for a trial recording: light, focus, frames, synchrony, sensors and shake
     are measured, and the verdict that a run of --seconds may expect; trial.html shows it.
+
+    With --quiet it prints only what is not ok, and how many checks there were.
 
     Exit code 0: nothing prevents the work, though there may be warnings. 1: there is a failure.
     """
@@ -58,11 +61,14 @@ def doctor(
     if as_json:
         say(json.dumps([asdict(check) for check in checks], indent=1, ensure_ascii=False))
     else:
-        width = max(len(check.what) for check in checks)
-        for check in checks:
+        shown = [c for c in checks if c.status != "ok"] if quiet else checks
+        width = max((len(check.what) for check in shown), default=0)
+        for check in shown:
             say(f"{_SIGNS[check.status]:<{_WIDTH}}{check.what:<{width}}  {check.words}")
             if check.todo:
                 say(f"{'':{_WIDTH + width + 2}}-> {check.todo}")
+        if quiet:
+            say(f"{len(checks) - len(shown)} of {counted(len(checks), 'check')} ok")
     if any(check.status == "failure" for check in checks):
         raise typer.Exit(EXIT_REJECTED)
 

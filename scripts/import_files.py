@@ -11,6 +11,7 @@ from telerig.errors import InputError
 from telerig.io.exchange.formats import CAMERA_IMPORTERS, recording_words
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, say, typed_command
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -191,7 +192,7 @@ def records(
     run_folder(listed)
     file = listed / "accelerometer.csv"
     if remove is not None:
-        say(f"removed: {remove_accelerations(remove, file)} readings of {remove}")
+        say(f"removed: {counted(remove_accelerations(remove, file), 'reading')} of {remove}")
     found = imported_records(file)
     frames_t_s = _frame_times(listed) if found else None
     for name, table in found.items():
@@ -248,7 +249,7 @@ def _record_words(sensor: str, table: pd.DataFrame, frames_t_s: Array | None) ->
     numbers = ", ".join(f"{value:.4g}" for value in mean)
     size = float((mean @ mean) ** 0.5)
     lines = [
-        f"{sensor}: {len(table)} readings from {t_s[0]:.6g} to {t_s[-1]:.6g} s{rate}",
+        f"{sensor}: {counted(len(table), 'reading')} from {t_s[0]:.6g} to {t_s[-1]:.6g} s{rate}",
         f"  mean reading (x, y, z): {numbers} m/s^2, {size:.4g} in all (gravity at rest: 9.81)",
     ]
     if frames_t_s is not None and len(frames_t_s):

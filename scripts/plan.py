@@ -64,8 +64,11 @@ def plan(
         variants,
     )
     from telerig.io.files.csv_table import write_table
+    from telerig.io.results.manifest import check_file
     from telerig.io.rig_file.rig_file import read_rig_toml
 
+    if out is not None:
+        check_file(out)
     rig = read_rig_toml(dataset / "rig.toml")
     planned = Experiment(
         rate_hz, seconds, bubbles, diameter_mm, sigma_px, rise_mm_s, zigzag_hz, zigzag_mm, shake_hz,

@@ -21,6 +21,7 @@ from telerig.scripts.console import (
     stopped_by_signals,
     viewed,
 )
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -254,7 +255,7 @@ def recording_words(done: Recording) -> str:
     if s["frames"]:
         f = s["frames"]
         lines.append(
-            f"{f['count']} frames, {f['missing']} missing, "
+            f"{counted(f['count'], 'frame')}, {f['missing']} missing, "
             f"{len(f['interpolated'])} with interpolated times"
         )
     lines.append(
@@ -264,7 +265,7 @@ def recording_words(done: Recording) -> str:
 
 
 def _device_words(device: dict[str, Any]) -> Iterator[str]:
-    yield f"{device['readings']} readings"
+    yield counted(device["readings"], "reading")
     if not device["readings"]:
         yield (
             "it sent nothing: check that it is switched on, and whether it has to be polled (poll "

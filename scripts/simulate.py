@@ -13,6 +13,7 @@ import typer
 from telerig.errors import InputError
 from telerig.io.simulation import preset_names
 from telerig.scripts.console import errors_in_words, run_file, say, stopped_by_signals
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -112,7 +113,8 @@ def simulate(
     stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale, "accelerometers": mounts}
     settings = _with_strip(preset, _settings(preset, run_only, stage), references, images)
     data = run(settings, rng=np.random.default_rng(seed), out=out, images=images)
-    say(f"{preset}: {len(data.views)} views of {len(data.rig.cameras)} cameras in {data.path}")
+    views, cameras = counted(len(data.views), "view"), counted(len(data.rig.cameras), "camera")
+    say(f"{preset}: {views} of {cameras} in {data.path}")
     for name in data.runs:
         say(f"run {name}: {data.runs[name].path}")
     say(f"next: telerig calibrate {data.path}")

@@ -39,11 +39,14 @@ def view(
 
     Exit code 0: shown or written. 2: the input cannot be used. 130: interrupted.
     """
+    from telerig.io.results.manifest import check_file
     from telerig.io.view.show import frames_of
     from telerig.io.view.show import view as show
 
     if web and save is not None:
         raise InputError("--web and --save are given", todo="give only one of them")
+    if save is not None:
+        check_file(save, "--save")
     stream = show(folder, save=save, web=web, frames=frames_of(frames), recording=run)
     if save is not None:
         say(f"written: {save} ({save.stat().st_size / 1e6:.1f} MB)")

@@ -14,6 +14,7 @@ from telerig.estimator.batch.cluster import dask_executor
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import RunData, load_run, recordings, run_folder
 from telerig.io.results.inputs import fingerprints
+from telerig.io.results.manifest import check_place
 from telerig.live import publish
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ def calibrate_dataset(
     begun = time.perf_counter()
     data = load_dataset(dataset, source=options.source)
     used = fingerprints(folder, sources(data))
+    check_place(folder, "calibrate", used)
     run = run_calibration(data, **options.keywords, stage=stage, pictures=True)
     write_results(
         data, run, folder, command="calibrate", options=options.record(),
@@ -114,6 +116,8 @@ def track_run(
         if stage is not None:
             stage("reading the run", 0.0, 1)
         data = load_with(run, calibrated, options.source)
+        if data.detections is not None:
+            _refuse_detection_options(run, options)
         publish("recording", path=data.path, rig=of_run(calibrated, data.cameras).cameras)
         summary = write_tracking(
             data if count is None else data.first(count), calibrated, folder,
@@ -122,6 +126,19 @@ def track_run(
         )  # fmt: skip
     publish("results", folder=folder.resolve())
     return summary
+
+
+def _refuse_detection_options(run: Path, options: TrackingOptions) -> None:
+    """Raise InputError for an option of the detection where the bubbles are given."""
+    for name in ("min_diameter_px", "min_contrast"):
+        value = getattr(options, name)
+        if value != getattr(TrackingOptions, name):
+            flag = TrackingOptions.settings()[name].flags[0]
+            raise InputError(
+                f"{flag} {value:g} has no effect, the bubbles are given",
+                where=str(run / "detections.csv"),
+                todo="leave it out, or detect the bubbles in images: --from images",
+            )
 
 
 def smooth_run(

@@ -68,6 +68,7 @@ from telerig.rig.lens_parameters import (
     rich_groups,
 )
 from telerig.rig.target import Target
+from telerig.short_text import counted
 
 
 def self_calibrate(
@@ -104,7 +105,7 @@ def self_calibrate(
     """
     if not 1 <= len(cameras) <= MOST_CAMERAS:
         todo = f"give one to {MOST_CAMERAS} cameras"
-        raise InputError(f"{len(cameras)} cameras", todo=todo)
+        raise InputError(counted(len(cameras), "camera"), todo=todo)
     models = models_by_camera(model, [c.name for c in cameras])
     nominal = _nominal(nominal_rotvec_deg, cameras)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)

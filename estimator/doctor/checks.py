@@ -268,7 +268,8 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
         return
     span = float(run.t_s[-1] - run.t_s[0]) if run.frame_count > 1 else 0.0
     rate = (run.frame_count - 1) / span if span else 0.0
-    words = f"{run.frame_count} frames from {run.source}, {span:.3g} s, {rate:.4g} per second"
+    frames = counted(run.frame_count, "frame")
+    words = f"{frames} from {run.source}, {span:.3g} s, {rate:.4g} per second"
     yield Check(what, "ok", words)
     for note in run.notes:
         yield Check(what, "note", note)
@@ -315,7 +316,7 @@ def _clocks(run: RunData, what: str) -> Iterator[Check]:
     if gaps:
         yield Check(
             f"{what} frames.csv", "note",
-            f"{gaps} steps are longer than the median step of {1000 * median_s:.3g} ms, "
+            f"{counted(gaps, 'step')} longer than the median one of {1000 * median_s:.3g} ms, "
             f"the longest is {1000 * float(steps.max()):.3g} ms",
             "frames were lost, or the camera was not triggered evenly; tracking allows for both",
         )  # fmt: skip
@@ -336,7 +337,7 @@ def _sensors(run: RunData, what: str) -> Iterator[Check]:
         for sensor, rows in run.accelerometers.groupby("sensor"):
             found.append(f"{sensor} {_rate(rows['t_s'].to_numpy(float))}")
     if run.references is not None:
-        found.append(f"{run.references['mark'].nunique()} marks")
+        found.append(counted(run.references["mark"].nunique(), "mark"))
     words = ", ".join(found) or "none, so the shake of the rig cannot be separated from the bubbles"
     todo = "" if found else "record the encoder, and an accelerometer on each arm"
     yield Check(f"{what} sensors", "ok" if found else "note", words, todo)
@@ -346,7 +347,7 @@ def _sensors(run: RunData, what: str) -> Iterator[Check]:
 
 def _rate(t_s: np.ndarray) -> str:
     if len(t_s) < _FEWEST_READINGS:
-        return f"{len(t_s)} readings"
+        return counted(len(t_s), "reading")
     return f"{(len(t_s) - 1) / (t_s[-1] - t_s[0]):.4g} Hz"
 
 

@@ -119,7 +119,7 @@ def dominant_oscillation(
     minor = float(axes[1]) if len(axes) > 1 else 0.0
     waves = _basis(t, f)
     waves = np.concatenate([waves, (t - t.mean())[:, None] * waves[:, 2:]], -1)
-    of_each = _variances(np.linalg.pinv(waves)[2:], t, f, duration)
+    of_each = _variances(np.asarray(np.linalg.pinv(waves)[2:]), t, f, duration)
     of_level, of_slope = of_each.reshape(2, 2).mean(1)
     if axes[0] < significant * np.sqrt(density * of_level) or not low <= f <= high:
         return None

@@ -17,6 +17,7 @@ from telerig.arrays import Array, Bools
 from telerig.errors import InputError, nearest, suggestion
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -243,7 +244,9 @@ def _samples(source: Mapping[str, Any], where: str) -> tuple[Array, Array, str, 
         )
     if len(t) < 2:
         raise InputError(
-            f"has {len(t)} samples", where=where, todo="give at least two, or leave the sensor out"
+            f"has {counted(len(t), 'sample')}",
+            where=where,
+            todo="give at least two, or leave the sensor out",
         )
     finite = np.isfinite(reading).all(1)
     if not finite.all():

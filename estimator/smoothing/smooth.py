@@ -85,6 +85,7 @@ from telerig.factors.bubble_motion import INERTIA_S, Inertia
 from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -474,8 +475,8 @@ def _log_evidence(problem: SmoothingProblem) -> float:
 
 
 def _smoothing_words(problem: SmoothingProblem) -> str:
-    bubbles = "1 bubble" if len(problem.bubbles) == 1 else f"{len(problem.bubbles)} bubbles"
-    return f"smoothing {bubbles} in {len(problem.t_s)} frames"
+    bubbles = counted(len(problem.bubbles), "bubble")
+    return f"smoothing {bubbles} in {counted(len(problem.t_s), 'frame')}"
 
 
 def _check_kinds(tracks: Any, calibration: Any, rig: Any) -> None:

@@ -17,6 +17,7 @@ from telerig.io.results.verdict_words import (
     words_of_contradiction,
 )
 from telerig.io.tables.table import CALIBRATION_SHARE, EXTRAPOLATED
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.estimator.smoothing.result import Smoothing
@@ -44,8 +45,8 @@ def smoothing_words(found: Smoothing) -> str:
         lines += [f"  {words}" for words in [to_resolve(remedy_words(file.remedies))] if words]
         lines += [f"  {line}" for line in uses_words(file.usable_for)]
         lines = [line for line in lines if line]
-    bubbles = "1 bubble" if summary["bubbles"] == 1 else f"{summary['bubbles']} bubbles"
-    lines.append(f"{bubbles} in {summary['frames']} frames; priors: {found.model.name}")
+    bubbles = counted(summary["bubbles"], "bubble")
+    lines.append(f"{bubbles} in {counted(summary['frames'], 'frame')}; priors: {found.model.name}")
     table = found.tables.typical([f"s{x}_mm" for x in "xyz"] + [f"sv{x}_mm_s" for x in "xyz"])
     if len(table) and "sx_mm" in table:
         position = [1000 * float(np.median(table[f"s{x}_mm"])) for x in "xyz"]

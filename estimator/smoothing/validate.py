@@ -175,11 +175,11 @@ def validate_run(
     run, followed = with_followed_references(run, folder)
     fingerprint = fingerprints(folder, [*run_sources(run), *followed, *inputs])
     shares = None if stage is None else lambda what, share: stage(what, float(share), 1)
-    found = validate(
-        run, calibration, marks=marks, model=model, accept=accept, seed=seed, progress=shares
-    )
     again = again or f"telerig validate {shlex.quote(str(run.path))}"
     with replaced_results(folder, "validate", again=again, inputs=fingerprint) as staged:
+        found = validate(
+            run, calibration, marks=marks, model=model, accept=accept, seed=seed, progress=shares
+        )
         found.write(staged / "validation.json")
         if report:
             from telerig.io.report.validation import write_validation_report

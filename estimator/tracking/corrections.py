@@ -207,6 +207,7 @@ def add_correction(run: Path, results: Path, row: Mapping[str, Any]) -> str:
     """
     found, file = load_tracks(results), run / CORRECTIONS
     numbered = found.table["particle"].dtype.kind == "i"
+    row = {**row, "reason": " ".join(str(row["reason"]).split())}
     before = read_table(file, _ROWS.of(), empty=True) if file.is_file() else pd.DataFrame()
     new = pd.DataFrame([row]).dropna(axis=1)
     table = pd.concat([before, new], ignore_index=True).reindex(columns=_ROWS.names())
@@ -225,7 +226,7 @@ def _effect(one: Correction, found: Tracks, where: Path) -> str:
     for particle in needed:
         if particle not in ids:
             known = sorted(set(ids), key=lambda text: (len(text), text))
-            todo = f"use one of {counted_list(known, 'id')}" if known else "there are no tracks"
+            todo = f"the run has {counted_list(known, 'id')}" if known else "there are no tracks"
             raise InputError(f"there is no track {particle}", where=str(where), todo=todo)
     of = needed[0]
     frames = found.table["frame"].to_numpy(np.int64)[ids == of]

@@ -59,6 +59,7 @@ from telerig.live import publish
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
 from telerig.rig.camera import Camera
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.estimator.tracking.follow_marks import FollowedMarks
@@ -172,7 +173,7 @@ class TrackingStream:
         run, kinds = self.run, [e.kind for e in self.events]
         if not self.detections:
             raise InputError(
-                f"no bubble was found in {run.frame_count} frames",
+                f"no bubble was found in {counted(run.frame_count, 'frame')}",
                 where=str(run.path),
                 todo="look at the images; bubbles must be darker than the screen by "
                 "--min-contrast, and wider than --min-diameter",

@@ -203,7 +203,7 @@ def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") 
         lines.append(f"  {left} detections have no partner in another view, or no track")
     for camera, reasons in summary["frames_without_bubbles"].items():
         lines += [
-            f"  camera {camera}: {count} frames without a bubble: {reason}"
+            f"  camera {camera}: {counted(count, 'frame')} without a bubble: {reason}"
             for reason, count in reasons.items()
         ]
     share = share_words(summary.get("calibration_sd_mm"), summary.get("extrapolated"))
@@ -222,6 +222,6 @@ def count_words(summary: Mapping[str, Any]) -> str:
     """Return how many tracks and points were found, from the content of tracking.json."""
     return (
         f"Run {summary['run']!r}: {counted(summary['tracks'], 'track')}, "
-        f"{summary['points']} points in space from {summary['detections']} detections in "
-        f"{summary['frames']} frames"
+        f"{counted(summary['points'], 'point')} in space from "
+        f"{counted(summary['detections'], 'detection')} in {counted(summary['frames'], 'frame')}"
     )

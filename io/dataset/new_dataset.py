@@ -15,6 +15,7 @@ from telerig.io.rig_file.camera_names import check_camera_names
 from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
 from telerig.io.rig_file.rig_file import description_from_toml
 from telerig.io.rig_file.writer import toml_key
+from telerig.short_text import counted
 
 PRACTICE_TARGET = """\
 layout = "grid"                    # or "points" with points_mm = [[x, y], ...]
@@ -115,7 +116,7 @@ def _camera(camera: NewCamera) -> str:
 def _check(cameras: Sequence[NewCamera], where: str) -> None:
     """Raise InputError for camera names, image sizes or scales that cannot be."""
     if not 1 <= len(cameras) <= MOST_CAMERAS:
-        raise InputError(f"{len(cameras)} cameras", todo=f"name one to {MOST_CAMERAS}")
+        raise InputError(counted(len(cameras), "camera"), todo=f"name one to {MOST_CAMERAS}")
     check_camera_names([camera.name for camera in cameras], where)
     for _, size, scale in cameras:
         if min(size) < 16:

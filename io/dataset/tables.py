@@ -24,6 +24,7 @@ from telerig.io.tables.calibration import DOTS
 from telerig.io.tables.run import ACCELEROMETER, DETECTIONS, FRAMES, REFERENCES, STAGE
 from telerig.io.tables.table import EDGE_COVARIANCE, OF_PIXELS, PIXEL, PIXEL_COVARIANCE
 from telerig.rig.target import Target
+from telerig.short_text import counted
 
 AnySource = TypeVar("AnySource", bound=str)
 
@@ -280,7 +281,7 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
     )
     if frame_count is not None and len(frame) < frame_count:
         raise InputError(
-            f"has {len(frame)} rows, but there are images of {frame_count} frames: "
+            f"has {counted(len(frame), 'row')}, but there are images of {frame_count} frames: "
             f"frame {len(frame)} has no time",
             where=f"{rows.file} row {rows.numbers[-1]}",
             todo="add the missing rows, or remove the images that do not belong to the run",

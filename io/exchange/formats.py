@@ -148,12 +148,15 @@ def export_results(
         results_root,
         run_folder,
     )
+    from telerig.io.results.manifest import check_file
 
     known = CAMERA_EXPORTS | RUN_EXPORTS
     if to not in known:
         raise InputError(
             f"--to {to}: there is no such format", todo=f"use one of: {', '.join(known)}"
         )
+    if out is not None and known[to].suffix:
+        check_file(out)
     _refuse_options_of_others(to, run=run, calibration=calibration, volume=volume)
     results = None
     if to in RUN_EXPORTS:
@@ -236,7 +239,7 @@ def export_run(
     RUN_EXPORTS[to](results, out, cameras=cameras)
     bubbles = counted(results.points["particle"].nunique(), "bubble")
     return [
-        f"{results.name}: {len(results.points)} rows, {bubbles}, from {results.source}",
+        f"{results.name}: {counted(len(results.points), 'row')}, {bubbles}, from {results.source}",
         f"frame: {results.frame}",
         f"verdict: {results.verdict or 'none: the run was tracked, but not smoothed'}",
     ]

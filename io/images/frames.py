@@ -30,6 +30,7 @@ from telerig.io.images.read import (
     refuse_too_large,
     tiff_reader,
 )
+from telerig.short_text import counted
 
 PAGE_EXTENSIONS = (".tif", ".tiff")
 
@@ -273,7 +274,7 @@ def _refuse_pages(file: Path, folder: Path) -> None:
         return
     if pages > 1:
         raise InputError(
-            f"holds {pages} frames",
+            f"holds {counted(pages, 'frame')}",
             where=str(file),
             todo=f"a multi-page file stands beside the folder: move it to {folder.name}.tif, "
             f"and remove the folder {folder.name}",

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Float32
 from telerig.errors import InputError, TelerigWarning
 from telerig.io.files.text import read_bytes
+from telerig.short_text import counted
 
 Image = NDArray[np.uint8] | NDArray[np.uint16] | Float32
 
@@ -201,7 +202,7 @@ def _tiff(data: bytes, file: Path) -> NDArray[Any]:
             frames = max(len(tiff.pages), of_series)
             if frames > 1:
                 raise InputError(
-                    f"holds {frames} images",
+                    f"holds {counted(frames, 'image')}",
                     where=str(file),
                     todo="save one image per file here; multi-page files belong in runs/",
                 )

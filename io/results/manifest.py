@@ -32,6 +32,7 @@ from telerig.io.files.atomic import (
 from telerig.io.files.hashing import hash_if_there, hashed
 from telerig.io.results.inputs import Input, fingerprints
 from telerig.io.results.record import Part, Record
+from telerig.short_text import counted
 from telerig.version import VERSION
 
 NAME = "manifest.json"
@@ -46,6 +47,23 @@ _OF = {
     "validate": "run", "bubbles": "bubbles", "batch": "batch",
 }  # fmt: skip
 """What the results of a command are of; results of different things need folders of their own."""
+_OWN = {"run.json", "report.html", "overlays"}
+_WRITES = {
+    "detect": {"dots.csv", "rejected.csv", "overlays"},
+    "calibrate": {
+        "calibration.json", "covariance.npz", "uncertainty.npz", "comparison.json", "nominal.toml",
+        "dots.csv", "residuals.csv", "rejected.csv", *_OWN,
+    },
+    "track": {"detections.csv", "tracks.csv", "events.csv", "tracking.json", _MARKS, *_OWN},
+    "smooth": {*_SMOOTHED, "bubbles.csv", "bubble_summary.csv", "run.json", "report.html"},
+    "validate": {"validation.json", "validation.html"},
+    "bubbles": {"detections.csv", "clusters.csv", "overlays"},
+    "batch": {"batch.json", "batch.csv", "bubbles.csv", "report.html"},
+}  # fmt: skip
+"""What a command writes, by the first part of the path in its folder, so that a folder in which it
+would replace an input is refused before the work."""
+_RECORDED = {"rig.toml", "calibration", "stage_axis", "runs", "truth"}
+"""What in a dataset no command may replace."""
 _LOCK_WITHIN_S = 30.0
 _MOST_TRIES = 20
 _LONGEST_NAME, _LONGEST_PATH = 255, 3000
@@ -278,7 +296,7 @@ def _difference(file: Path, entry: Written) -> str:
         return "was changed after telerig wrote it"
     if rows < entry.rows:
         return f"has {rows} of the {entry.rows} rows that telerig wrote"
-    return f"has {rows} rows, telerig wrote {entry.rows}"
+    return f"has {counted(rows, 'row')}, telerig wrote {entry.rows}"
 
 
 @contextmanager
@@ -295,16 +313,13 @@ def replaced_results(
     again : the command line that makes the files again.
     inputs : the fingerprints of the inputs by path relative to ``folder``, see `fingerprints`.
 
-    Raises InputError when the folder cannot be written, and when a file would replace an input.
+    Raises InputError as `check_place` does.
     """
     again = again if len(again) <= LONGEST_COMMAND else again[:LONGEST_COMMAND] + " ..."
     section = Section(again=again, telerig=VERSION, inputs=dict(inputs))
+    check_place(folder, command, inputs)
     with staged_folder(folder) as staged:
         before = _old(folder).sections
-        for name in before if command != "report" else ():
-            if name != "report" and _OF.get(name) != _OF[command]:
-                what = f"holds results of `telerig {name}`, of which some files would be replaced"
-                raise InputError(what, where=str(folder), todo="choose another --out")
         sections = {
             **before,
             command: section.model_copy(update={"unfinished": True}),
@@ -318,17 +333,58 @@ def replaced_results(
         files = {path.relative_to(staged).as_posix(): _entry(path) for path in paths}
         for name in (NAME, *files):
             _make_room(folder / name)
-            if name in inputs:
-                raise InputError(
-                    "would be written over, and these results are made from it",
-                    where=str(folder / name),
-                    todo="choose another --out",
-                )
+        assert not set(files) & set(inputs), "`_WRITES` lacks a file"
         remove_leftovers(folder)
         done = datetime.now(UTC).isoformat(timespec="seconds")
         new = section.model_copy(update={"files": files, "finished": done})
         with _locked(folder, fcntl.LOCK_EX):
             _replace(staged, folder, command, new)
+
+
+def check_place(folder: Path, command: str, inputs: Collection[str] = ()) -> None:
+    """Check that a command can write its results into a folder; for before its work.
+
+    inputs : paths relative to ``folder``, the keys of `fingerprints`.
+
+    Raises InputError when the folder cannot be written, when it holds results of another kind, and
+    when a file would replace an input.
+    """
+    with staged_folder(folder):
+        before = _old(folder).sections
+    for name in before if command != "report" else ():
+        if name != "report" and _OF.get(name) != _OF[command]:
+            what = f"holds results of `telerig {name}`, of which some files would be replaced"
+            raise InputError(what, where=str(folder), todo="choose another --out")
+    for name in inputs:
+        if PurePosixPath(name).parts[:1] and PurePosixPath(name).parts[0] in _WRITES[command]:
+            raise InputError(
+                "would be written over, and these results are made from it",
+                where=str(folder / name),
+                todo="choose another --out",
+            )
+
+
+def check_file(file: Path, option: str = "--out") -> None:
+    """Check that a single file may be written; for before the work.
+
+    Raises InputError for a folder, for what was recorded in a dataset, and for a file of results.
+    """
+    if file.is_dir():
+        todo = f"give {option} the name of a file"
+        raise InputError("is a folder, a file must be written there", where=str(file), todo=todo)
+    if not file.exists():
+        return
+    place = file.resolve()
+    for folder in place.parents:
+        inside = place.relative_to(folder)
+        if (folder / "rig.toml").is_file() and inside.parts[0] in _RECORDED:
+            what = f"belongs to the dataset {folder} and would be written over"
+            raise InputError(what, where=str(file), todo=f"choose another {option}")
+        manifest = _old(folder)
+        for name, section in manifest.sections.items():
+            if inside.as_posix() in section.files:
+                what = f"is a result of `telerig {name}` and would be written over"
+                raise InputError(what, where=str(file), todo=f"choose another {option}")
 
 
 def _one_deeper(section: Section) -> Section:

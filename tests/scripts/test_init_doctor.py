@@ -224,7 +224,9 @@ def test_lost_frames_are_noted(data):
     rows = file.read_text().splitlines()
     late = [f"{r.split(',')[0]},{float(r.split(',')[1]) + 0.05}" for r in rows[15:]]
     file.write_text("\n".join([*rows[:15], *late]) + "\n")
-    assert "1 steps are longer" in _of(check_dataset(data), "run rise frames.csv", "note")
+    assert "1 step longer than" in _of(
+        check_dataset(data), "run rise frames.csv", "note"
+    )
 
 
 def test_an_empty_dataset_is_told_what_to_put_where(tmp_path):
@@ -282,6 +284,10 @@ def test_the_command_prints_json_and_its_exit_code_says_whether_all_is_well(data
     bad = _asked("doctor", str(tmp_path / "nowhere"))
     assert bad.exit_code == 1
     assert "FAILURE dataset" in bad.output
+    assert "ok      Python" in bad.output
+    quiet = _asked("doctor", str(tmp_path / "nowhere"), "--quiet")
+    first, *_, last = quiet.output.splitlines()
+    assert first.startswith("FAILURE dataset") and last.endswith("checks ok")
 
 
 def test_the_time_and_memory_of_a_run_are_estimated(data: Path) -> None:

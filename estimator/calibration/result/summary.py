@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from telerig.io.results.calibration_words import telecentricity_words
+from telerig.short_text import counted
 
 if TYPE_CHECKING:
     from telerig.io.results.calibration import CalibrationFile
@@ -24,7 +25,7 @@ def _numbers(calibration: CalibrationFile) -> list[str]:
     """Return the lines on residuals, parameters, accuracy and the mirror ambiguity."""
     s, lines = calibration.statistics, list[str]()
     lines.append(
-        f"  {s['views']} views, {s['dots_kept']} of {s['dots_measured']} dots kept "
+        f"  {counted(s['views'], 'view')}, {s['dots_kept']} of {s['dots_measured']} dots kept "
         f"({s['share_kept']:.1%}), residual {s['rms_px']:.4f} px RMS per coordinate, "
         f"chi-square {s['chi2_dof']:.2f} per degree of freedom"
     )

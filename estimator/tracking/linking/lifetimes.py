@@ -9,6 +9,7 @@ from dataclasses import replace
 from telerig.arrays import Ints
 from telerig.estimator.tracking.linking.filter import TrackEvent
 from telerig.estimator.tracking.linking.frames import NO_PARTICLE
+from telerig.short_text import counted
 
 
 class Lifetimes:
@@ -27,7 +28,7 @@ class Lifetimes:
             missed = frame - self._last.get(track, (frame - 1, t_s))[0] - 1
             self._last[track] = frame, t_s
             if missed > 0:
-                words = f"{missed} frames bridged" if missed > 1 else "1 frame bridged"
+                words = f"{counted(missed, 'frame')} bridged"
                 gaps.append(TrackEvent("gap", frame, t_s, (track,), words))
         return gaps
 

@@ -29,6 +29,7 @@ from telerig.io.exchange.importing.logger_text import is_number
 from telerig.io.exchange.importing.recording import EXPORT_AGAIN, Recording
 from telerig.io.files.text import LARGEST_NUMBER, need_file
 from telerig.rig.units import ACCELERATION_UNITS
+from telerig.short_text import counted
 
 AXES = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
 
@@ -91,7 +92,7 @@ def import_accelerations(
     t_s = t_s + layout.start_s
     if len(raw) != len(t_s) or not len(raw):
         raise recording.error(
-            f"has {len(raw)} readings and {len(t_s)} times",
+            f"has {counted(len(raw), 'reading')} and {len(t_s)} times",
             "give as many times as readings, at least one",
         )
     blank = np.isnan(raw).all(-1) if recording.lines is not None else np.zeros(len(raw), bool)
@@ -103,7 +104,7 @@ def import_accelerations(
     if stated:
         notes.append(f"their names state another unit: {', '.join(sorted(stated))}")
     if not kept.all():
-        notes.append(f"{int((~kept).sum())} rows are left out, because they have no reading")
+        notes.append(f"left out: {counted(int((~kept).sum()), 'row')} without a reading")
     _check_numbers(recording, np.c_[raw, t_s], [*names, "time"], kept)
     _check_order(recording, t_s, kept)
     table = pd.DataFrame({"t_s": t_s[kept], "sensor": sensor})

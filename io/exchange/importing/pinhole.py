@@ -25,6 +25,7 @@ from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
 from telerig.io.rig_file.writer import toml_key
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, nearest_rotation
+from telerig.short_text import counted
 
 _LEAST_SCALE = 1e-12
 _SHEAR_BESIDE_DISTORTION = 1e-5
@@ -86,7 +87,7 @@ def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> 
     """
     if len(names) != len(pinholes):
         raise InputError(
-            f"the files hold {len(pinholes)} cameras, but the names are {list(names)}",
+            f"the files hold {counted(len(pinholes), 'camera')}, but the names are {list(names)}",
             todo=f"give {len(pinholes)} names, one for each camera",
         )
     check_camera_names(names, "names of the cameras", "--names")
@@ -219,7 +220,7 @@ def nominal_toml(cameras: Sequence[Camera]) -> str:
     """
     if not 1 <= len(cameras) <= MOST_CAMERAS:
         todo = f"rig.toml describes one to {MOST_CAMERAS}"
-        raise InputError(f"{len(cameras)} cameras", todo=todo)
+        raise InputError(counted(len(cameras), "camera"), todo=todo)
     check_camera_names([camera.name for camera in cameras], "nominal.toml")
     lines = []
     for camera in cameras:

@@ -12,6 +12,7 @@ from telerig.io.report.film.mp4 import Progress
 from telerig.io.report.film.path import write_path_film
 from telerig.io.report.film.views import write_views_film
 from telerig.io.results.folders.tracking import read_track_results
+from telerig.short_text import counted
 
 
 def write_films(
@@ -42,7 +43,7 @@ def write_films(
     frames = tracked.file.frames or data.frame_count
     if frames > data.frame_count:
         raise InputError(
-            f"has {data.frame_count} frames, but {frames} were tracked",
+            f"has {counted(data.frame_count, 'frame')}, but {frames} were tracked",
             where=str(recording),
             todo="name the recording that these results are of (--run DATASET/runs/NAME)",
         )

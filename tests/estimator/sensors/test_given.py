@@ -152,7 +152,7 @@ def unordered(step: int) -> Any:
         ({"t_s": np.where(T[3] == T, np.nan, T)}, "not finite at row 3"),
         ({"t_s": T[::-1]}, "sort the samples"),
         ({"t_s": np.round(T, 2)}, "coarser than its rate"),
-        ({"t_s": T[:1], "a_m_s2": readings()[:1]}, "has 1 samples"),
+        ({"t_s": T[:1], "a_m_s2": readings()[:1]}, "has 1 sample"),
         ({"mounted_on": None}, "lacks mounted_on"),
         ({"mounted_on": "lef"}, "did you mean left"),
         ({"axes": None}, "lacks axes"),

@@ -238,6 +238,24 @@ def test_a_correction_that_does_not_fit_is_not_written(
     assert not (run / "corrections.csv").exists()
 
 
+def test_a_reason_stays_in_its_row(tank_copy: Path) -> None:
+    run = tank_copy / "runs" / "rise"
+    code, found = correct(run, "drop", "0", "--reason", 'out of\nfocus, "blurred"')
+    assert code == 0, found
+    table = pd.read_csv(run / "corrections.csv")
+    assert table["reason"].tolist() == ['out of focus, "blurred"']
+    assert len((run / "corrections.csv").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize("option", ["--min-diameter", "--min-contrast"])
+def test_options_of_the_detection_are_refused_where_bubbles_are_given(
+    tank_copy: Path, option: str
+) -> None:
+    run = tank_copy / "runs" / "rise"
+    found = CliRunner().invoke(app, ["track", str(run), option, "5"])
+    assert found.exit_code == 2 and f"{option} 5 has no effect" in found.output
+
+
 def test_tracks_that_are_both_seen_are_not_joined(tmp_path: Path) -> None:
     """Frame 4 shows both to one camera only."""
     run, results = tmp_path / "run", tmp_path / "results"

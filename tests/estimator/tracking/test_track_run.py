@@ -83,7 +83,7 @@ def test_one_bubble_is_one_track_at_the_true_pixels(rise: Path, whole: Tracks) -
 
 def test_min_contrast_reaches_the_detection(rise: Path) -> None:
     run = telerig.load_run(rise / "runs" / "rise").first(1)
-    with pytest.raises(InputError, match="no bubble was found in 1 frames"):
+    with pytest.raises(InputError, match="no bubble was found in 1 frame"):
         telerig.track(run, truth_calibration(), options=TrackOptions(min_contrast=0.98))
 
 

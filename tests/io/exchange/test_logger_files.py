@@ -324,7 +324,7 @@ def test_rows_without_a_reading_are_left_out(tmp_path: Path) -> None:
     check(write(tmp_path, lines(rows[:1], seconds(), more=",")))
     event = write(tmp_path, "\n".join([*rows[:50], "0.485,,,", *rows[50:]]))
     notes = import_accelerations(event, "arm").notes
-    assert "1 rows are left out, because they have no reading" in notes
+    assert "left out: 1 row without a reading" in notes
     cut = write(tmp_path, phyphox() + "3.0,0.1")
     assert any("row 302 is left out" in n for n in import_accelerations(cut, "arm").notes)
 

@@ -9,6 +9,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,14 @@ from telerig.errors import InputError, TelerigWarning
 from telerig.io.files import atomic
 from telerig.io.results import manifest
 from telerig.io.results.inputs import Source, fingerprints
-from telerig.io.results.manifest import is_whole, read_manifest, reading, replaced_results
+from telerig.io.results.manifest import (
+    check_file,
+    check_place,
+    is_whole,
+    read_manifest,
+    reading,
+    replaced_results,
+)
 from telerig.io.results.stale import refuse_stale, stale
 
 TRACKS = ("tracks.csv", "tracking.json")
@@ -439,3 +447,41 @@ def test_results_of_different_things_need_folders_of_their_own(tmp_path: Path) -
     assert read(tmp_path, "run.json", "report.html") == ["c", "c"]
     write(tmp_path, "detect", dots_csv="d")
     write(tmp_path, "report", report_html="d")
+
+
+def test_a_place_that_would_replace_an_input_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "overlays").mkdir()
+    (image := tmp_path / "overlays" / "a.jpg").write_text("image")
+    used = fingerprints(tmp_path, [image])
+    with (
+        pytest.raises(InputError, match="would be written over"),
+        replaced_results(tmp_path, "bubbles", again="", inputs=used),
+    ):
+        pytest.fail("the work has begun")
+    check_place(tmp_path, "validate", used)
+    write(tmp_path / "rise", "track", tracks_csv="t")
+    with pytest.raises(InputError, match="holds results of `telerig track`"):
+        check_place(tmp_path / "rise", "batch")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("rig.toml", "belongs to the dataset"),
+        ("runs/rise/frames.csv", "belongs to the dataset"),
+        ("runs", "is a folder"),
+        ("results/rise/tracks.csv", "is a result of `telerig track`"),
+        ("results/rise/mine.csv", ""),
+        ("plan.csv", ""),
+        ("runs/rise/new.csv", ""),
+    ],
+)
+def test_a_single_file_never_replaces_data_or_results(
+    tmp_path: Path, name: str, words: str
+) -> None:
+    (tmp_path / "runs" / "rise").mkdir(parents=True)
+    write(tmp_path / "results" / "rise", "track", tracks_csv="t")
+    for file in ("rig.toml", "runs/rise/frames.csv", "results/rise/mine.csv", "plan.csv"):
+        (tmp_path / file).write_text("x")
+    with pytest.raises(InputError, match=words) if words else nullcontext():
+        check_file(tmp_path / name)

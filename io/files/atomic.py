@@ -81,12 +81,7 @@ def staged_folder(final: Path) -> Iterator[Path]:
     disk of its own or the folder above cannot be written. Raises InputError when the place cannot
     be written.
     """
-    if final.exists() and not final.is_dir():
-        raise InputError(
-            "is a file, a folder of results must be written there",
-            where=str(final),
-            todo="choose another --out",
-        )
+    check_writable(final)
     make_parent(final)
     alone = final.is_dir() and (
         os.path.ismount(final) or not os.access(final.absolute().parent, os.W_OK)
@@ -207,6 +202,19 @@ def rename(source: Path, target: Path) -> None:
         os.replace(source, target)  # noqa: PTH105
     except OSError as error:
         raise unwritable(target, error) from error
+
+
+def check_writable(folder: Path) -> None:
+    """Raise InputError where a folder can be neither made nor written, without making it."""
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not there.is_dir():
+        raise InputError(
+            "is a file, a folder of results must be written there",
+            where=str(there),
+            todo="choose another --out",
+        )
+    if there != folder and not os.access(there, os.W_OK):
+        raise unwritable(folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from pydantic import Field, field_validator
 
 from telerig.errors import InputError, TelerigWarning
 from telerig.io.files.atomic import (
+    check_writable,
     make_parent,
     remove_leftovers,
     rename,
@@ -349,8 +350,8 @@ def check_place(folder: Path, command: str, inputs: Collection[str] = ()) -> Non
     Raises InputError when the folder cannot be written, when it holds results of another kind, and
     when a file would replace an input.
     """
-    with staged_folder(folder):
-        before = _old(folder).sections
+    check_writable(folder)
+    before = _old(folder).sections
     for name in before if command != "report" else ():
         if name != "report" and _OF.get(name) != _OF[command]:
             what = f"holds results of `telerig {name}`, of which some files would be replaced"

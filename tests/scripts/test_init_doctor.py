@@ -224,9 +224,7 @@ def test_lost_frames_are_noted(data):
     rows = file.read_text().splitlines()
     late = [f"{r.split(',')[0]},{float(r.split(',')[1]) + 0.05}" for r in rows[15:]]
     file.write_text("\n".join([*rows[:15], *late]) + "\n")
-    assert "1 step longer than" in _of(
-        check_dataset(data), "run rise frames.csv", "note"
-    )
+    assert "1 step longer than" in _of(check_dataset(data), "run rise frames.csv", "note")
 
 
 def test_an_empty_dataset_is_told_what_to_put_where(tmp_path):

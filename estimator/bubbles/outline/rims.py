@@ -127,8 +127,12 @@ def _voted(image: Float32, floor: float, least_radius: float) -> Array:
 
     The votes at a place x for radius r are the mean over directions n of n . g(x + r n), with g the
     normalised gradient. Its transform is i J1(k r) k . G / |k|, with J1 Bessel's function.
+
+    The last radius is also the first of the next octave: its blur, of twice as many pixels, moves
+    a rim inwards by about half a step, and the maximum of a bubble between the two would be beyond
+    the radii of either.
     """
-    radii = least_radius * 2.0 ** (np.arange(-1, _RADII_PER_OCTAVE + 1) / _RADII_PER_OCTAVE)
+    radii = least_radius * 2.0 ** (np.arange(-1, _RADII_PER_OCTAVE + 2) / _RADII_PER_OCTAVE)
     margin = int(np.ceil(radii[-1])) + 2
     wide = cv2.copyMakeBorder(image, *(margin,) * 4, cv2.BORDER_REPLICATE)
     calm = _blurred(np.asarray(wide, np.float32), _BLUR_CELLS)

@@ -16,11 +16,11 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.accelerations import Accelerations, Grid
 
-_CLEAR_LOG_RATIO = 60.0
-_LEAST_LOG_RATIO = 20.0
-_MOST_OF_PEAK, _LESS_OF_PEAK = 0.7, 0.5
-"""Largest share of the peak that other lags, or the reversed record, may reach. In the simulated
-runs without a connection 0.7 was never reached by both; see docs/decisions/025."""
+LEAST_LOG_RATIO, BEYOND, REFUSED = 8.0, 1.4, 2.5
+"""Least log-likelihood ratio of a hypothesis, also as a multiple of the largest that is due to
+chance, and of one by which a run is refused. Chance has exponential tails of unknown scale: the
+largest of 24 values is exceeded so many times by one more in 1.3 and 0.1 % of all cases. See
+docs/decisions/025."""
 
 _LONG_RECORD, _MOST_SENSORS = 200_000, 1
 """In longer records, channels that several sensors explain take gigabytes and bring little."""
@@ -102,33 +102,36 @@ class Alignment:
     @property
     def connected(self) -> bool:
         """Whether the record explains the images clearly better than the reversed record does."""
-        return (
-            self.log_ratio > _LEAST_LOG_RATIO
-            and self.reversed_log_ratio < _MOST_OF_PEAK * self.log_ratio
-        )
+        return beyond_chance(self.log_ratio, self.reversed_log_ratio)
 
     @property
     def unique(self) -> bool:
         """Whether the images can be explained at one lag only."""
-        alone = self.runner_up_log_ratio < _MOST_OF_PEAK * self.log_ratio
+        alone = beyond_chance(self.log_ratio, self.runner_up_log_ratio)
         return self.connected and alone and not self.at_end
 
     @property
     def clear(self) -> bool:
-        """Whether the alignment is significant enough to reject the stated clock of an encoder."""
+        """Whether a clock that is said to be the frames' is refused by this offset."""
         others = max(self.runner_up_log_ratio, self.reversed_log_ratio)
-        return (
-            self.unique
-            and self.log_ratio > _CLEAR_LOG_RATIO
-            and others < _LESS_OF_PEAK * self.log_ratio
-        )
+        return self.unique and beyond_chance(self.log_ratio, others, REFUSED)
 
     @property
     def at_zero(self) -> bool:
         """Whether the record explains the images at the clock of the frames, and at no lag clearly
         better.
         """
-        return self.connected and self.at_zero_log_ratio > _MOST_OF_PEAK * self.log_ratio
+        return self.connected and not beyond_chance(self.log_ratio, self.at_zero_log_ratio)
+
+
+def beyond_chance(log_ratio: float, chance: float, times: float = BEYOND) -> bool:
+    """Return whether a hypothesis is better than another by more than chance.
+
+    log_ratio : log-likelihood ratio of both.
+    chance : the largest of those that are due to chance.
+    times : so many times as large it has to be.
+    """
+    return log_ratio > max(LEAST_LOG_RATIO, times * chance)
 
 
 def align(
@@ -331,7 +334,7 @@ def _disagreement(
         own = _total([profile], [size], tried)
         low = max(round(place) - reach, 0)
         peak = low + int(np.argmax(own[low : round(place) + reach + 1]))
-        if own[peak] > _LEAST_LOG_RATIO and abs(peak - round(place)) < reach:
+        if own[peak] > LEAST_LOG_RATIO and abs(peak - round(place)) < reach:
             shift, sd = refined(own, peak)
             squares.append(((peak + shift - place) / sd) ** 2)
     if len(squares) < 2:

@@ -14,11 +14,14 @@ from itertools import permutations, product
 import numpy as np
 
 from telerig.arrays import Array, Bools
-from telerig.estimator.sensors.alignment import effective_size, filtered, whitening_filter
+from telerig.estimator.sensors.alignment import (
+    beyond_chance,
+    effective_size,
+    filtered,
+    whitening_filter,
+)
 
-_CLEAR_LOG_RATIO = 8.0
 _SHIFTS = 24
-_CHANCE = 1.5
 _UPRIGHT_DEG = 30.0
 _LEAST_SAMPLES = 60
 
@@ -116,7 +119,7 @@ def is_clear(log_ratios: Callable[[float], Array]) -> bool:
     """
     first, second = log_ratios(0.0)
     chance = max(float(np.ptp(log_ratios(s))) for s in np.linspace(0.1, 0.9, _SHIFTS))
-    return bool(first - second > max(_CLEAR_LOG_RATIO, _CHANCE * chance))
+    return beyond_chance(float(first - second), chance)
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """Learns the hyper-parameters of shake and bubbles from a run by maximum marginal likelihood.
 
-The structure is fixed: a mode that all cameras share, a mode of each camera's arm, one low-pass of
-the force that drives them, and the motion of the bubbles. Its hyper-parameters are optimised from a
-few starts, of which the most probable end counts, and Laplace's approximation gives their
-covariance. Which of them are the rig's is told by bubbles: what several have in common is the
-rig's, how they differ is their own. Fewer than three do not tell. The best source is a run in which
-the stage moves in front of a target at rest.
+The structure is fixed: a mode that all cameras share (two where the evidence clearly asks for it),
+a mode of each camera's arm, one low-pass of the force that drives them, and the motion of the
+bubbles. Its hyper-parameters are optimised from a few starts, of which the most probable end
+counts, and Laplace's approximation gives their covariance. Which of them are the rig's is told by
+bubbles: what several have in common is the rig's, how they differ is their own. Fewer than three do
+not tell. The best source is a run in which the stage moves in front of a target at rest.
 """
 
 from __future__ import annotations
@@ -56,6 +56,8 @@ _START_DAMPING, _START_RMS_MM, _START_FORCE_HZ = 0.15, 0.1, 60.0
 _HIGHEST_HZ = 50.0
 """Frames are averaged as far as a line of this frequency bears it."""
 _FEW_STEPS = 12
+_FALSE_LINE, _PARAMETERS = 1e-3, 3
+"""Of runs, the share in which a further mode of so many parameters is added for nothing."""
 _ACROSS, _ACROSS_LOG_SIGMA = 0.5, 1.0
 _VAGUE_LOG_SIGMA = 0.3
 _LOG_RATIOS = np.linspace(-3.0, 2.0, 11)
@@ -142,12 +144,15 @@ def _learn_group(
     t_s = group.signals[0].t_s
     factor = averaging_factor(t_s, _HIGHEST_HZ)
     coarse = replace(group, signals=tuple(averaged(c, factor) for c in group.signals))
-    models = [_averaged_rms(model, factor, t_s) for model in models]
-    names = free_names(models[0], coarse, options, first)
-    if len(models) > 1:
-        fits = [maximise(coarse.fast, m, names, steps=_FEW_STEPS) for m in models]
-        models = [max(fits, key=lambda fit: fit.log_posterior).model]
-    fit: Fit = maximise(coarse.fast, models[0], names)
+    starts = [_averaged_rms(model, factor, t_s) for model in models]
+    names, model = free_names(starts[0], coarse, options, first), starts[0]
+    if len(starts) > 1:
+        fits = [maximise(coarse.fast, m, names, steps=_FEW_STEPS) for m in starts]
+        model = max(fits, key=lambda fit: fit.log_posterior).model
+    fit = maximise(coarse.fast, model, names)
+    if first and len(starts) > 1:
+        fit = _with_shared_line(coarse, fit, options)
+        names = free_names(fit.model, coarse, options, first)
     sigma = np.sqrt(np.diag(laplace_covariance(coarse.fast, fit.model, names)))
     found = dict(zip(names, sigma.tolist()))
     model = fit.model
@@ -157,6 +162,27 @@ def _learn_group(
         likely = [posterior_rms(coarse.fast, model, n, medians[n]) for n in vague]
         model = with_values(model, vague, likely)
     return _averaged_rms(model, factor, t_s, back=True), found
+
+
+def _with_shared_line(group: Group, fit: Fit, options: Learning) -> Fit:
+    """Return the fit with one more common mode, at the frequency of an arm's, where the evidence is
+    clearly larger.
+
+    What shakes both arms at one frequency, but not alike, is a common mode and one of an arm. With
+    a second frequency there are more lines than modes, and the bubbles would take the rest.
+    """
+    from scipy.stats import chi2
+
+    trials = []
+    for mode in fit.model.modes:
+        if mode.camera != CARRIAGE:
+            shared = replace(mode, camera=CARRIAGE, damping=_START_DAMPING)
+            model = replace(fit.model, modes=(*fit.model.modes, shared))
+            names = free_names(model, group, options, first=True)
+            trials.append(maximise(group.fast, model, names))
+    best = max(trials, key=lambda trial: trial.log_posterior, default=fit)
+    clear = best.log_posterior - fit.log_posterior > chi2.isf(_FALSE_LINE, _PARAMETERS) / 2
+    return best if clear else fit
 
 
 def _seeded(

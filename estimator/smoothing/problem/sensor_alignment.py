@@ -21,7 +21,14 @@ from telerig.estimator.sensors.accelerations import (
     of_positions,
     of_readings,
 )
-from telerig.estimator.sensors.alignment import Alignment, Channel, align
+from telerig.estimator.sensors.alignment import (
+    LEAST_LOG_RATIO,
+    REFUSED,
+    Alignment,
+    Channel,
+    align,
+    beyond_chance,
+)
 from telerig.estimator.sensors.drift import LEAST_PARTS, drift_of
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
@@ -56,10 +63,9 @@ _LEAST_SAMPLES = 100
 _DIFFERENT_SDS = 5.0
 _LONG_S = 1.2
 _WINDOW_S = 3.0
-_MOST_DRIFT, _DRIFT_LOG_RATIO = 0.02, 5.0
-"""No clock's rate is off by a larger share; a drift explains the images better by at least this."""
+_MOST_DRIFT = 0.02
+"""No clock's rate is off by a larger share."""
 _WINDOW_MARGIN_S = 0.1
-_FACTOR_LOG_RATIO = 60.0
 _LEAST_FRAMES = 150
 _FRAME_FACTORS = {
     1e-3: "they are in milliseconds",
@@ -557,7 +563,7 @@ def _without_drift(
 
     best = sensors
     for _ in range(_MOST_REFINEMENTS if t[-1] - t[0] >= _LONG_S else 0):
-        sds, needed = (_DIFFERENT_SDS, _DRIFT_LOG_RATIO) if best is sensors else (1.0, 0.0)
+        sds, needed = (_DIFFERENT_SDS, LEAST_LOG_RATIO) if best is sensors else (1.0, 0.0)
         corrected = _corrected_drift(best, t, channels, images, sds)
         if corrected is None or not log_ratio(corrected) > log_ratio(best) + needed:
             break
@@ -1027,7 +1033,7 @@ def _frame_times(problem: SmoothingProblem, as_stated: float) -> Finding | None:
             near = [c for c in found if free or abs(c.offset_s) < shift]
             log_ratio[factor] = sum(c.log_ratio for c in near if c.unique)
     best = max(log_ratio, key=lambda f: log_ratio[f], default=None)
-    if best is None or log_ratio[best] < max(_FACTOR_LOG_RATIO, 2 * as_stated):
+    if best is None or not beyond_chance(log_ratio[best], as_stated, REFUSED):
         return None
     return Finding(
         f"the images agree with the sensors only if the times are multiplied by {best:g}: "

@@ -17,7 +17,14 @@ from telerig.estimator.sensors.accelerations import (
     of_positions,
     of_readings,
 )
-from telerig.estimator.sensors.alignment import Alignment, Channel, align
+from telerig.estimator.sensors.alignment import (
+    BEYOND,
+    REFUSED,
+    Alignment,
+    Channel,
+    align,
+    beyond_chance,
+)
 from telerig.estimator.sensors.mounting import Expected, Regression, mounting
 
 GRID = Grid(0.0, 0.002, 1000, 5)
@@ -87,6 +94,15 @@ def test_a_record_without_a_connection_is_not_taken() -> None:
         rng = np.random.default_rng(100 + seed)
         found = aligned(rng, 0.3, around_s=3.0, connected=False)
         assert not found.unique and not found.at_zero
+
+
+@pytest.mark.parametrize(("times", "rate"), [(BEYOND, 0.013), (REFUSED, 0.001)])
+def test_chance_is_exceeded_as_rarely_as_is_stated(times: float, rate: float) -> None:
+    """Exponential log-likelihood ratios of any scale: the largest of 24, and one more."""
+    rng, count = np.random.default_rng(5), 200_000
+    values = 1000.0 * rng.exponential(size=(count, 25))
+    beyond = [beyond_chance(v, m, times) for v, m in zip(values[:, 0], values[:, 1:].max(1))]
+    assert np.mean(beyond) == pytest.approx(rate, abs=4 * np.sqrt(rate / count) + 0.05 * rate)
 
 
 def test_a_single_frequency_is_ambiguous_by_whole_periods() -> None:

@@ -180,14 +180,16 @@ def test_a_short_sound_run_is_no_fault(scenario: str, seed: int, around_s: float
 
 
 @pytest.mark.parametrize(
-    "number", [12, 30, 45, 620, 643, 5004, 20206, 20446, *long((0,), (6,), (21,), (24,), (650,))]
+    "number",
+    [12, 30, 45, 620, 643, 5004, 20206, 20446, 31102, *long((0,), (6,), (21,), (24,), (650,))],
 )
 def test_a_sound_run_of_an_unusual_rig_is_no_fault(number: int) -> None:
     """Arms that resonate beside a servo that hunts; 20 frames a second, whose straight lines make
     the motion in the images smaller; a pump whose harmonic moves the median of the readings by
     6 m/s^2; an encoder that shows nothing but its noise beside a bubble; a sensor on the carriage
     of arms that resonate; 0.1 s of a slow shake, which half of
-    the frames' times fit as well, and which the other arm's sensor fits better beside a bubble."""
+    the frames' times fit as well, and which the other arm's sensor fits better beside a bubble; 0.2
+    s of five bubbles, which fit an encoder 81 ms ahead 2.2 times as well as any other."""
     problem, _, _, known = problem_of(**drawn(number).inputs)
     assert all(f.code is None for f in with_sensors_aligned(problem, known)[1])
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from shake_learning_data import ARM_HZ, BUBBLE_HZ, COMMON_HZ, SWING_HZ, run, true_model
+from sound_runs import drawn, judged
 
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Options, solve
@@ -167,6 +168,12 @@ def test_a_fixed_target_shows_every_mode_of_the_rig() -> None:
     assert all(m.frequency_hz == pytest.approx(ARM_HZ, rel=0.08) for m in arms)
     spread = found.learned[f"modes.{found.modes.index(strongest)}.frequency_hz"]
     assert 0 < spread < 0.1
+
+
+def test_a_pump_that_shakes_both_arms_at_two_frequencies_is_no_motion_of_the_bubbles() -> None:
+    """More lines than one mode of the rig and one of each arm: NEES was 0.3, 46 and 28."""
+    found = judged(drawn(20672))
+    assert not found["alarms"] and max(found["nees"]) < 2.0
 
 
 def test_several_bubbles_tell_their_own_line_from_the_rigs() -> None:

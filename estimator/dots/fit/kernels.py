@@ -16,6 +16,8 @@ _NODE_SPACING_SIGMA = 1.1
 _LEAST_NODES = 24
 _REACH_SIGMA = 7.0
 """Beyond so many standard deviations the point spread is below 1e-10 of its peak."""
+_NO_INFORMATION = 1e-6
+"""A pixel that tells an edge's place to a thousand radii tells nothing."""
 _MIN_SIGMA_PX, _MIN_SEMI_AXIS_PX = 0.3, 0.6
 
 
@@ -383,10 +385,12 @@ def edge_equations(
         x = m22 * offset[0, p] - m12 * offset[1, p]
         y = m11 * offset[1, p] - m12 * offset[0, p]
         length = sqrt(x * x + y * y)
-        if weight[p] == 0.0 or length == 0.0:
+        if length == 0.0:
             continue
         x, y = x / length, y / length
         out = jacobian[0, p] * (m11 * x + m12 * y) + jacobian[1, p] * (m12 * x + m22 * y)
+        if weight[p] * out * out < _NO_INFORMATION:
+            continue
         c, s, order = 1.0, 0.0, 0
         for k in range(len(orders)):
             while order < orders[k]:

@@ -119,7 +119,7 @@ class Experiment:
             raise InputError(f"sigma_px is {self.sigma_px}", where="plan", todo="give > 0 px")
         if self.bubbles < 1 or self.frames < 10 or self.frames * self.bubbles > MOST_STATES:
             raise InputError(
-                f"{self.bubbles} bubbles in {self.frames} frames",
+                f"{counted(self.bubbles, 'bubble')} in {self.frames:.6g} frames",
                 where="plan",
                 todo="plan 1 or more bubbles in 10 or more frames, bubbles times frames at most "
                 f"{MOST_STATES}; a longer run will be at least as accurate as this plan says",
@@ -464,12 +464,12 @@ def plan_words(
         f"{first.vertical}  verdict",
     ]
     for name, one in expected.items():
-        place = "".join(f"{v:7.3g}" for v in one.position_um)
-        speed = "".join(f"{v:7.2g}" for v in one.velocity_mm_s)
+        place = "".join(f" {v:6.3g}" for v in one.position_um)
+        speed = "".join(f" {v:6.2g}" for v in one.velocity_mm_s)
         eta = one.axes[one.vertical].eta
         removed = "" if eta is None else share(eta, 1.0)
         lines.append(f"{name:30}{place} {speed}  {removed:>13}  {one.verdict}")
-    known = "".join(f"{v:7.3g}" for v in first.known_um)
+    known = "".join(f" {v:6.3g}" for v in first.known_um)
     lines += [f"{'(as planned, shake known)':30}{known}", "", _advice(chosen, expected)]
     return lines
 

@@ -81,7 +81,7 @@ def _recording(
     from telerig.errors import TelerigError
     from telerig.estimator.batch.work import load_with
     from telerig.estimator.calibration.result.calibration import calibration_for
-    from telerig.estimator.doctor.checks import Check
+    from telerig.estimator.doctor.checks import Check, Status
     from telerig.estimator.doctor.recording import check_recording
     from telerig.io.report.trial import write_trial_report
 
@@ -89,7 +89,8 @@ def _recording(
     try:
         calibration, _ = calibration_for(run, files)
     except TelerigError as error:
-        return (Check("trial recording", "note", f"not looked at: {error.what}", error.todo),)
+        status: Status = "note" if run.is_dir() else "failure"
+        return (Check("trial recording", status, f"not looked at: {error.what}", error.todo),)
     try:
         found = (run / "detections.csv").is_file()
         recorded = load_with(run, calibration, "detections" if found else None)

@@ -27,6 +27,8 @@ from telerig.short_text import counted, counted_list
 
 _ONCE = ["frame", "particle", "camera"]
 ACTIONS = ("drop", "join", "split", "rename")
+_MOST_DIGITS = 18
+"""Of an id, so that it is a 64-bit whole number."""
 _TODO = {
     "drop": "give particle (the track's id) and frame (the first one to drop; blank for all)",
     "join": "give particle (an id) and other (the id of the track that gets this id)",
@@ -258,6 +260,11 @@ def _refuse_overlap(one: Correction, found: Tracks, where: Path) -> None:
         )
 
 
+def _is_id(text: str) -> bool:
+    """Return whether a text is a whole number that tables hold as one."""
+    return text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS
+
+
 def read_corrections(run: Path, numbered: bool) -> Corrections:
     """Read the corrections of a run; there are none if it has no such file.
 
@@ -288,7 +295,7 @@ def _read(file: Path, numbered: bool) -> Corrections:
             first = "" if np.isnan(frame) else int(frame)
             what = f"{action} has particle {particle!r}, other {other!r}, frame {first!r}"
             raise InputError(what, where=where, todo=_TODO[action])
-        if numbered and not all(t.isascii() and t.isdecimal() for t in (particle, other or "0")):
+        if numbered and not all(_is_id(text) for text in (particle, other or "0")):
             what, todo = (
                 f"{particle!r} or {other!r} is no whole number",
                 "give numbers, as tracks.csv",

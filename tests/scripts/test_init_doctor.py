@@ -283,6 +283,8 @@ def test_the_command_prints_json_and_its_exit_code_says_whether_all_is_well(data
     assert bad.exit_code == 1
     assert "FAILURE dataset" in bad.output
     assert "ok      Python" in bad.output
+    gone = _asked("doctor", str(data / "runs" / "gone"), "--quiet")
+    assert gone.exit_code == 1 and "there is no such run" in gone.output
     quiet = _asked("doctor", str(tmp_path / "nowhere"), "--quiet")
     first, *_, last = quiet.output.splitlines()
     assert first.startswith("FAILURE dataset") and last.endswith("checks ok")

@@ -225,6 +225,7 @@ def test_other_detections_are_tracked_anew(tank_copy: Path) -> None:
         (["split", "0", "5", "--from", "0"], "split from frame 0 on changes all of it"),
         (["split", "0", "5", "--from", "4000"], "split from frame 4000 on changes none of it"),
         (["rename", "0", "b"], "no whole number"),
+        (["rename", "0", "9" * 23], "no whole number"),
         (["cut", "0"], "no action 'cut'"),
         (["drop", "0", "--reason", ""], "reason"),
     ],

@@ -24,7 +24,7 @@ from telerig.estimator.bubbles.flat_field import (
     normalised,
     nothing_to_see,
 )
-from telerig.estimator.bubbles.lighting import NOT_BACKLIT, on_bright_spots
+from telerig.estimator.bubbles.lighting import NOT_BACKLIT, on_bright_spots, share_of_hearts
 from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
@@ -299,8 +299,8 @@ def _without_bright_spots(found: Bubbles, image: NDArray[Any], field: Bools | No
     """Return the bubbles without the dark hearts of bright spots, if the scene is not backlit."""
     table = found.accepted
     ellipse = table[["u_px", "v_px", "a_px", "b_px", "angle_rad"]].to_numpy(float)
-    bright, share = on_bright_spots(image, field, ellipse, found.clusters)
-    if share <= NOT_BACKLIT:
+    bright, seen = on_bright_spots(image, field, ellipse, found.clusters)
+    if share_of_hearts(bright, seen) <= NOT_BACKLIT:
         return found
     places = table.loc[bright, ["u_px", "v_px", "d_eq_px"]].to_numpy(float).tolist()
     hearts = [Rejected(u, v, d / 2.0, "dark heart of a bright spot") for u, v, d in places]

@@ -26,13 +26,17 @@ FEWEST_OUTLINES = 5
 NOT_BACKLIT = 0.25
 """Share of dark hearts beyond which a scene is not backlit: at most 0.07 in six frames of real
 bubbles, 0.8 to 1 in rendered bright spots."""
+NOT_BACKLIT_WORDS = (
+    "dark hearts of bright spots: the scene is not backlit, and bubbles are looked for as "
+    "shadows on a lit screen; put the light behind the bubbles"
+)
 
 
 def on_bright_spots(
     image: NDArray[np.generic], field: Bools | None, ellipse: Array, others: Sequence[Array]
-) -> tuple[Bools, float]:
-    """Return which outlines are dark hearts of bright spots, and their share of those of which the
-    surroundings are seen; 0 if these are too few.
+) -> tuple[Bools, Bools]:
+    """Return which outlines are dark hearts of bright spots, and of which the surroundings are
+    seen, so that this can be told.
 
     image : (rows, columns) grey levels. field : (rows, columns) of the lit screen, or None.
     ellipse : (B, 5) u, v, a, b (px) and angle. others : outlines (n, 2) of other dark regions.
@@ -49,9 +53,14 @@ def on_bright_spots(
     inside = _median(_light(image, None, ellipse, np.array([_INSIDE]))[:, 0])
     around = _median(far.reshape(len(far), len(_AROUND) * far.shape[-1]))
     seen = np.isfinite(edge + inside) & (np.isfinite(far).mean((1, 2)) > _LEAST_AROUND)
-    bright = seen & (edge - around > _BRIGHTER * (edge - inside))
+    return seen & (edge - around > _BRIGHTER * (edge - inside)), seen
+
+
+def share_of_hearts(bright: Bools, seen: Bools) -> float:
+    """Return the share of dark hearts among the outlines that `on_bright_spots` could judge, of one
+    image or of several; 0 if these are too few to tell how the scene is lit."""
     few = np.count_nonzero(seen) < FEWEST_OUTLINES
-    return bright, 0.0 if few else float(np.mean(bright[seen]))
+    return 0.0 if few else float(np.mean(bright[seen]))
 
 
 def _light(

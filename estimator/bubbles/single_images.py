@@ -20,6 +20,7 @@ from telerig.estimator.bubbles.detect import (
     outline_points,
 )
 from telerig.estimator.bubbles.field import described_field
+from telerig.estimator.bubbles.lighting import NOT_BACKLIT_WORDS
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.files.csv_table import write_table
 from telerig.io.images.read import Image, read_image
@@ -109,9 +110,7 @@ def _found(name: str, bubbles: Bubbles) -> Found:
         )
     if bubbles.bright_spots:
         words += (
-            f"; warning: {_count(bubbles.bright_spots, 'outline')} left out as dark "
-            "hearts of bright spots: the scene is not backlit, and bubbles are looked for as "
-            "shadows on a lit screen; put the light behind the bubbles"
+            f"; warning: {_count(bubbles.bright_spots, 'outline')} left out as {NOT_BACKLIT_WORDS}"
         )
     if bubbles.field is not None:
         words += f"; {bubbles.field.mean():.0%} of the image was searched"

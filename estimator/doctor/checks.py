@@ -283,13 +283,15 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
 
 
 def _crowds(run: RunData, what: str) -> Iterator[Check]:
-    """Warn when bubbles cover more of a frame in the middle of the run than detection can take."""
+    """Warn when bubbles cover more of a frame in the middle of the run than detection can take, or
+    when it is not backlit."""
     from telerig.estimator.bubbles.detect import (
         COVERED_LIMIT,
         crowded_words,
         find_bubbles,
         is_crowded,
     )
+    from telerig.estimator.bubbles.lighting import NOT_BACKLIT_WORDS
     from telerig.estimator.tracking.detect_run import described_fields
 
     try:
@@ -301,6 +303,9 @@ def _crowds(run: RunData, what: str) -> Iterator[Check]:
             found = find_bubbles(image, field=fields.get(camera))
             if is_crowded(found.covered, len(found.accepted), COVERED_LIMIT):
                 words = crowded_words(f"camera {camera}", found.covered)
+                yield Check(f"{what} bubbles", "warning", words)
+            if found.bright_spots:
+                words = f"camera {camera}: {found.bright_spots} outlines are {NOT_BACKLIT_WORDS}"
                 yield Check(f"{what} bubbles", "warning", words)
     except TelerigError as error:
         yield _failure(f"{what} images", error)

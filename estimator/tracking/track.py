@@ -17,6 +17,13 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Ints
 from telerig.errors import LOAD, CalibrationError, InputError, need_kind
 from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
+from telerig.estimator.bubbles.field import lit_field
+from telerig.estimator.bubbles.lighting import (
+    NOT_BACKLIT,
+    NOT_BACKLIT_WORDS,
+    on_bright_spots,
+    share_of_hearts,
+)
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.groups import candidates_of
 from telerig.estimator.bubbles.pairing.learning import learn_rig
@@ -75,6 +82,10 @@ LARGEST_ID = 10**15
 _RELIABLE = 0.99
 """Probability of a group from which shapes are learned."""
 
+_LIGHT_FRAMES = 10
+"""Images of each camera, spread over those with bubbles, of which is looked at how they are lit:
+five outlines in all tell it."""
+
 _FRAMES_AT_ONCE = 64
 """Frames whose tables are turned into arrays together."""
 
@@ -106,6 +117,8 @@ class TrackingStream:
     beyond : number of points beyond the dots of the calibration, so far.
     common_mm2 : (3,) sums over the points of the variances by the calibration's errors, so far.
     place_mm : (3,) sum of the points, so far.
+    shown : for each camera, ellipses (B, 5) by frame, of the first frame with bubbles in each of
+        `_LIGHT_FRAMES` parts of the run, so far.
     names : names of the tracks by number, if the given ids are no whole numbers.
     """
 
@@ -124,6 +137,7 @@ class TrackingStream:
     place_mm: Array = field(default_factory=lambda: np.zeros(3))
     particles: set[Any] = field(default_factory=set)
     covered: dict[str, tuple[int, float]] = field(default_factory=dict)
+    shown: dict[str, dict[int, Array]] = field(default_factory=dict)
     names: Mapping[int, str] | None = None
 
     def __post_init__(self) -> None:
@@ -157,8 +171,21 @@ class TrackingStream:
                 many, area = self.covered.get(str(camera), (0, 0.0))
                 many, area = many + int(areas.notna().sum()), area + float(areas.sum())
                 self.covered[str(camera)] = many, area
+            if self.run.detections is None:
+                self._keep_shown(part.detections)
             publish("linked", tracks=part.tracks, detections=part.detections)
             yield part
+
+    def _keep_shown(self, detections: pd.DataFrame) -> None:
+        """Keep the outlines of those frames whose images `_not_backlit` looks at."""
+        for camera, rows in detections[detections["a_px"].notna()].groupby("camera"):
+            frames = self.shown.setdefault(str(camera), {})
+            part = rows["frame"] * _LIGHT_FRAMES // self.run.frame_count
+            known = {frame * _LIGHT_FRAMES // self.run.frame_count for frame in frames}
+            for _, new in rows[~part.isin(known)].groupby(part):
+                first = new[new["frame"] == new["frame"].min()]
+                ellipse = first[["u_px", "v_px", "a_px", "b_px", "angle_rad"]]
+                frames[int(first["frame"].iloc[0])] = ellipse.to_numpy(float)
 
     def _with_share(self, part: Linked) -> Linked:
         """Add the columns of the calibration's share, and count them."""
@@ -207,6 +234,7 @@ class TrackingStream:
             "warnings": [
                 *_window_warnings(run, self.calibration),
                 *self._crowded(),
+                *self._not_backlit(),
                 *self.corrections.warnings,
                 *([] if known else [NO_COVARIANCE]),
             ],
@@ -235,6 +263,26 @@ class TrackingStream:
             share = area / (float(looked_at) * frames)
             if is_crowded(share, many / frames, COVERED_LIMIT):
                 found.append(crowded_words(f"camera {camera}", share))
+        return found
+
+    def _not_backlit(self) -> list[str]:
+        """Return a warning for each camera whose bubbles are dark hearts of bright spots."""
+        found, fields = [], described_fields(self.run) if self.shown else {}
+        for camera, frames in self.shown.items():
+            judged = []
+            for frame, ellipse in frames.items():
+                image = self.run.image(camera, frame)
+                if image is not None:
+                    field = fields[camera] if camera in fields else lit_field(image)
+                    judged.append(on_bright_spots(image, field, ellipse, []))
+            if not judged:
+                continue
+            bright, seen = map(np.concatenate, zip(*judged))
+            if share_of_hearts(bright, seen) > NOT_BACKLIT:
+                found.append(
+                    f"camera {camera}: {bright.sum()} of {seen.sum()} outlines in {len(judged)} "
+                    f"images are {NOT_BACKLIT_WORDS}"
+                )
         return found
 
 

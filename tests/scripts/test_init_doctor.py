@@ -274,6 +274,25 @@ def test_a_run_with_crowded_images_is_warned_about(tmp_path):
     assert "camera left: bubbles cover 17%" in said and "beyond 10%" in said
 
 
+def test_a_run_that_is_not_backlit_is_warned_about(tmp_path):
+    new_dataset(tmp_path / "tank", [NewCamera(n, (400, 400)) for n in ("left", "right")])
+    v, u = np.mgrid[:400, :400]
+    for camera, around in (("left", 200.0), ("right", 60.0)):
+        grey = np.full((400, 400), around)
+        for x, y in [(i, j) for i in range(60, 400, 90) for j in range(60, 400, 90)]:
+            far = np.hypot(u - x, v - y)
+            grey[far < 18.0] = 200.0
+            grey[far < 10.0] = 20.0
+        folder = tmp_path / "tank" / "runs" / "swarm" / camera
+        folder.mkdir(parents=True)
+        picture = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.uint8)
+        for frame in range(2):
+            cv2.imwrite(str(folder / f"{frame:06d}.png"), picture)
+    (tmp_path / "tank" / "runs" / "swarm" / "frames.csv").write_text("frame,t_s\n0,0.0\n1,0.01\n")
+    said = _of(list(check_dataset(tmp_path / "tank")), "run swarm bubbles", "warning")
+    assert "camera right: 16 outlines are dark hearts" in said and "camera left" not in said
+
+
 def test_the_command_prints_json_and_its_exit_code_says_whether_all_is_well(data, tmp_path):
     good = _asked("doctor", str(data), "--json")
     assert good.exit_code == 0, good.output

@@ -11,7 +11,7 @@ from places import REAL
 
 from telerig.arrays import Array
 from telerig.estimator.bubbles.detect import find_bubbles
-from telerig.estimator.bubbles.lighting import NOT_BACKLIT, on_bright_spots
+from telerig.estimator.bubbles.lighting import NOT_BACKLIT, on_bright_spots, share_of_hearts
 from telerig.estimator.bubbles.single_images import write_bubbles
 
 PLACES = np.stack(np.meshgrid(np.arange(60, 500, 90), np.arange(60, 400, 90)), -1).reshape(-1, 2)
@@ -73,5 +73,5 @@ def test_no_real_backlit_frame_is_said_not_to_be(name: str) -> None:
     assert image is not None
     found = find_bubbles(image)
     ellipse = found.accepted[["u_px", "v_px", "a_px", "b_px", "angle_rad"]].to_numpy(float)
-    share = on_bright_spots(image, found.field, ellipse, found.clusters)[1]
+    share = share_of_hearts(*on_bright_spots(image, found.field, ellipse, found.clusters))
     assert share < 0.3 * NOT_BACKLIT and not found.bright_spots

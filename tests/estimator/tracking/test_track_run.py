@@ -338,6 +338,29 @@ def test_a_crowded_run_is_warned_about(rise: Path, whole: Tracks) -> None:
         assert len(said) == count
 
 
+@pytest.mark.parametrize("reach", [1.3, 2.3])
+def test_a_run_that_is_not_backlit_is_warned_about(
+    rise: Path, whole: Tracks, tmp_path: Path, reach: float
+) -> None:
+    """Bright spots, ``reach`` times as wide as their dark hearts, in place of the bubble."""
+    shutil.copytree(rise, tmp_path / "data")
+    run = telerig.load_run(tmp_path / "data" / "runs" / "rise")
+    for row in whole.detections.itertuples():
+        width, height = run.image_sizes_px[row.camera]
+        v, u = np.mgrid[:height, :width]
+        far = np.hypot(u - row.u_px, v - row.v_px) / (row.d_eq_px / 2.0)
+        image = np.where(far < reach, 170.0, 60.0)
+        image[far < 1.0] = 15.0
+        noise = np.random.default_rng(row.frame).normal(0.0, 1.0, image.shape)
+        image = cv2.GaussianBlur(image, (0, 0), 1.5) + noise
+        (file,) = (run.path / row.camera).glob(f"*{row.frame:06d}.*")
+        cv2.imwrite(str(file), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    warnings = telerig.track(run, truth_calibration()).summary["warnings"]
+    said = [w for w in warnings if "the scene is not backlit" in w]
+    assert len(said) == 2
+    assert said[0].startswith("camera left: ") and "images are dark hearts of" in said[0]
+
+
 def test_bubbles_after_a_long_time_without_any(rise: Path, whole: Tracks, tmp_path: Path) -> None:
     before = 700
     late = whole.detections.assign(frame=whole.detections["frame"] + before, particle="")

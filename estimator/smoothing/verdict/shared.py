@@ -138,10 +138,12 @@ def _scores(
     if len(seen) < max(1, FEWEST_BUBBLES * len(np.unique(frame))):
         return
     root = np.sqrt(solution.weights[int(marks)][mine])[:, None]
-    whitener = pixel_whiteners(graph, seen.covariance_px2, noise) * root[:, None]
-    residual = solution.residuals[int(marks)][mine] @ within * root
+    whitener = pixel_whiteners(graph, seen.covariance_px2, noise)
+    residual = solution.residuals[int(marks)][mine]
+    predicted_px = seen.uv_px + np.linalg.solve(whitener, residual[..., None])[..., 0]
+    whitener, residual = whitener * root[:, None], residual @ within * root
     reach = max(problem.cameras[camera].image_size_px) / 2
-    for by in _derivatives(seen, reach):
+    for by in _derivatives(predicted_px, frame, reach):
         along = np.einsum("mij,mj->mi", whitener, by)
         score = (along * residual).sum(1)
         of_draws = np.einsum("mi,mik->mk", along, drawn[mine])
@@ -168,15 +170,16 @@ def _is_shared(item: Ints, frame: Ints, score: Array, squares: Array, weight: Ar
     return bool((np.abs(each.sum() - each) >= _LEAST_OF_OTHERS * expected).all())
 
 
-def _derivatives(obs: Observations, reach_px: float) -> Array:
+def _derivatives(predicted_px: Array, frame: Ints, reach_px: float) -> Array:
     """Return the derivatives (4, M, 2) of pixels: shift along u and v, turn and growth.
 
     The last two are about the middle of what is seen in the frame, so that they contain no shift,
-    and in px at the edge of the image.
+    and in px at the edge of the image. Measured pixels contain the noise that the residuals do, and
+    of bubbles that are close together it would be a growth.
     """
-    frame = np.unique(obs.frame, return_inverse=True)[1]
-    middle = np.stack([np.bincount(frame, x) for x in obs.uv_px.T], -1)
-    away = (obs.uv_px - (middle / np.bincount(frame)[:, None])[frame]) / reach_px
+    frame = np.unique(frame, return_inverse=True)[1]
+    middle = np.stack([np.bincount(frame, x) for x in predicted_px.T], -1)
+    away = (predicted_px - (middle / np.bincount(frame)[:, None])[frame]) / reach_px
     one = np.ones_like(away)
     turn = away[:, ::-1] * [-1.0, 1.0]
     return np.stack([one * [1.0, 0.0], one * [0.0, 1.0], turn, away])

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
-from places import ROOT
+from guard_parts.contradictions import contradictions
 from smoothed_folder import write_folder
 
 from telerig.io.report.run.report import write_track_report
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from guard_parts.contradictions import contradictions
 
 
 def _tile(name: str, value: str) -> str:

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import numpy as np
 import pytest
-from places import ROOT
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
 from guard_parts import metrics
 from guard_parts.inputs import digest
 from guard_parts.metrics import BETTER, FAILED, GONE, MOVED, NEW, WITHIN, WORSE, Metric

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 from numpy.random import default_rng
-from places import ROOT
 from shake_problem import true_model
+from shake_scene import LATERAL, LATERAL_SHAKE, Run, cases, simulate
 
 from telerig.estimator.smoothing.problem.problem import ShakeModel
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from shake_scene import LATERAL, LATERAL_SHAKE, Run, cases, simulate
 
 
 @cache

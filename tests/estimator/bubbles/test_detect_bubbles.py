@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
+from bubble_outline_renderer import Drawn, centre_bound_px, draw
 from numpy.typing import NDArray
-from places import ROOT
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import (
@@ -18,9 +16,6 @@ from telerig.estimator.bubbles.detect import (
 )
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS, HARMONIC_COLUMNS
 from telerig.io.simulation.images.bubbles import Look, Silhouette, transmission
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from bubble_outline_renderer import Drawn, centre_bound_px, draw
 
 Array = NDArray[np.float64]
 WHITE = 3000.0

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from bubble_outline_renderer import Drawn, draw
 from numpy.typing import NDArray
-from places import REAL, ROOT
+from places import REAL
 
 from telerig.estimator.bubbles.detect import detect_bubbles
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from bubble_outline_renderer import Drawn, draw
 
 Array = NDArray[np.float64]
 PAIR = REAL / "bubble_pair"

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
 import numba
 import numpy as np
 import pytest
+from bubble_outline_renderer import Drawn, draw
 from numpy.typing import NDArray
-from places import ROOT
 from scipy.special import ndtr
 
 from telerig import compiled
@@ -20,9 +18,6 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     profile_table,
     start_outlines,
 )
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from bubble_outline_renderer import Drawn, draw
 
 
 @pytest.mark.parametrize("many", [9, 17])

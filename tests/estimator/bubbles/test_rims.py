@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from places import REAL, ROOT
+from bubble_outline_renderer import Drawn, draw
+from dense_bubbles import ELLIPSE
+from dense_scenes import paired, swarm, whole
+from places import REAL
 from seeds import few_or_many
 
 from telerig.arrays import Array
@@ -17,11 +18,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import centre_covariance
 from telerig.estimator.bubbles.outline.outline_fit import implausible_outlines, start_outlines
 from telerig.estimator.bubbles.outline.rim_rays import RAYS, closed_rims, owners
 from telerig.estimator.bubbles.outline.rims import find_rims
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from bubble_outline_renderer import Drawn, draw
-from dense_bubbles import ELLIPSE
-from dense_scenes import paired, swarm, whole
 
 WHITE = 3000.0
 

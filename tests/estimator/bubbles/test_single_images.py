@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from places import REAL, ROOT
+from bubble_outline_renderer import Drawn, draw
+from places import REAL
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import detect_bubbles, find_bubbles
 from telerig.estimator.bubbles.field import lit_field, mask_field, region_field
 from telerig.estimator.bubbles.single_images import CLUSTER_COLUMNS, write_bubbles
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from bubble_outline_renderer import Drawn, draw
 
 PLACES = np.array([(150.0, 140.0), (260.0, 180.0), (200.0, 270.0), (300.0, 300.0)])
 RADIUS_PX = 16.0

@@ -150,9 +150,12 @@ def _learn_group(
         fits = [maximise(coarse.fast, m, names, steps=_FEW_STEPS) for m in starts]
         model = max(fits, key=lambda fit: fit.log_posterior).model
     fit = maximise(coarse.fast, model, names)
-    if first and len(starts) > 1:
-        fit = _with_shared_line(coarse, fit, options)
-        names = free_names(fit.model, coarse, options, first)
+    if len(starts) > 1:
+        others = [maximise(coarse.fast, m, names) for m in overlooked(fit.model, coarse)]
+        fit = max((fit, *others), key=lambda fit: fit.log_posterior)
+        if first:
+            fit = _with_shared_line(coarse, fit, options)
+            names = free_names(fit.model, coarse, options, first)
     sigma = np.sqrt(np.diag(laplace_covariance(coarse.fast, fit.model, names)))
     found = dict(zip(names, sigma.tolist()))
     model = fit.model
@@ -183,6 +186,32 @@ def _with_shared_line(group: Group, fit: Fit, options: Learning) -> Fit:
     best = max(trials, key=lambda trial: trial.log_posterior, default=fit)
     clear = best.log_posterior - fit.log_posterior > chi2.isf(_FALSE_LINE, _PARAMETERS) / 2
     return best if clear else fit
+
+
+def overlooked(model: ShakeModel, group: Group) -> list[ShakeModel]:
+    """Return starts that no start of another frequency leads to, from the end of one.
+
+    What moves one camera against the other may be one arm or both: here both are like the stronger
+    one. A common mode may be hidden by an oscillation of the bubbles at its frequency.
+    """
+    out = list[ShakeModel]()
+    arms = [i for i, mode in enumerate(model.modes) if mode.camera != CARRIAGE]
+    if len(arms) > 1:
+        strongest = max((model.modes[i] for i in arms), key=lambda mode: max(mode.rms_mm))
+        rms = np.sqrt(np.mean([np.square(model.modes[i].rms_mm) for i in arms], axis=0))
+        alike = replace(strongest, rms_mm=(float(rms[0]), float(rms[1]), float(rms[2])))
+        modes = [
+            replace(alike, camera=m.camera) if i in arms else m for i, m in enumerate(model.modes)
+        ]
+        out.append(replace(model, modes=tuple(modes)))
+    for i, own in enumerate(model.bubble.zigzags):
+        if _concerns(group, model, f"bubble.zigzags.{i}.rms_mm"):
+            modes = [
+                replace(m, frequency_hz=own.frequency_hz) if m.camera == CARRIAGE else m
+                for m in model.modes
+            ]
+            out.append(replace(model, modes=tuple(modes)))
+    return out
 
 
 def _seeded(

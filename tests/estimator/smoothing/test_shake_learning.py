@@ -16,7 +16,12 @@ from telerig.estimator.smoothing.learning.evidence import (
     signal_evidence,
     signal_posterior,
 )
-from telerig.estimator.smoothing.learning.learn import Learning, groups_of, learn
+from telerig.estimator.smoothing.learning.learn import (
+    Learning,
+    groups_of,
+    learn,
+    overlooked,
+)
 from telerig.estimator.smoothing.learning.likelihood import (
     evidence,
     laplace_covariance,
@@ -257,3 +262,27 @@ def test_lines_across_are_as_wide_whichever_way_the_cameras_look(angle_deg: floa
     # one camera alone knows nothing of its own depth
     single = groups_of(signals[:2], problem.up)[1]
     np.testing.assert_allclose(single.pattern, np.abs(signals[1].direction), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_a_common_mode_at_the_bubbles_own_frequency_is_found(seed: int) -> None:
+    """Without a start there it is taken for 9 and 36 Hz, in the second run with a tenth of it."""
+    problem, *_ = run(np.random.default_rng(seed), bubbles=5, seconds=0.6, common_hz=BUBBLE_HZ)
+    (common, *_) = learn(problem, default_model(problem)).modes
+    assert common.camera == CARRIAGE
+    assert common.frequency_hz == pytest.approx(BUBBLE_HZ, rel=0.1)
+    assert 0.1 < common.rms_mm[1] < 0.25
+
+
+def test_both_arms_are_tried_alike_after_one_took_all() -> None:
+    """Only the difference of the cameras' motions is seen well, which one arm alone explains."""
+    model = true_model()
+    strong, weak = (replace(model.modes[1], rms_mm=(0.0, mm, 0.0)) for mm in (0.08, 0.0))
+    weak = replace(weak, camera=1, frequency_hz=15.0)
+    problem, *_ = run(np.random.default_rng(1), bubbles=5, seconds=0.2)
+    group = groups_of(signals_of(problem), problem.up)[0]
+    alike, hidden = overlooked(replace(model, modes=(model.modes[0], strong, weak)), group)
+    assert [m.frequency_hz for m in alike.modes] == [COMMON_HZ, ARM_HZ, ARM_HZ]
+    assert [m.camera for m in alike.modes] == [CARRIAGE, 0, 1]
+    np.testing.assert_allclose([m.rms_mm[1] for m in alike.modes[1:]], 0.08 / np.sqrt(2))
+    assert [m.frequency_hz for m in hidden.modes] == [BUBBLE_HZ, ARM_HZ, 15.0]

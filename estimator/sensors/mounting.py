@@ -23,6 +23,8 @@ from telerig.estimator.sensors.alignment import (
 
 _SHIFTS = 24
 _UPRIGHT_DEG = 30.0
+LEAST_BESIDE = 2.0
+"""Least log-likelihood ratio by the images of axes that other sensors, too, find clearly better."""
 _LEAST_SAMPLES = 60
 
 
@@ -35,8 +37,8 @@ class Expected:
     known : (n,) whether it is known.
     whole : whether it is the sensor's complete acceleration along the direction. For an arm that of
         the stage or of another arm is not, nor for the stage that of an arm: beyond its resonance
-        an arm moves in the opposite direction. It only tells which axes replace stated ones that
-        gravity excludes.
+        an arm moves in the opposite direction. By itself it only tells which axes replace stated
+        ones that gravity excludes.
     """
 
     direction: Array
@@ -75,7 +77,9 @@ def mounting(
     """Return the axes of a sensor that agree best with gravity and expected motion.
 
     All signed permutations of the stated axes are compared, by what is whole alone if the stated
-    ones agree with gravity.
+    ones agree with gravity. Those that fit it better, be it by little, are clearly better if the
+    rest says so: a short record of one bubble hardly shows axes, and two sensors that disagree do
+    not tell which of them is wrong.
 
     axes : (3, 3) stated direction of each of the sensor's axes.
     at_rest : (3,) mean reading, which has to point along up (3,).
@@ -91,24 +95,28 @@ def mounting(
         upright[:] = True
     candidates = turned[upright]
     stated = np.flatnonzero(np.abs(candidates - axes).max((1, 2)) < 1e-9)
-    judging = [f for f in expected if f.whole or not len(stated)]
-    fits = [(f, r) for f in judging if (r := Regression.of(f.values, f.known & known, x))]
-    if not fits:
+    fits = [(f, r) for f in expected if (r := Regression.of(f.values, f.known & known, x))]
+    judging = [(f, r) for f, r in fits if f.whole or not len(stated)]
+    if not judging:
         found = axes if len(stated) else candidates[0]
         return Mounting(found, not len(stated), 0.0)
-
-    def scores(axes: Array, shift: float = 0.0) -> Array:
-        each = [r.log_ratios(axes @ f.direction, shift) for f, r in fits]
-        return np.asarray(np.sum(each, axis=0))
-
-    score = scores(candidates)
+    score = _scores(judging, candidates)
     changes = np.abs(candidates - axes).sum((1, 2))
     best = int(np.lexsort((changes, -score))[0])
     if not len(stated):
         return Mounting(candidates[best], True, float("inf"))
     own = int(stated[0])
-    clear = best != own and is_clear(partial(scores, candidates[[best, own]]))
-    return Mounting(candidates[best], clear, float(score[best] - score[own]))
+    lead, both = float(score[best] - score[own]), candidates[[best, own]]
+    rest = [(f, r) for f, r in fits if not f.whole]
+    clear = lead > 0 and is_clear(partial(_scores, judging, both))
+    clear |= lead > LEAST_BESIDE and is_clear(partial(_scores, rest, both))
+    return Mounting(candidates[best], clear, lead)
+
+
+def _scores(fits: Sequence[tuple[Expected, Regression]], axes: Array, shift: float = 0.0) -> Array:
+    """Return the log-likelihood ratio (h,) of each of h axes (h, 3, 3) to none."""
+    each = [r.log_ratios(axes @ f.direction, shift) for f, r in fits]
+    return np.asarray(np.sum(each, axis=0)) if each else np.zeros(len(axes))
 
 
 def is_clear(log_ratios: Callable[[float], Array]) -> bool:

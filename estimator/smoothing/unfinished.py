@@ -7,10 +7,9 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from telerig.arrays import Array
 from telerig.estimator.smoothing.pieces import Constants, Piece
@@ -21,6 +20,9 @@ from telerig.io.files.atomic import atomic_path
 from telerig.io.files.hdf5 import hdf5_file
 from telerig.io.files.typed_json import packed, unpacked
 from telerig.io.results.work_folder import empty_unless
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _CONSTANTS = "constants.json"
 _NOTES = "notes"

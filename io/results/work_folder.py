@@ -8,12 +8,14 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from telerig import version
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.hashing import hashed
-from telerig.io.results.inputs import Input
+
+if TYPE_CHECKING:
+    from telerig.io.results.inputs import Input
 
 
 def work_key(options: Mapping[str, Any], inputs: Mapping[str, Input]) -> str:

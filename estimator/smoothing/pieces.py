@@ -34,7 +34,7 @@ from telerig.estimator.smoothing.problem.window import Window, all_of
 
 MOST_ROWS, MOST_FRAMES = 60_000, 12_000
 """Frames of all bubbles together, and frames, that are solved in one piece."""
-_ROWS, _FRAMES = 32_000, 10_000
+_ROWS, _FRAMES = 24_000, 10_000
 """Of a piece of a run that has more. With the margins of 20 bubbles it takes less than 1 GB."""
 _DECAY_TIMES = 1.5
 _CONSTANT = 1e-6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -172,8 +173,8 @@ def smooth(
         ENCODER_JUMP, ENCODER_CLOCK, STAGE_AXIS, CAMERA_SCALE, FRAME_TIMES, RISE_SPEED.
     folder : an existing folder for results.h5 of a run that is too long for memory; None for a
         temporary one, which lasts as long as what is returned.
-    unfinished : where the finished pieces of such a run are kept, so that an interrupted call with
-        the same arguments goes on; None for a temporary folder.
+    unfinished : where the finished pieces of such a run are kept, so that an interrupted call goes
+        on. Its key has to differ for other arguments. None for a temporary folder.
 
     A run of more than 12,000 frames, or of more than 60,000 of all bubbles together, is smoothed
     in pieces; its tables are read from results.h5 when they are asked for.
@@ -221,10 +222,11 @@ def smooth(
     else:
         keep = None if folder else TemporaryDirectory(prefix="telerig-")
         place = folder or Path(keep.name if keep else "")
-        kept = unfinished or UnfinishedPieces(place / ".pieces")
-        done = run.in_pieces(pieces, StoredTables(place, keep), kept)
-        if unfinished is None:
-            kept.end()
+        with ExitStack() as stack:
+            if unfinished is None:
+                own = stack.enter_context(TemporaryDirectory(prefix=".pieces-", dir=place))
+                unfinished = UnfinishedPieces(Path(own), "")
+            done = run.in_pieces(pieces, StoredTables(place, keep), unfinished)
     from telerig.estimator.smoothing.verdict.contradiction import sample_warnings, speed_warnings
 
     verdict, evidence, solution = done.verdict, done.evidence, done.solution

@@ -54,7 +54,7 @@ class UnfinishedPieces:
     """
 
     folder: Path
-    key: str = ""
+    key: str
 
     def begin(self) -> None:
         """Make the folder, or leave what it holds of the same key."""

@@ -255,41 +255,40 @@ def test_images_of_the_wrong_size_are_found(tmp_path):
     assert "6 views" in _of(checks, "views", "note")
 
 
-def test_a_run_with_crowded_images_is_warned_about(tmp_path):
-    """Nine discs cover 17 % of the left images, one large one as much of the right images."""
-    new_dataset(tmp_path / "tank", [NewCamera(n, (200, 200)) for n in ("left", "right")])
-    v, u = np.mgrid[:200, :200]
-    places = {"left": [(i, j) for i in (40, 100, 160) for j in (40, 100, 160)], "right": [(99, 99)]}
-    for camera, radius in (("left", 15.5), ("right", 46.5)):
-        grey = np.full((200, 200), 200.0)
-        for x, y in places[camera]:
-            grey[np.hypot(u - x, v - y) < radius] = 20.0
-        folder = tmp_path / "tank" / "runs" / "swarm" / camera
+def _bubbles_warning(tank, size_px, pictures):
+    """What the doctor warns of a run whose two images of each camera are these."""
+    new_dataset(tank, [NewCamera(n, (size_px, size_px)) for n in pictures])
+    for camera, grey in pictures.items():
+        folder = tank / "runs" / "swarm" / camera
         folder.mkdir(parents=True)
         picture = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.uint8)
         for frame in range(2):
             cv2.imwrite(str(folder / f"{frame:06d}.png"), picture)
-    (tmp_path / "tank" / "runs" / "swarm" / "frames.csv").write_text("frame,t_s\n0,0.0\n1,0.01\n")
-    said = _of(list(check_dataset(tmp_path / "tank")), "run swarm bubbles", "warning")
+    (tank / "runs" / "swarm" / "frames.csv").write_text("frame,t_s\n0,0.0\n1,0.01\n")
+    return _of(list(check_dataset(tank)), "run swarm bubbles", "warning")
+
+
+def test_a_run_with_crowded_images_is_warned_about(tmp_path):
+    """Nine discs cover 17 % of the left images, one large one as much of the right images."""
+    v, u = np.mgrid[:200, :200]
+    places = {"left": [(i, j) for i in (40, 100, 160) for j in (40, 100, 160)], "right": [(99, 99)]}
+    pictures = {camera: np.full((200, 200), 200.0) for camera in places}
+    for camera, radius in (("left", 15.5), ("right", 46.5)):
+        for x, y in places[camera]:
+            pictures[camera][np.hypot(u - x, v - y) < radius] = 20.0
+    said = _bubbles_warning(tmp_path / "tank", 200, pictures)
     assert "camera left: bubbles cover 17%" in said and "beyond 10%" in said
 
 
 def test_a_run_that_is_not_backlit_is_warned_about(tmp_path):
-    new_dataset(tmp_path / "tank", [NewCamera(n, (400, 400)) for n in ("left", "right")])
     v, u = np.mgrid[:400, :400]
-    for camera, around in (("left", 200.0), ("right", 60.0)):
-        grey = np.full((400, 400), around)
+    pictures = {"left": np.full((400, 400), 200.0), "right": np.full((400, 400), 60.0)}
+    for grey in pictures.values():
         for x, y in [(i, j) for i in range(60, 400, 90) for j in range(60, 400, 90)]:
             far = np.hypot(u - x, v - y)
             grey[far < 18.0] = 200.0
             grey[far < 10.0] = 20.0
-        folder = tmp_path / "tank" / "runs" / "swarm" / camera
-        folder.mkdir(parents=True)
-        picture = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.uint8)
-        for frame in range(2):
-            cv2.imwrite(str(folder / f"{frame:06d}.png"), picture)
-    (tmp_path / "tank" / "runs" / "swarm" / "frames.csv").write_text("frame,t_s\n0,0.0\n1,0.01\n")
-    said = _of(list(check_dataset(tmp_path / "tank")), "run swarm bubbles", "warning")
+    said = _bubbles_warning(tmp_path / "tank", 400, pictures)
     assert "camera right: 16 outlines are dark hearts" in said and "camera left" not in said
 
 

@@ -319,6 +319,33 @@ def test_an_interrupted_smoothing_goes_on_with_the_pieces_that_it_has(
     assert len(solved) == 4, "pieces of other inputs are not used"
 
 
+def test_pieces_of_an_interrupted_call_are_not_taken_for_those_of_other_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, _ = crowded(120)
+    calibration = calibration_from_cameras(list(problem.cameras), name="truth")
+    tracks = tracks_of(problem)
+
+    def smoothed(table: pd.DataFrame, **options: Path) -> telerig.Smoothing:
+        return telerig.smooth(
+            table, calibration, model="default", t_s=problem.t_s, options=Options(frames=60),
+            **options,
+        )  # fmt: skip
+
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("telerig.estimator.smoothing.smooth.evidence_of", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            smoothed(tracks, folder=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    other = tracks.assign(left_u_px=tracks["left_u_px"] + 0.5)
+    found, expected = smoothed(other, folder=tmp_path), smoothed(other)
+    pd.testing.assert_frame_equal(found.trajectories, expected.trajectories)
+    assert [file.name for file in tmp_path.iterdir()] == ["results.h5"]
+
+
 def test_a_sensor_of_another_piece_than_the_middle_one_is_held_against_its_prior() -> None:
     """It reads 3 m/s^2 too much, fifteen times what is known of its bias, and soon ends."""
     problem, model = sensed("arms")

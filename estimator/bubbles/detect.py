@@ -234,8 +234,9 @@ def _found(
     if whole or merged.any() or hearts:
         sure = rims_along(ratio, sigma, outlines.ellipse[known])
     look = partial(
-        resolved_crowd, ratio, sigma, min_diameter_px=min_diameter_px, min_contrast=min_contrast
-    )
+        resolved_crowd, ratio, sigma, min_diameter_px=min_diameter_px, min_contrast=min_contrast,
+        alone=shadows,
+    )  # fmt: skip
     if whole:
         crowds = [look(blobs, parts, sure, WHOLE)]
         rejected, clusters = rejected + crowds[0].rejected, crowds[0].clusters

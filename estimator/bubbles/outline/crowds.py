@@ -76,6 +76,7 @@ def resolved_crowd(
     *,
     min_diameter_px: float,
     min_contrast: float,
+    alone: bool,
 ) -> Crowd:
     """Look for rims in a window of the image; dark regions that show none are clusters, unless
     single.
@@ -86,10 +87,14 @@ def resolved_crowd(
     sure : the bubbles of the image that are sure. Their rims belong to them; they are not among
         the bubbles that are returned.
     window : (rows, columns) of the image, such as `around` gives them.
+    alone : as for `find_rims`.
     """
     part = ratio[window]
     largest = min(min(ratio.shape) / _LARGEST_SHARE, min(part.shape) / 2.0)
-    rims = find_rims(part, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest)
+    rims = find_rims(
+        part, sigma, min_diameter_px=min_diameter_px, largest_radius_px=largest,
+        alone=alone,
+    )  # fmt: skip
     rims = rims.moved(window[1].start or 0, window[0].start or 0)
     single = {part.blob: part.ellipse for part in parts if not (part.merged or part.shared)}
     large = [ellipse for ellipse in single.values() if ellipse[2] * ellipse[3] > largest**2]

@@ -83,7 +83,7 @@ class Rims(Rows):
 
 
 def find_rims(
-    ratio: Float32, sigma: float, *, min_diameter_px: float, largest_radius_px: float
+    ratio: Float32, sigma: float, *, min_diameter_px: float, largest_radius_px: float, alone: bool
 ) -> Rims:
     """Return all candidates for bubbles in an image, with what is seen of their rims.
 
@@ -92,6 +92,7 @@ def find_rims(
     ratio : (rows, columns) grey levels divided by the background.
     sigma : noise of a pixel, as a share of the background.
     min_diameter_px, largest_radius_px : limits of the rims' size.
+    alone : whether the image is judged by itself, and is not one of a run.
     """
     levels = [np.ascontiguousarray(ratio, np.float32)]
     least = _LEAST_RADIUS_SHARE * max(min_diameter_px, _LEAST_DIAMETER_PX)
@@ -100,7 +101,7 @@ def find_rims(
         half = cv2.resize(levels[-1], (columns // 2, rows // 2), interpolation=cv2.INTER_AREA)
         levels.append(np.asarray(half, np.float32))
     floors = [_NOISE_SLOPE * sigma / 2**k for k in range(len(levels))]
-    found = [_voted(image, floors[k], least) for k, image in enumerate(levels)]
+    found = [_voted(image, floors[k], least, alone) for k, image in enumerate(levels)]
     octave = np.repeat(np.arange(len(found)), [len(one) for one in found])
     circle = _from_octave(np.concatenate(found), octave)
     small = circle[:, 2] < largest_radius_px
@@ -122,17 +123,18 @@ def _from_octave(circle: Array, octave: Index) -> Array:
     return np.asarray(circle * size + [0.5, 0.5, 0.0] * (size - 1.0))
 
 
-def _voted(image: Float32, floor: float, least_radius: float) -> Array:
+def _voted(image: Float32, floor: float, least_radius: float, alone: bool) -> Array:
     """Circles (N, 3) of an octave of radii (px) that are seen over enough of their rims.
 
     The votes at a place x for radius r are the mean over directions n of n . g(x + r n), with g the
     normalised gradient. Its transform is i J1(k r) k . G / |k|, with J1 Bessel's function.
 
-    The last radius is also the first of the next octave: its blur, of twice as many pixels, moves
-    a rim inwards by about half a step, and the maximum of a bubble between the two would be beyond
-    the radii of either.
+    In an image by itself the last radius is also the first of the next octave: its blur, of twice
+    as many pixels, moves a rim inwards by about half a step, and the maximum of a bubble between
+    the two would be beyond the radii of either. In the images of runs, which are sparser, that
+    radius cost more than it found (docs/decisions/035-crowds.md).
     """
-    radii = least_radius * 2.0 ** (np.arange(-1, _RADII_PER_OCTAVE + 2) / _RADII_PER_OCTAVE)
+    radii = least_radius * 2.0 ** (np.arange(-1, _RADII_PER_OCTAVE + 1 + alone) / _RADII_PER_OCTAVE)
     margin = int(np.ceil(radii[-1])) + 2
     wide = cv2.copyMakeBorder(image, *(margin,) * 4, cv2.BORDER_REPLICATE)
     calm = _blurred(np.asarray(wide, np.float32), _BLUR_CELLS)

@@ -633,10 +633,11 @@ def _mountings(
     """Return findings about sensors whose axes or place contradict the other measurements.
 
     The clearest contradiction comes first. Axes that gravity allows are judged by the images of the
-    sensor's own camera, and a correction has to make all measurements together at least as likely
-    as before; where gravity excludes those stated, the encoder and the other sensors, corrected so
-    far, help to choose. Scales are judged by gravity alone: in a short record a bubble that swings
-    as fast as the rig shakes shows any.
+    sensor's own camera, with the other sensors where these images prefer other axes, and a
+    correction has to make all measurements together at least as likely as before; where gravity
+    excludes those stated, the encoder and the other sensors, corrected so far, help to choose.
+    Scales are judged by gravity alone: in a short record a bubble that swings as fast as the rig
+    shakes shows any.
 
     refused : earlier findings. Axes are not tested without gravity.
     """

@@ -132,13 +132,14 @@ def test_a_bubble_cut_by_the_edge_of_the_image_is_flagged() -> None:
     assert flags[60.0] == "" and "border" in next(w for u, w in flags.items() if u > 100)
 
 
+@pytest.mark.parametrize("alone", [True, False])
 @pytest.mark.parametrize("radius", [4.5, 13.0, 37.0])
-def test_votes_find_a_circle_of_any_size(radius: float) -> None:
+def test_votes_find_a_circle_of_any_size(radius: float, alone: bool) -> None:
     side = int(6 * radius) + 40
     place = side / 2 + 0.3
     image = crowd([Drawn((place, place, radius, radius, 0.0), heart=0.5)], side) / WHITE
     rims = find_rims(
-        image.astype(np.float32), 0.01, min_diameter_px=8.0, largest_radius_px=side / 3
+        image.astype(np.float32), 0.01, min_diameter_px=8.0, largest_radius_px=side / 3, alone=alone
     )
     best = rims.take(np.array([int(np.argmax(rims.agreement))]))
     assert np.allclose(

@@ -89,7 +89,7 @@ def dots() -> str:
     t = table("dots")
     off = np.abs(numbers(t["cov"]) - 1).max()
     return (
-        f"**Dots**: RMS {span(numbers(t['rms']), 2)} times the Cramer-Rao bound over {len(t)} kinds of "
+        f"RMS {span(numbers(t['rms']), 2)} times the Cramer-Rao bound over {len(t)} kinds of "
         f"picture, reported covariance right to {100 * off:.0f} % ({link('dots')})."
     )
 
@@ -101,7 +101,7 @@ def paper() -> str:
     gain = numbers(table("print_errors").query("`dots off by µm` == '20'").iloc[:, 5])
     right = int(dots) - int(missing) - int(wrong)
     return (
-        f"**Calibration**, twelve views of 15 dots from images, {seeds} rigs not tuned to: {right:,} of "
+        f"Twelve views of 15 dots from images, {seeds} rigs not tuned to: {right:,} of "
         f"{int(dots):,} dots found and rightly numbered; 3-D error {number(error):.2f} µm RMS per "
         f"axis over a 30 mm volume (median), root mean square {number(ratio):.2f} of what the "
         f"covariance predicts ({link('paper')}). Dots held at their nominal places (20 µm print "
@@ -116,7 +116,7 @@ def covariance() -> str:
     (pooled,) = said("covariance", r"reported over observed \*\*([\d.]+ \+- [\d.]+)\*\*")
     right = [m for m in t["model"] if "too simple" not in m]
     return (
-        f"**Covariance**: reported standard deviations over observed ones {pooled}, pooled over simulated "
+        f"Reported standard deviations over observed ones: {pooled}, pooled over simulated "
         f"calibrations of {len(right)} kinds; {outside:.0f} of {total} quantities outside their "
         f"99.9 % interval ({link('covariance')})."
     )
@@ -128,7 +128,7 @@ def ladder() -> str:
     rigs = int(last) - int(first) + 1
     right = np.rint(numbers(t["right"]) / 100 * rigs).sum()
     return (
-        f"**Lens models** are chosen camera by camera: {right:.0f} of {rigs * len(t)} simulated rigs "
+        f"Chosen camera by camera: {right:.0f} of {rigs * len(t)} simulated rigs "
         "right where its parameters are three times detectable or more, too simple more often than "
         f"not below that ({link('ladder')})."
     )
@@ -141,7 +141,7 @@ def stress() -> str:
     auto = t["model"].str.startswith("auto")
     ratio = numbers(t["RMS / bound"])
     return (
-        "**Tilted sensors** of both kinds, 20 to 160 degrees between the cameras, views of 30-100 % of "
+        "Both kinds, 20 to 160 degrees between the cameras, views of 30-100 % of "
         f"the target, 5 % gross outliers: 3-D error {span(ratio[~auto], 2)} times its Cramer-Rao "
         f"bound with the lens model given, {span(ratio[auto], 2)} with `--model auto` "
         f"(fewer seeds) ({link('stress')})."
@@ -155,7 +155,7 @@ def bubbles() -> str:
     (offset,) = said("bubble_pair", r"cameras differ by \+?(-?[\d.]+) px")
     off = np.abs(numbers(t["cov"]) - 1).max()
     return (
-        f"**Bubbles**: outline centres at {span(numbers(t['rms']), 2)} times the Cramer-Rao bound, "
+        f"Outline centres at {span(numbers(t['rms']), 2)} times the Cramer-Rao bound, "
         f"covariance right to {100 * off:.0f} % ({link('bubbles')}). On a real pair of another "
         f"laboratory {listed} listed bubbles are found, {pair['sound']} sound pairs are matched, "
         f"{pair['unsound']} unsound ones, and the {number(offset):.0f} px error of its calibration "
@@ -169,7 +169,7 @@ def bodies() -> str:
     apart = t[t["mode"].str.startswith("3,") & (t["axis"] == "apart")]
     less = 100 * (1 - 1 / numbers(apart["gain"]))
     return (
-        "**Shape modes** of degree 3 move an outline's centre off the centre of volume; two views see "
+        "Modes of degree 3 move an outline's centre off the centre of volume; two views see "
         "this along the shared coordinate, not across it. With modes of 5 % that are axisymmetric "
         "about the vertical the error falls from "
         f"{number(zonal['mean of outlines, µm']):.0f} µm to "
@@ -182,7 +182,7 @@ def swarms() -> str:
     t = table("bubble_runs")
     swaps = numbers(t["swaps"]).sum()
     return (
-        f"**Swarms** of 20 bubbles, {len(t)} runs not tuned to: recall "
+        f"20 bubbles, {len(t)} runs not tuned to: recall "
         f"{span(numbers(t['recall']), 3)} of all that both images show whole, precision "
         f"{span(numbers(t['precision']), 3)}, {swaps:.0f} identities swapped "
         f"({link('bubble_runs')})."
@@ -200,7 +200,7 @@ def crossings() -> str:
             f"{number(plain['swaps %']):.0f} %, trackpy {number(peer['swaps %']):.0f} %)"
         )
     return (
-        f"**Crossings**: identity swaps in close passes of zigzagging bubbles: {'; '.join(parts)} "
+        f"Identity swaps in close passes of zigzagging bubbles: {'; '.join(parts)} "
         f"({link('crossings')})."
     )
 
@@ -218,7 +218,7 @@ def shake() -> str:
             counts[verdict] += int(number)
     shares = ", ".join(f"{n} of {counts.total()} axes are {v}" for v, n in sorted(counts.items()))
     return (
-        "**Shake**: with hyper-parameters given, the graph equals an independent Kalman smoother to "
+        "With hyper-parameters given, the graph equals an independent Kalman smoother to "
         "1e-6 for every set of sensors. With marks fixed to the tank or an accelerometer on each "
         "arm, and hyper-parameters at their defaults, paths of a shaking rig are "
         f"{span(gain, 1)} times better than triangulating and adding the encoder, at "
@@ -242,7 +242,7 @@ def physics() -> str:
              "slip velocity": "slip_mm_s", "drag": "drag"}  # fmt: skip
     listed = ", ".join(f"{words} {number(bubble.loc[n]['NEES']):.2f}" for words, n in means.items())
     return (
-        "**Sizes and forces** of bubbles: simulated bubbles that obey Clift's drag law in a shaking "
+        "Simulated bubbles that obey Clift's drag law in a shaking "
         f"rig have their drag coefficient back with a bias of {bias}. NEES in a frame: "
         f"{span(numbers(given['NEES']), 2)} where the motion is given, "
         f"{span(velocity, 2)} for smoothed velocities and accelerations, "
@@ -254,7 +254,7 @@ def physics() -> str:
 def start() -> str:
     right, rigs = said("initialisation", r"\*\*(\d+) of (\d+)\*\* rigs")
     return (
-        "**Start**: in closed form it is in the right basin and on the right side for "
+        "The closed-form start is in the right basin and on the right side for "
         f"{right} of {rigs} random rigs ({link('initialisation')})."
     )
 
@@ -275,7 +275,7 @@ def cameras() -> str:
     two = pairs[pairs["scene"].str.contains("no shake")]["error (µm), median"]
     bound = numbers(every["over the bound"])
     return (
-        "**Three cameras** at 0, 60 and 120 degrees, from images: points at "
+        "At 0, 60 and 120 degrees, from images: points at "
         f"{ratio} times their Cramer-Rao bound, {pair} times as good as from the best pair of "
         f"them, NEES {nees} ({seeds} seeds: {link('three_cameras')}). Swarms of 20 and 60 bubbles "
         f"tracked with three and four cameras: {span(numbers(every['recall']), 3)} of the bubbles "
@@ -295,7 +295,7 @@ def solvers() -> str:
     scipy = [number(r["scipy"]) / number(r[ours]) for _, r in t.iterrows()
              for ours in ("gtsam", "numpy") if np.isfinite(number(r["scipy"]))]  # fmt: skip
     return (
-        f"**Solvers**: GTSAM solves 12 views of 15 dots in two cameras in {1e3 * seconds['12x15']:.0f} ms of "
+        f"GTSAM solves 12 views of 15 dots in two cameras in {1e3 * seconds['12x15']:.0f} ms of "
         f"CPU, 12 of 100 in {1e3 * seconds['12x100']:.0f} ms; from 5,000 measured dots on NumPy "
         f"eliminates the dots: 200 views of 400 dots in {number(large):.1f} s. SciPy's sparse "
         f"least squares with the same derivatives takes {span(np.array(scipy), 0)} times as long "
@@ -305,7 +305,7 @@ def solvers() -> str:
 
 def windows() -> str:
     return (
-        "**Windows**: glass and water are modelled exactly, to 3e-13 px of an independent ray tracer "
+        "Glass and water are modelled exactly, to 3e-13 px of an independent ray tracer "
         "([how](docs/howto/glass.md))."
     )
 
@@ -313,7 +313,7 @@ def windows() -> str:
 def paper_2004() -> str:
     t = table("paper_2004").set_index("figure")["telerig"]
     return (
-        "**2004**: the figures of Coudert et al. (ISFV11, 2004; the work from which telerig started, see "
+        "The figures of Coudert et al. (ISFV11, 2004; the work from which telerig started, see "
         "[`CITATION.cff`](CITATION.cff)) under its own inputs: dots 0.03 -> "
         f"{number(t['dots, from images']):.3f} px, the bubble's centre 1.5 -> "
         f"{number(t[next(k for k in t.index if 'centre' in k)]):.2f} px, its place 0.5 -> "
@@ -325,32 +325,47 @@ def real_images() -> str:
     t = table("real_images")
     free = t[t["dots"] == "3d"].iloc[0]
     return (
-        "**Real images** (14 stereo pairs of a printed target, lenses that are *not* telecentric): "
+        "14 stereo pairs of a printed target, lenses that are *not* telecentric: "
         f"dots agree with the model to {number(free['RMS px']):.3f} px RMS, and the report finds "
         f"that the print is out of plane by {number(free['out of plane µm']):.0f} µm "
         f"({link('real_images')})."
     )
 
 
-SENTENCES: dict[Path, tuple[Callable[[], str], ...]] = {
-    HERE.parent / "README.md": (
-        dots, paper, covariance, bubbles, swarms, crossings, shake, paper_2004, real_images,
-    ),
-    HERE / "README.md": (
-        ladder, stress, start, cameras, solvers, windows, bodies, physics,
-    ),
-}  # fmt: skip
+SENTENCES: dict[Path, dict[str, Callable[[], str]]] = {
+    HERE.parent / "README.md": {
+        "Dots": dots,
+        "Calibration": paper,
+        "Covariance": covariance,
+        "Bubbles": bubbles,
+        "Swarms": swarms,
+        "Crossings": crossings,
+        "Shake": shake,
+        "Before telerig": paper_2004,
+        "Real images": real_images,
+    },
+    HERE / "README.md": {
+        "Lens models": ladder,
+        "Tilted sensors": stress,
+        "Start": start,
+        "Three and four cameras": cameras,
+        "Solvers": solvers,
+        "Windows": windows,
+        "Centre of volume": bodies,
+        "Sizes and forces": physics,
+    },
+}
 """The first are what a newcomer asks; the others stand beside the list of studies."""
 
 
 def block(file: Path) -> str:
     """A file's part with its sentences. SystemExit names the pages that lack a figure."""
     made, missing = [], []
-    for sentence in SENTENCES[file]:
+    for about, sentence in SENTENCES[file].items():
         try:
-            made.append(f"- {sentence()}")
+            made.append(f"- **{about}.** {sentence()}")
         except (SystemExit, LookupError, StopIteration, ValueError) as error:
-            missing.append(f"{sentence.__name__}: {error}")
+            missing.append(f"{about}: {error}")
     if missing:
         raise SystemExit("run these studies again (benchmarks/all.py):\n" + "\n".join(missing))
     text = "\n".join([BEGIN, "", *made, "", END])

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 import telerig
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.rig_drift import (
+from telerig.estimator.rig_drift.estimate import rig_change
+from telerig.estimator.rig_drift.movement import (
     DriftPrior,
     covariance_root,
     drift_covariance,
     moved_pose,
-    offset_roll_pitch,
-    rig_change,
 )
+from telerig.estimator.rig_drift.ray_misses import offset_roll_pitch
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.io.simulation.calibration.scene import true_cameras

@@ -41,7 +41,7 @@ from telerig.estimator.bubbles.detect import detect_bubbles, load_compiled_loops
 from telerig.estimator.bubbles.pairing.learning import learn_rig
 from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
-from telerig.estimator.rig_drift import PairCollector
+from telerig.estimator.rig_drift.estimate import PairCollector
 from telerig.estimator.tracking.detect_run import lab_shift_px
 from telerig.estimator.tracking.linking.filter import TrackerSettings, transition
 from telerig.estimator.tracking.linking.frames_to_rows import RowMaker

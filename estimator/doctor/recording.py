@@ -20,7 +20,8 @@ from telerig.estimator.bubbles.flat_field import full_scale
 from telerig.estimator.calibration.result.calibration import Calibration, of_run
 from telerig.estimator.doctor.checks import Check, Status
 from telerig.estimator.plan import MOST_STATES, Experiment, expect
-from telerig.estimator.rig_drift import LATE_SIGMAS, with_speeds
+from telerig.estimator.rig_drift.change import LATE_SIGMAS
+from telerig.estimator.rig_drift.estimate import with_speeds
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.sensors.findings import Finding, SensorError
 from telerig.estimator.smoothing.result import Smoothing

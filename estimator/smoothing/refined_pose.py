@@ -16,17 +16,14 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.rig_drift import (
-    LEAST_PAIRS,
+from telerig.estimator.rig_drift.change import RigChange, rig_change_from
+from telerig.estimator.rig_drift.estimate import LEAST_PAIRS, PairCollector, culprit
+from telerig.estimator.rig_drift.movement import (
     POSE,
     DriftPrior,
     Movement,
-    PairCollector,
-    RigChange,
-    culprit,
     drift_posterior,
     moved_pose,
-    rig_change_from,
     with_drift,
 )
 from telerig.estimator.smoothing.graph.solve import Solution

@@ -92,7 +92,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from telerig.estimator.calibration.result.calibration import Calibration
-    from telerig.estimator.rig_drift import DriftPrior, Movement
+    from telerig.estimator.rig_drift.movement import DriftPrior, Movement
     from telerig.io.dataset.run import RunData
     from telerig.io.rig_file.description import RigDescription
 

@@ -36,7 +36,8 @@ from telerig.estimator.calibration.result.calibration import (
     Calibration,
     of_run,
 )
-from telerig.estimator.rig_drift import LEAST_SEEN_S, PairCollector, with_change
+from telerig.estimator.rig_drift.change import with_change
+from telerig.estimator.rig_drift.estimate import LEAST_SEEN_S, PairCollector
 from telerig.estimator.tracking.corrections import Corrections, read_corrections
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,

@@ -17,7 +17,7 @@ from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 if TYPE_CHECKING:
-    from telerig.estimator.rig_drift import Movement
+    from telerig.estimator.rig_drift.movement import Movement
 
 CARRIAGE = -1
 """This value in place of a camera's index stands for a sensor on the carriage of the stage, or for

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from telerig.estimator.calibration.result.calibration import Calibration
-    from telerig.estimator.rig_drift import Movement
+    from telerig.estimator.rig_drift.movement import Movement
     from telerig.rig.camera import Camera
 
 
@@ -221,7 +221,7 @@ def calibration_share(
     sigma_px : noise of a pixel.
     drift : a movement of a camera since the calibration; None if none has moved.
     """
-    from telerig.estimator.rig_drift import rig_block, with_drift
+    from telerig.estimator.rig_drift.movement import rig_block, with_drift
     from telerig.rig.triangulation import rig_jacobian
 
     covariance, free = calibration.covariance, calibration.free

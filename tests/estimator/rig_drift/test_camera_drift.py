@@ -14,26 +14,22 @@ from numpy.typing import NDArray
 
 import telerig
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator import rig_drift
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.pairing.model import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.rig_drift import (
+from telerig.estimator.rig_drift import estimate
+from telerig.estimator.rig_drift.change import with_change
+from telerig.estimator.rig_drift.estimate import PairCollector, rig_change
+from telerig.estimator.rig_drift.movement import (
     DriftPrior,
     Movement,
-    Noise,
-    PairCollector,
-    Series,
     covariance_root,
     drift_covariance,
     drift_posterior,
-    learned_noise,
     moved_pose,
-    offset_roll_pitch,
-    ray_misses,
-    rig_change,
-    with_change,
 )
+from telerig.estimator.rig_drift.noise import Noise, Series, _noise, _spectrum, learned_noise
+from telerig.estimator.rig_drift.ray_misses import offset_roll_pitch, ray_misses
 from telerig.estimator.smoothing.problem.problem import RigMode, ShakeModel
 from telerig.estimator.smoothing.refined_pose import refinement_of
 from telerig.io.simulation.calibration.scene import true_cameras
@@ -393,7 +389,7 @@ def test_of_three_cameras_the_one_that_moved_is_refined(which: int) -> None:
 
 
 def test_a_long_run_is_collected_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rig_drift, "_MOST_COLLECTED", 400)
+    monkeypatch.setattr(estimate, "_MOST_COLLECTED", 400)
     cameras, known = rig(), calibration(rig())
     true = along_perpendicular(cameras, 0.08, 0, 0)
     tracks = Run(frames=1500, rate_hz=500.0).tracks(
@@ -485,13 +481,13 @@ def test_tracks_on_disk_are_refined_by_all_their_parts() -> None:
 def test_the_gradient_of_the_noise_is_that_of_its_likelihood(samples: int) -> None:
     rng = np.random.default_rng(3)
     t = 0.002 * np.arange(samples)
-    spectrum = rig_drift._spectrum(t, rng.standard_normal(samples) + np.sin(300 * t), 0.8, 0.3)
+    spectrum = _spectrum(t, rng.standard_normal(samples) + np.sin(300 * t), 0.8, 0.3)
     log = np.log([0.5, 0.3, 0.05, 0.4, 0.2, 40.0, 0.2, 0.1, 90.0])
 
     def cost(place: np.ndarray) -> float:
-        return spectrum.cost(rig_drift._noise(place))[0]
+        return spectrum.cost(_noise(place))[0]
 
-    _, slope = spectrum.cost(rig_drift._noise(log))
+    _, slope = spectrum.cost(_noise(log))
     steps = 1e-6 * np.eye(len(log))
     numeric = [(cost(log + step) - cost(log - step)) / 2e-6 for step in steps]
     np.testing.assert_allclose(slope, numeric, rtol=1e-5, atol=1e-6)

@@ -9,9 +9,10 @@ a first round, of pieces without margins, collects the information of each on th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -139,10 +140,13 @@ def solved_pieces(
     constants : the run's information about them; None where there are none.
     chosen : which pieces; None for all.
     """
-    numbers = range(len(pieces)) if chosen is None else chosen
-    for done, number in enumerate(numbers):
+    numbers, count = range(len(pieces)) if chosen is None else chosen, len(pieces)
+    before = count - len(numbers)
+    if before:
+        progress(f"going on, {before} of {count} pieces are finished", before / count)
+    for done, number in enumerate(numbers, before):
         piece = pieces[number]
-        progress(f"piece {done + 1} of {len(numbers)}", done / len(numbers))
+        progress(f"piece {done + 1} of {count}", done / count)
         window = piece.cut(problem)
         known = (
             replace(window.problem, known=())
@@ -150,6 +154,64 @@ def solved_pieces(
             else constants.given(window.problem, model, number)
         )
         yield piece, replace(window, problem=known), solve(known, model, options)
+
+
+class Told(NamedTuple):
+    """What a piece without its margins tells of the C constants of the run.
+
+    at : (c,) places of the piece's own constants among those of the run.
+    prior, prior_mean : (c,) information and means of their priors.
+    information, side : (c, c) information matrix Lambda, and (c,) Lambda times the estimate.
+    """
+
+    at: Ints
+    prior: Array
+    prior_mean: Array
+    information: Array
+    side: Array
+
+    @classmethod
+    def of(cls, solution: Solution, problem: SmoothingProblem) -> Told:
+        """Return what a piece's solution tells, whose constants have a joint covariance.
+
+        problem : that of the run.
+        """
+        graph, state, joint = solution.graph, solution.state, solution.constants
+        assert joint is not None
+        at = _places(graph, problem, _sizes(problem, graph.model))
+        values = _flat(constant_values(graph, state))
+        prior, mean, below = np.zeros(len(at)), np.zeros(len(at)), 0
+        for linear in constant_priors(graph, state):
+            sigma = np.diagonal(linear.blocks[0], axis1=1, axis2=2)
+            mine = slice(below, below + sigma.size)
+            prior[mine] = sigma.ravel() ** 2
+            mean[mine] = values[mine] + (linear.rhs / sigma).ravel()
+            below = mine.stop
+        whole = np.linalg.inv(joint)
+        side = np.asarray(whole @ values - prior * mean)
+        return cls(at, prior, mean, np.asarray(whole - np.diag(prior)), side)
+
+
+def first_round(
+    problem: SmoothingProblem,
+    model: ShakeModel,
+    pieces: Sequence[Piece],
+    options: Options,
+    progress: Progress,
+    chosen: Sequence[int] | None = None,
+) -> Iterator[tuple[Piece, Told]]:
+    """Yield what each piece tells of the run's constants; nothing where nothing is constant.
+
+    pieces : without margins.
+    options : their covariances are not computed.
+    chosen : which pieces; None for all.
+    """
+    if _count(_sizes(problem, model)):
+        options = replace(options, covariances=False, draws=False, constants=True)
+        for piece, _, solution in solved_pieces(
+            problem, model, pieces, options, progress, None, chosen
+        ):
+            yield piece, Told.of(solution, problem)
 
 
 @dataclass(frozen=True)
@@ -176,39 +238,21 @@ class Constants:
         problem: SmoothingProblem,
         model: ShakeModel,
         pieces: Sequence[Piece],
-        options: Options,
-        progress: Progress,
+        told: Iterable[Told],
     ) -> Constants | None:
         """Return the information of all pieces; None where nothing is constant along the run.
 
-        options : their covariances are not computed.
+        told : by each piece.
         """
-        sizes = _sizes(problem, model)
-        count = sum(n * d for n, d in sizes.values())
+        count = _count(_sizes(problem, model))
         if not count:
             return None
         prior, mean = np.ones(count), np.zeros(count)
         information, side = np.zeros((len(pieces), count, count)), np.zeros((len(pieces), count))
-        options = replace(options, covariances=False, draws=False, constants=True)
-        own = [piece.without_margin() for piece in pieces]
-        for number, (_, _, solution) in enumerate(
-            solved_pieces(problem, model, own, options, progress, None)
-        ):
-            graph, state, joint = solution.graph, solution.state, solution.constants
-            assert joint is not None
-            at = _places(graph, problem, sizes)
-            values = _flat(constant_values(graph, state))
-            before, below = np.zeros(len(at)), 0
-            for linear in constant_priors(graph, state):
-                sigma = np.diagonal(linear.blocks[0], axis1=1, axis2=2)
-                mine = slice(below, below + sigma.size)
-                before[mine] = sigma.ravel() ** 2
-                mean[at[mine]] = values[mine] + (linear.rhs / sigma).ravel()
-                below = mine.stop
-            prior[at] = before
-            whole = np.linalg.inv(joint)
-            information[number][np.ix_(at, at)] = whole - np.diag(before)
-            side[number][at] = whole @ values - before * mean[at]
+        for number, one in enumerate(told):
+            prior[one.at], mean[one.at] = one.prior, one.prior_mean
+            information[number][np.ix_(one.at, one.at)] = one.information
+            side[number][one.at] = one.side
         return cls(problem, tuple(pieces), prior, mean, information, side)
 
     @property
@@ -317,6 +361,10 @@ def _sizes(problem: SmoothingProblem, model: ShakeModel) -> Sizes:
         "marks": (len(problem.marks), 3),
         "clocks": (clocks, int(model.accelerometer_delay_sigma_s > 0)),
     }
+
+
+def _count(sizes: Sizes) -> int:
+    return sum(number * dimension for number, dimension in sizes.values())
 
 
 def _here(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,25 +41,19 @@ class ResultsFile:
         self.file = file
         self.rows = list[int]()
 
-    def append(
-        self,
-        trajectories: pd.DataFrame,
-        shake: pd.DataFrame,
-        states: Mapping[str, Array],
-        bodies: pd.DataFrame | None = None,
-    ) -> None:
+    def append(self, tables: Tables) -> None:
         """Append rows of the tables and the states that belong to them.
 
-        bodies : columns that are kept beside those of the trajectories, row by row; None for none.
+        Bodies are columns that are kept beside those of the trajectories, row by row.
         """
-        for name, table in zip(TABLES, (trajectories, shake)):
-            self._table(name, table)
-        if bodies is not None:
-            self._table("bodies", bodies)
-        for name, array in states.items():
+        for name in TABLES:
+            self._table(name, getattr(tables, name))
+        if tables.bodies is not None:
+            self._table("bodies", tables.bodies)
+        for name, array in tables.states.items():
             if not name.endswith("_rows") or f"states/{name}" not in self.file:
                 self._add(f"states/{name}", array)
-        self.rows.append(len(trajectories))
+        self.rows.append(len(tables.trajectories))
 
     def _table(self, name: str, table: pd.DataFrame) -> None:
         if name not in self.file:
@@ -141,7 +135,7 @@ class Tables:
         write_table(self.trajectories, out / "trajectories.csv")
         write_table(self.shake, out / "shake.csv")
         with results_file(out) as file:
-            file.append(self.trajectories, self.shake, self.states)
+            file.append(replace(self, bodies=None))
             file.finish(inflation)
 
     def parts(self) -> Iterator[Tables]:

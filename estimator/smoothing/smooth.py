@@ -35,6 +35,8 @@ from telerig.estimator.smoothing.phases import Phases
 from telerig.estimator.smoothing.pieces import (
     Constants,
     Piece,
+    Told,
+    first_round,
     piece_with_most,
     pieces_of,
     solved_pieces,
@@ -359,13 +361,17 @@ class _Run:
                 pieces[middle].cut(problem).problem, self.model, self.options, _silent,
                 given=self.given,
             ).graph.model  # fmt: skip
-            step("what is constant along the run", 0.0)
-            constants = kept.constants(problem, pieces)
-            if constants is None:
-                constants = Constants.of(problem, model, pieces, self.options, step)
-                if constants is not None:
-                    kept.keep_constants(constants)
-            swarm, rest = None, [n for n in kept.missing(pieces) if n != middle]
+            own = [piece.without_margin() for piece in pieces]
+            for piece, told in first_round(
+                problem, model, own, self.options,
+                lambda what, share: step(f"what is constant along the run, {what}", share),
+                kept.missing(Told, own),
+            ):  # fmt: skip
+                kept.keep(piece, told)
+            constants = Constants.of(
+                problem, model, pieces, (kept.notes(Told, piece) for piece in own)
+            )
+            swarm, rest = None, [n for n in kept.missing(Notes, pieces) if n != middle]
             for piece, window, solution in solved_pieces(
                 problem, model, pieces, self.options, step, constants, [*rest, middle]
             ):
@@ -378,14 +384,14 @@ class _Run:
                 if last:
                     swarm = self._swarm(solution, paths, bodies, span)
                 kept.keep(
-                    piece, Notes(evidence, sensors_of(solution)), (paths, offsets),
-                    states_of(solution, span), _beside(paths, bodies),
+                    piece, Notes(evidence, sensors_of(solution)),
+                    Tables(paths, offsets, states_of(solution, span), _beside(paths, bodies)),
                 )  # fmt: skip
                 del paths, offsets, bodies
                 if not last:
                     del window, solution
         with self.phases.phase("verdict", "judging the result"):
-            notes = [kept.notes(piece) for piece in pieces]
+            notes = [kept.notes(Notes, piece) for piece in pieces]
             evidence = evidence_of([one.evidence for one in notes])
             verdict = judge(window.problem, model, solution, evidence)
         with self.phases.phase("tables", "writing the tables"):

@@ -7,24 +7,17 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from telerig.arrays import Array
-from telerig.estimator.smoothing.pieces import Constants, Piece
-from telerig.estimator.smoothing.problem.problem import SmoothingProblem
-from telerig.estimator.smoothing.results_file import ResultsFile
+from telerig.estimator.smoothing.pieces import Piece, Told
+from telerig.estimator.smoothing.results_file import ResultsFile, Tables
 from telerig.estimator.smoothing.verdict.evidence import Evidence
-from telerig.io.files.atomic import atomic_path
 from telerig.io.files.hdf5 import hdf5_file
 from telerig.io.files.typed_json import packed, unpacked
 from telerig.io.results.work_folder import empty_unless
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-_CONSTANTS = "constants.json"
 _NOTES = "notes"
 
 
@@ -39,11 +32,8 @@ class Notes(NamedTuple):
     sensors: Mapping[str, Any]
 
 
-class _Told(NamedTuple):
-    prior: Array
-    prior_mean: Array
-    information: Array
-    side: Array
+Kind = TypeVar("Kind", Notes, Told)
+"""What is kept of a piece in each of the two rounds."""
 
 
 @dataclass(frozen=True)
@@ -64,47 +54,25 @@ class UnfinishedPieces:
         """Remove the folder with all pieces."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def constants(self, problem: SmoothingProblem, pieces: Sequence[Piece]) -> Constants | None:
-        """Return the information on the run's constants; None if it is not there."""
-        path = self.folder / _CONSTANTS
-        if not path.is_file():
-            return None
-        return Constants(problem, tuple(pieces), *unpacked(_Told, json.loads(path.read_bytes())))
+    def missing(self, kind: type[Kind], pieces: Sequence[Piece]) -> list[int]:
+        """Return the numbers of the pieces of which there are no such notes."""
+        return [n for n, piece in enumerate(pieces) if not self._path(kind, piece).is_file()]
 
-    def keep_constants(self, constants: Constants) -> None:
-        """Write the information on the run's constants."""
-        told = _Told(
-            constants.prior, constants.prior_mean, constants.information, constants.side
-        )  # fmt: skip
-        with atomic_path(self.folder / _CONSTANTS) as staged:
-            staged.write_text(json.dumps(packed(told)), encoding="utf-8")
+    def keep(self, piece: Piece, notes: Notes | Told, tables: Tables | None = None) -> None:
+        """Write the notes of a piece, and its tables."""
+        with hdf5_file(self._path(type(notes), piece)) as file:
+            if tables is not None:
+                one = ResultsFile(file)
+                one.append(tables)
+                one.finish((1.0, 1.0, 1.0))
+            file[_NOTES] = np.frombuffer(json.dumps(packed(notes)).encode(), np.uint8)
 
-    def missing(self, pieces: Sequence[Piece]) -> list[int]:
-        """Return the numbers of the pieces that are not there."""
-        return [n for n, piece in enumerate(pieces) if not self._path(piece).is_file()]
-
-    def keep(
-        self,
-        piece: Piece,
-        notes: Notes,
-        tables: tuple[pd.DataFrame, pd.DataFrame],
-        states: Mapping[str, Array],
-        bodies: pd.DataFrame | None,
-    ) -> None:
-        """Write a piece: notes, and what `ResultsFile.append` takes."""
-        with hdf5_file(self._path(piece)) as file:
-            one = ResultsFile(file)
-            one.append(*tables, states, bodies)
-            one.finish((1.0, 1.0, 1.0))
-            text = json.dumps(packed(notes)).encode()
-            file[_NOTES] = np.frombuffer(text, np.uint8)
-
-    def notes(self, piece: Piece) -> Notes:
+    def notes(self, kind: type[Kind], piece: Piece) -> Kind:
         """Read the notes of a piece."""
         import h5py
 
-        with h5py.File(self._path(piece), "r") as file:
-            found: Notes = unpacked(Notes, json.loads(file[_NOTES][()].tobytes()))
+        with h5py.File(self._path(kind, piece), "r") as file:
+            found: Kind = unpacked(kind, json.loads(file[_NOTES][()].tobytes()))
         return found
 
     def append_to(
@@ -114,8 +82,8 @@ class UnfinishedPieces:
         import h5py
 
         for piece in pieces:
-            with h5py.File(self._path(piece), "r") as one:
+            with h5py.File(self._path(Notes, piece), "r") as one:
                 file.append_piece(one, inflation)
 
-    def _path(self, piece: Piece) -> Path:
-        return self.folder / f"piece-{'-'.join(map(str, astuple(piece)))}.h5"
+    def _path(self, kind: type[Notes | Told], piece: Piece) -> Path:
+        return self.folder / f"{kind.__name__.lower()}-{'-'.join(map(str, astuple(piece)))}.h5"

@@ -137,3 +137,56 @@ def test_ctrl_c_at_any_moment_prints_no_traceback(tank: Path, tmp_path: Path) ->
 def test_ctrl_c_at_a_hundred_moments(tank: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     check_interrupts(list(rng.uniform(0.1, 5.0, 100)), tank, tmp_path)
+
+
+IN_PIECES = """
+import sys, time
+from telerig.estimator.smoothing import pieces, smooth
+from telerig.factors.bubble_motion import Inertia
+pieces.MOST_FRAMES, pieces._FRAMES = 12, 6
+smooth.learned_inertia = lambda _: Inertia((0.001,) * 3)
+solve, calls, stop = pieces.solve, [], int(sys.argv.pop(1))
+def slow(*arguments):
+    calls.append(None)
+    if len(calls) == stop:
+        print("stopped", flush=True)
+        time.sleep(60)
+    return solve(*arguments)
+pieces.solve = slow
+from telerig.scripts.start import run
+run()
+"""
+"""telerig, with runs of more than 12 frames smoothed in pieces of six; it waits at a piece."""
+
+
+def test_ctrl_c_in_the_first_round_of_a_long_run_and_again(tank: Path, tmp_path: Path) -> None:
+    def smoothing(out: str, stop: int = 0) -> tuple[int, str]:
+        command = [
+            sys.executable, "-c", IN_PIECES, str(stop), "smooth", str(tank / "runs" / "rise"),
+            "--model", "default", "--no-report", "--out", str(tmp_path / out),
+        ]  # fmt: skip
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            start_new_session=True,
+        ) as process:  # fmt: skip
+            if stop:
+                assert process.stdout is not None
+                assert process.stdout.readline() == "stopped\n"
+                os.killpg(process.pid, signal.SIGINT)
+            _, said = process.communicate(timeout=120)
+        return process.returncode, said
+
+    code, said = smoothing("parts", stop=3)
+    assert code == 130, said
+    assert "interrupted; no file is half-written" in said
+    assert [p.name for p in tmp_path.iterdir()] == [".parts.smoothing"]
+    code, said = smoothing("parts")
+    assert code == 0, said
+    assert "what is constant along the run, going on, 2 of 4 pieces are finished" in said
+    code, said = smoothing("whole")
+    assert code == 0, said
+    assert "going on" not in said
+    assert {p.name for p in tmp_path.iterdir()} == {"parts", "whole"}
+    for name in ("trajectories.csv", "shake.csv", "bubbles.csv"):
+        one, other = ((tmp_path / place / name).read_bytes() for place in ("parts", "whole"))
+        assert one == other

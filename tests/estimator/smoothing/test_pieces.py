@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +23,8 @@ from telerig.estimator.smoothing.graph.layout import clocks_of
 from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.pieces import (
     Constants,
+    Piece,
+    first_round,
     piece_with_most,
     pieces_of,
     solved_pieces,
@@ -33,7 +35,7 @@ from telerig.estimator.smoothing.problem.problem import (
     ShakeModel,
     SmoothingProblem,
 )
-from telerig.estimator.smoothing.results_file import ResultsFile, StoredTables, results_file
+from telerig.estimator.smoothing.results_file import ResultsFile, StoredTables, Tables, results_file
 from telerig.estimator.smoothing.unfinished import UnfinishedPieces
 from telerig.estimator.smoothing.verdict.contradiction import contradictions
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
@@ -55,8 +57,8 @@ def with_calibration(problem: SmoothingProblem) -> SmoothingProblem:
     return replace(problem, calibration=CalibrationShare(root, free, root @ root.T))
 
 
-def crowded(frames: int = 600) -> tuple[SmoothingProblem, ShakeModel]:
-    problem, *_ = run(np.random.default_rng(3), bubbles=3, seconds=frames / 200)
+def crowded(frames: int = 600, marks: int = 0) -> tuple[SmoothingProblem, ShakeModel]:
+    problem, *_ = run(np.random.default_rng(3), bubbles=3, seconds=frames / 200, marks=marks)
     cut = with_comings_and_goings(problem, np.random.default_rng(4), frames // 3)
     return with_calibration(cut), true_model()
 
@@ -70,6 +72,14 @@ def sensed(information: str) -> tuple[SmoothingProblem, ShakeModel]:
 
 def silent(_what: str, _share: float) -> None:
     """Report nothing."""
+
+
+def constants_of(
+    problem: SmoothingProblem, model: ShakeModel, pieces: Sequence[Piece]
+) -> Constants | None:
+    own = [piece.without_margin() for piece in pieces]
+    told = (told for _, told in first_round(problem, model, own, PLAIN, silent))
+    return Constants.of(problem, model, pieces, told)
 
 
 def sigma(solution: Solution, rows: Array) -> Array:
@@ -93,7 +103,7 @@ def test_paths_and_sums_are_those_of_the_joint_solution(
     joint = solve(problem, model, PLAIN)
     pieces = pieces_of(problem, model, -(-len(problem.t_s) // 3))
     assert len(pieces) == 3
-    constants = Constants.of(problem, model, pieces, PLAIN, silent)
+    constants = constants_of(problem, model, pieces)
     graph, at = joint.graph, joint.graph.bubble.position
     seen, parts = np.zeros(graph.rows, bool), []
     for piece, window, solution in solved_pieces(problem, model, pieces, PLAIN, silent, constants):
@@ -128,7 +138,7 @@ def test_paths_and_sums_are_those_of_the_joint_solution(
 def test_what_all_pieces_tell_of_the_calibration_is_what_the_joint_solution_knows() -> None:
     problem, model = crowded()
     pieces = pieces_of(problem, model, 200)
-    constants = Constants.of(problem, model, pieces, PLAIN, silent)
+    constants = constants_of(problem, model, pieces)
     joint = solve(problem, model, replace(PLAIN, constants=True))
     assert constants is not None and joint.constants is not None
     spread = np.sqrt(np.diag(joint.constants))
@@ -163,6 +173,15 @@ def tracks_of(problem: SmoothingProblem) -> pd.DataFrame:
         table = table.merge(pd.DataFrame(pixels), on=["frame", "particle"])
     table["d_eq_mm"] = table["sd_eq_mm"] = 1.5
     return table.sort_values(["frame", "particle"], ignore_index=True)
+
+
+def marks_of(problem: SmoothingProblem) -> pd.DataFrame:
+    """The pixels of a problem's marks as a table like references.csv."""
+    seen = problem.references
+    table = pd.DataFrame({"frame": seen.frame, "mark": [f"m{k}" for k in seen.item]})
+    table["camera"] = [problem.cameras[c].name for c in seen.camera]
+    table["u_px"], table["v_px"] = seen.uv_px.T
+    return table
 
 
 def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
@@ -266,7 +285,7 @@ def test_only_standard_deviations_are_widened(tmp_path: Path) -> None:
     shake = pd.DataFrame({name: np.ones(3) for name in names})
     with hdf5_file(tmp_path / "piece.h5") as made:
         piece = ResultsFile(made)
-        piece.append(shake.iloc[:0], shake, {}, None)
+        piece.append(Tables(shake.iloc[:0], shake))
         piece.finish((1.0, 1.0, 1.0))
     with results_file(tmp_path) as file, h5py.File(tmp_path / "piece.h5", "r") as written:
         file.append_piece(written, (2.0, 3.0, 4.0))
@@ -277,36 +296,47 @@ def test_only_standard_deviations_are_widened(tmp_path: Path) -> None:
 def test_an_interrupted_smoothing_goes_on_with_the_pieces_that_it_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, _ = crowded(240)
+    """Each of four pieces is solved twice, first for the places of the marks."""
+    problem, _ = crowded(240, marks=1)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
-    solved = list[int]()
+    stop, solved, said = 0, list[int](), list[str]()
 
     def counted(problem: SmoothingProblem, model: ShakeModel, options: Options) -> Solution:
-        if options.covariances:
-            solved.append(len(problem.t_s))
-            if len(solved) == stop:
-                raise KeyboardInterrupt
+        solved.append(len(problem.t_s))
+        if len(solved) == stop:
+            raise KeyboardInterrupt
         return solve(problem, model, options)
 
     monkeypatch.setattr(pieces_module, "solve", counted)
 
     def smoothed(folder: str, key: str = "a") -> telerig.Smoothing:
         solved.clear()
-        place = tmp_path / folder
+        said.clear()
         return telerig.smooth(
             tracks_of(problem), calibration, model="default", t_s=problem.t_s,
-            options=Options(frames=60), unfinished=UnfinishedPieces(place, key),
+            references=marks_of(problem), options=Options(frames=60),
+            unfinished=UnfinishedPieces(tmp_path / folder, key),
+            progress=lambda what, _share, _of: said.append(what.partition("frames: ")[2]),
         )  # fmt: skip
 
-    stop = 0
+    def going_on() -> list[str]:
+        return [what for what in said if "going on" in what]
+
     whole = smoothed("whole")
-    assert len(solved) == 4
+    assert len(solved) == 8 and not going_on()
+    of_first_round = "what is constant along the run, going on, {} of 4 pieces are finished"
     stop = 3
     with pytest.raises(KeyboardInterrupt):
         smoothed("parts")
+    assert not going_on()
+    stop = 5
+    with pytest.raises(KeyboardInterrupt):
+        smoothed("parts")
+    assert going_on() == [of_first_round.format(2)]
     stop = 0
     again = smoothed("parts")
     assert len(solved) == 2
+    assert going_on() == [of_first_round.format(4), "going on, 2 of 4 pieces are finished"]
     for name in ("trajectories", "shake", "bodies"):
         pd.testing.assert_frame_equal(getattr(again, name), getattr(whole, name))
     np.testing.assert_array_equal(
@@ -315,8 +345,10 @@ def test_an_interrupted_smoothing_goes_on_with_the_pieces_that_it_has(
     assert again.verdict == whole.verdict
     first, second = (packed({**s.summary, "seconds": 0}) for s in (again, whole))
     assert first == second
-    smoothed("parts", "b")
-    assert len(solved) == 4, "pieces of other inputs are not used"
+    stop = 1
+    with pytest.raises(KeyboardInterrupt):
+        smoothed("parts", "b")
+    assert not going_on(), "pieces of other inputs are not used"
 
 
 def test_pieces_of_an_interrupted_call_are_not_taken_for_those_of_other_data(
@@ -354,7 +386,7 @@ def test_a_sensor_of_another_piece_than_the_middle_one_is_held_against_its_prior
     ending = replace(right.of(short), reading_mm_s2=right.reading_mm_s2[short] + [0, 3000.0, 0])
     problem = with_clock_numbers(replace(problem, accelerometers=(left, ending)))
     pieces = pieces_of(problem, model, 100)
-    constants = Constants.of(problem, model, pieces, PLAIN, silent)
+    constants = constants_of(problem, model, pieces)
     chosen = [0, piece_with_most(problem, pieces)]
     parts = list[Evidence]()
     for piece, _, solution in solved_pieces(

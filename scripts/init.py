@@ -65,9 +65,10 @@ def init(
         copies = [
             f"the images of {source} to {dataset / 'calibration' / name}"
             for name, source in seen.sources.items()
+            if Path(source).resolve() != (dataset / "calibration" / name).resolve()
         ]
-        first = f"copy {', '.join(copies)}"
-        if len(rig) > 1:
+        first = f"copy {', '.join(copies)}" if copies else ""
+        if copies and len(rig) > 1:
             first += " (images of one view have the same name for all cameras)"
         missing = "the angles between the cameras" if len(rig) > 1 else "the cameras"
         if pitch is None:
@@ -86,7 +87,7 @@ def init(
         missing = "the target and its size, the cameras"
     for path in made:
         say(f"made: {path}")
-    say(f"next: {first}, and edit {made[0]} ({missing})")
+    say(f"next: {first}{', and ' * bool(first)}edit {made[0]} ({missing})")
 
 
 if __name__ == "__main__":

@@ -83,14 +83,14 @@ class NextView:
         before, after = (number(um, digits) for um in both)
         return (
             f"{self.views} views; one more would reduce the calibration's share of the errors of "
-            f"points from {before} to {after} µm{self._floor()}{worth}"
+            f"points from {before} to {after} µm{self._floor(digits)}{worth}"
         )
 
-    def _floor(self) -> str:
+    def _floor(self, digits: int) -> str:
         if 2 * self.size_um**2 < self.before_um**2:
             return ""
         return (
-            f" ({number(self.size_um, 2)} µm remain with any number of views, because the "
+            f" ({number(self.size_um, digits)} µm remain with any number of views, because the "
             "target's size is not known better)"
         )
 

@@ -203,7 +203,10 @@ def load_run(
     sizes |= {n: _size(s) for n, s in sources.items() if n not in sizes}
     count = len(positions[names[0]]) if images else None
     recorded = _recorded_times(sources, positions)
-    t_s = _times(folder, every, count, detections, notes, recorded)
+    skipped = (
+        np.flatnonzero(np.all([p < 0 for p in positions.values()], axis=0)) if images else None
+    )
+    t_s = _times(folder, every, count, detections, notes, recorded, skipped)
     lost = notes if skip_unreadable else None
     stage = _table(folder / "stage.csv", read_stage_csv, lost)
     sensors = list(rig.accelerometers) if rig else None
@@ -390,17 +393,19 @@ def _times(
     detections: pd.DataFrame | FrameTable | None,
     notes: list[str],
     recorded: tuple[Path, Array] | None = None,
+    skipped: Ints | None = None,
 ) -> Array:
     """Return the (F,) times in s of the frames from frames.csv, else from run.toml, else recorded.
 
     count : number of frames of the images; None when the detections decide.
+    skipped : the frames of which no camera has an image.
     """
     file, settings = folder / "frames.csv", folder / "run.toml"
     if file.is_file():
         if settings.is_file():
             read_run_toml(settings)
             notes.append("frame times are read from frames.csv; those of run.toml are not used")
-        return np.asarray(read_frames_csv(file, count, names)["t_s"], float)
+        return np.asarray(read_frames_csv(file, count, names, skipped)["t_s"], float)
     if count is None:
         count = 0
         if isinstance(detections, FrameTable):

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
-from telerig.arrays import Bools
+from telerig.arrays import Bools, Ints
 from telerig.errors import InputError, suggestion
 from telerig.io.files.csv_table import Column, Rows, read_part, read_table, rows_of
 from telerig.io.files.toml import read_toml
@@ -119,17 +119,25 @@ def check_names(table: pd.DataFrame, column: str, thing: str, names: list[str], 
 
 
 def check_pixels(table: pd.DataFrame, sizes_px: Mapping[str, tuple[int, int]], file: Path) -> None:
-    """Raise InputError for the first pixel more than `OUTSIDE_PX` outside its camera's image."""
+    """Raise InputError for the first pixel more than `OUTSIDE_PX` outside its camera's image.
+
+    The centre of an outline with a semi-axis a_px may lie farther outside by a_px: the image's
+    border cuts the outline.
+    """
     sizes = np.array([sizes_px[name] for name in table["camera"]], float).reshape(-1, 2)
+    reach = np.nan_to_num(table["a_px"].to_numpy(float)) if "a_px" in table else 0.0
     for column, size in zip(("u_px", "v_px"), sizes.T):
-        _check_inside(table, column, size, file)
+        _check_inside(table, column, size, OUTSIDE_PX + reach, file)
 
 
-def _check_inside(table: pd.DataFrame, column: str, size: Any, file: Path) -> None:
-    """Raise InputError for a pixel coordinate outside its image; size : (rows,) limit in px."""
+def _check_inside(table: pd.DataFrame, column: str, size: Any, reach: Any, file: Path) -> None:
+    """Raise InputError for a pixel coordinate outside its image.
+
+    size : (rows,) limit in px. reach : how far (px) outside a coordinate may be.
+    """
     value = table[column].to_numpy()
     rows_of(table, file).refuse(
-        (value < -0.5 - OUTSIDE_PX) | (value > size - 0.5 + OUTSIDE_PX),
+        (value < -0.5 - reach) | (value > size - 0.5 + reach),
         column,
         lambda i: f"is {value[i]:g}, outside the image of {size[i]:.0f} px",
         "correct the cell, or image_size_px = [width, height] in rig.toml",
@@ -227,10 +235,13 @@ REFERENCE_SIGMA_PX = 0.1
 _RUN_KEYS = ["frame_rate_hz", "start_s"]
 
 
-def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> pd.DataFrame:
+def read_frames_csv(
+    path: Path, frame_count: int | None, cameras: list[str], skipped: Ints | None = None
+) -> pd.DataFrame:
     """Read `frames.csv`, which gives the time of every frame of a run.
 
     frame_count : how many frames the images have; None where the table decides.
+    skipped : the frames among them of which no camera has an image.
     Returns one row per frame, counted from 0 without gaps, with the columns frame, t_s (the middle
     of the exposure in s) and all further ones. The optional column ``missing`` names the cameras
     that dropped the frame, joined by ``|``.
@@ -239,7 +250,7 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
     """
     table = read_table(path, FRAMES.of(), extra=True)
     rows = rows_of(table, path)
-    _check_frames(table, frame_count, rows)
+    _check_frames(table, frame_count, rows, skipped)
     frame, t = table["frame"].to_numpy(), table["t_s"].to_numpy()
     rows.refuse(
         np.diff(t, prepend=-np.inf) <= 0,
@@ -259,7 +270,9 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
     return table.reset_index(drop=True)
 
 
-def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> None:
+def _check_frames(
+    table: pd.DataFrame, frame_count: int | None, rows: Rows, skipped: Ints | None
+) -> None:
     """Raise InputError unless the column frame counts 0, 1, 2, ... up to the last image."""
     frame, expected = table["frame"].to_numpy(), np.arange(len(table))
 
@@ -280,12 +293,21 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
         "add the missing row; frames count from 0",
     )
     if frame_count is not None and len(frame) < frame_count:
-        raise InputError(
+        what = (
             f"has {counted(len(frame), 'row')}, but there are images of {frame_count} frames: "
-            f"frame {len(frame)} has no time",
-            where=f"{rows.file} row {rows.numbers[-1]}",
-            todo="add the missing rows, or remove the images that do not belong to the run",
+            f"frame {len(frame)} has no time"
         )
+        todo = "add the missing rows, or remove the images that do not belong to the run"
+        if skipped is not None and len(skipped):
+            some = ", ".join(map(str, skipped[:8])) + (", ..." if len(skipped) > 8 else "")
+            what += (
+                f"; the numbers in the images' names skip {counted(len(skipped), 'frame')} ({some})"
+            )
+            todo = (
+                "add a row for each of these frames, too; or, if the images follow each other "
+                "without a gap, add a blank column `missing`: then their order counts"
+            )
+        raise InputError(what, where=f"{rows.file} row {rows.numbers[-1]}", todo=todo)
 
 
 def read_run_toml(path: Path) -> tuple[float, float]:

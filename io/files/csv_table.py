@@ -31,6 +31,10 @@ _EVERY_DIGIT: dict[str, Any] = (
 )  # fmt: skip
 """An option for `pandas.read_csv`, whose default parser rounds correctly from pandas 3.1 on."""
 _EXPORT = "export the table as comma-separated UTF-8 with one header line"
+_CONVERT_IT = (
+    "; or write it anew with pandas: pd.read_csv(FILE, sep={mark!r}, decimal=',')"
+    ".to_csv(FILE, index=False)"
+)
 _NO_MARKS = bytes(set(range(256)) - set(b",\n"))
 
 MOST_COLUMNS = 1000
@@ -240,7 +244,8 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
     for mark, word in ((";", "semicolons"), ("\t", "tabs")):
         if mark in first and "," not in first:
             what = f"the columns are separated by {word}"
-            raise InputError(what, where=f"{file} row {numbers[0]}", todo=_EXPORT)
+            todo = _EXPORT + _CONVERT_IT.format(mark=mark)
+            raise InputError(what, where=f"{file} row {numbers[0]}", todo=todo)
     header, *rows = (_split(lines[i - 1], f"{file} row {i}") for i in numbers)
     Rows(file, numbers[1:]).refuse(
         np.array([len(row) != len(header) for row in rows], bool),

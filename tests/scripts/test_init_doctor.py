@@ -74,6 +74,12 @@ def test_init_from_images_says_where_the_images_go(tmp_path):
     for name in ("left", "right"):
         assert f"{images}/{name} to {tank}/calibration/{name}" in text
     assert "no view has an image of every camera" in text
+    (tank / "rig.toml").unlink()
+    for name in ("left", "right"):
+        (tmp_path / "images" / name).replace(tank / "calibration" / name)
+    result = _asked("init", str(tank), "--from-images", str(tank / "calibration"), "--pitch", "7")
+    assert result.exit_code == 0, result.output
+    assert f"next: edit {tank}/rig.toml" in result.output.replace("\n", " "), "they are there"
 
 
 def test_init_of_four_cameras(tmp_path):

@@ -73,6 +73,9 @@ _FRAME_FACTORS = {
     2.0: "the stated frame rate is twice the true one",
 }
 _USUAL_GAIN, _KNOWN_GAIN = (0.75, 1.35), 0.01
+_STANDS = 1e5
+"""An encoder that reads less than a hundredth of its motion in metres stands still; a gain would
+only be the noise of its numbers."""
 _FAR = 3.0
 """Prior standard deviations beyond which a lens or an axis is wrong rather than a little off."""
 
@@ -920,6 +923,8 @@ def _gain_finding(gain: float, reach: float, sd: float, where: str) -> Finding:
     named = abs(np.log(abs(gain) / size)) < reach and (size != 1.0 or gain < 0)
     factor = float(np.copysign(size, gain)) if named else gain
     seen = f"images and sensors show {gain:.4g} ± {sd:.2g} times the motion that it reads"
+    if abs(gain) > _STANDS:
+        seen = "it reads hardly any motion, but images and sensors show some"
     todo, fix = f"multiply position_mm by {factor:.6g}", {"encoder_factor": factor}
     if factor == -1.0:
         words, code = f"{seen}: its sign is turned", Code.ENCODER_SIGN
@@ -928,7 +933,7 @@ def _gain_finding(gain: float, reach: float, sd: float, where: str) -> Finding:
     else:
         words, code = f"{seen}: its scale is wrong", Code.ENCODER_SCALE
         if not sd < _KNOWN_GAIN * abs(gain):
-            todo, fix = "check its unit and its counts per mm", {}
+            todo, fix = "check its unit, its counts per mm, and that t_s is in s", {}
     return Finding(words, where, todo, code, fix)
 
 

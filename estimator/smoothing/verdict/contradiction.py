@@ -147,7 +147,7 @@ def speed_warnings(problem: SmoothingProblem, means: Array) -> list[str]:
     how = "sink" if rise < -_LEAST_RISE_MM_S else "hover"
     return [
         f"the bubbles {how} in the laboratory frame (mean rise {rise:.3g} mm/s). Unless liquid "
-        "flows downwards, check the sign and the unit of the encoder"
+        "flows downwards, check the sign and the unit of the encoder, and that its t_s is in s"
     ]
 
 

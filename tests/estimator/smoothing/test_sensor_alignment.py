@@ -129,6 +129,14 @@ def test_marks_show_the_unit_of_an_encoder_that_seems_to_stand() -> None:
     assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": 1e3}]
 
 
+def test_an_encoder_of_another_clock_unit_hardly_moves() -> None:
+    """Times in microseconds: a factor would be the noise of its numbers."""
+    _, said = placed(905, "one", scenario="S2", encoder=1e-9)
+    (finding,) = [f for f in said if f.code is not None]
+    assert finding.code == "ENCODER_SCALE" and not finding.fix
+    assert "hardly any motion" in finding.warning and "t_s is in s" in finding.todo
+
+
 def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known() -> None:
     """By marks. Beside one bubble 4 times could be a resonance of the arms."""
     _, said = placed(906, "references", scenario="S2", encoder=1 / 4, around_s=10.0)

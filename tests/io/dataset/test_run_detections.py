@@ -72,8 +72,8 @@ def change(old: str, new: str) -> str:
 
 BAD_DETECTIONS = [
     ("camera", change("0,right", "0,rigth"), ("row 3, column camera", "did you mean right?")),
-    ("right of it", change("10,12", "52,12"), ("row 2, column u_px", "outside the image of 48 px")),
-    ("above it", change("10,12", "10,-4"), ("row 2, column v_px", "outside the image of 32 px")),
+    ("right of it", change("10,12", "62,12"), ("row 2, column u_px", "outside the image of 48 px")),
+    ("above it", change("10,12", "10,-14"), ("row 2, column v_px", "outside the image of 32 px")),
     ("nan", change("10,12", "nan,12"), ("row 2, column u_px", "not a finite number")),
     ("text", change("10,12", "10,middle"), ("row 2, column v_px", "'middle'")),
     ("negative frame", change("2,left", "-2,left"), ("row 4, column frame", "before 0")),
@@ -93,6 +93,14 @@ BAD_DETECTIONS = [
 )
 def test_bad_detections(text: str, words: tuple[str, ...], run_folder: Path) -> None:
     error_of(detections(run_folder, text), "detections.csv", *words)
+
+
+def test_outlines_that_the_border_cuts_may_have_their_centres_outside(run_folder: Path) -> None:
+    """As in the table that telerig itself writes."""
+    run = load_run(detections(run_folder, change("10,12", "-8,12")))
+    assert run.detections is not None and run.detections["u_px"][0] == -8
+    message = ("row 2, column u_px", "is -9, outside the image of 48 px")
+    error_of(detections(run_folder, change("10,12", "-9,12")), *message)
 
 
 def test_detections_beyond_frames_csv(run_folder: Path) -> None:

@@ -118,6 +118,11 @@ def test_a_number_that_both_cameras_miss_keeps_its_time(full_run: Path) -> None:
     assert run.frame_count == 6 and run.image("left", 3) is None
     np.testing.assert_array_equal(run.image("left", 4), LEFT[4])
     assert run.t_s[4] == pytest.approx(2.04)
+    (full_run / "frames.csv").write_text("frame,t_s\n0,0\n1,.1\n2,.2\n3,.4\n4,.5\n")
+    error_of(full_run, "has 5 rows", "the images' names skip 1 frame (3)", "blank column `missing`")
+    (full_run / "frames.csv").write_text("frame,t_s,missing\n0,0,\n1,.1,\n2,.2,\n3,.4,\n4,.5,\n")
+    run = load_run(full_run)
+    np.testing.assert_array_equal(run.image("left", 3), LEFT[4])
 
 
 def test_counts_that_differ_without_numbers(run_folder: Path) -> None:

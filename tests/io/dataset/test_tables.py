@@ -157,7 +157,7 @@ HEADERS = [
     ("view,camera,dot,u_px,v_pix", "unknown column 'v_pix': did you mean v_px?", "view,camera,dot"),
     ("view,camera,dot,u_px,v_pix", "missing column: v_px", "view,camera,dot"),
     ("view,camera,dot,u_px,u_px", "the column 'u_px' stands twice", "remove one"),
-    ("view;camera;dot;u_px;v_px", "separated by semicolons", "comma-separated"),
+    ("view;camera;dot;u_px;v_px", "separated by semicolons", "pd.read_csv(FILE, sep=';'"),
     ("view\tcamera\tdot\tu_px\tv_px", "separated by tabs", "comma-separated"),
 ]
 

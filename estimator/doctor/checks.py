@@ -7,7 +7,7 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distributions, requires, version
 from pathlib import Path
@@ -179,14 +179,15 @@ def check_dataset(place: Path) -> Iterator[Check]:
     )
     yield Check("rig.toml", "ok", f"{data.rig.name!r}: {cameras}")
     yield from _views(data)
+    frames = 0
     for name in data.runs:
         if only in (None, name):
-            yield from _run(data, name)
+            frames += yield from _run(data, name)
     if not data.runs:
         yield Check("runs", "note", "none", "put recordings into runs/<name>/<camera>/")
     yield from _results(data)
     yield from _left_over(data)
-    yield _disk(data)
+    yield _disk(data, frames)
 
 
 def _results(data: Dataset) -> Iterator[Check]:
@@ -255,8 +256,8 @@ def _decoded(data: Dataset) -> Iterator[Check]:
             yield Check(f"images of {camera}", "ok", f"{len(mine)}, {', '.join(sorted(kinds))}")
 
 
-def _run(data: Dataset, name: str) -> Iterator[Check]:
-    """Check that a run can be loaded, then its clocks and its sensors."""
+def _run(data: Dataset, name: str) -> Generator[Check, None, int]:
+    """Check that a run can be loaded, then its clocks and its sensors; return its frames."""
     what = f"run {name}"
     try:
         check_run_name(data.runs[name].path)
@@ -265,7 +266,7 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
         run = data.runs[name].load(source=source)
     except TelerigError as error:
         yield _failure(what, error)
-        return
+        return 0
     span = float(run.t_s[-1] - run.t_s[0]) if run.frame_count > 1 else 0.0
     rate = (run.frame_count - 1) / span if span else 0.0
     frames = counted(run.frame_count, "frame")
@@ -280,6 +281,7 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
         yield from _crowds(run, what)
     yield from _clocks(run, what)
     yield from _sensors(run, what)
+    return run.frame_count
 
 
 def _crowds(run: RunData, what: str) -> Iterator[Check]:
@@ -356,10 +358,9 @@ def _rate(t_s: np.ndarray) -> str:
     return f"{(len(t_s) - 1) / (t_s[-1] - t_s[0]):.4g} Hz"
 
 
-def _disk(data: Dataset) -> Check:
-    """Check that there is enough disk space for the results."""
+def _disk(data: Dataset, frames: int) -> Check:
+    """Check that there is enough disk space for the results of so many frames."""
     free = shutil.disk_usage(data.path).free
-    frames = sum(len(list(r.path.rglob("*.tif*"))) for r in data.runs.values())
     wanted = max(_LEAST_FREE_GB * 1e9, frames * _RESULT_BYTES_PER_FRAME)
     words = f"{free / 1e9:.3g} GB free"
     if free < wanted:

@@ -35,7 +35,7 @@ from telerig.io.results.verdict_words import number_words
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.tables.smoothing import AXES
 from telerig.short_text import counted, share
-from telerig.spectra import motion_spectrum
+from telerig.spectra import motion_spectrum, welch_density
 
 Progress = Callable[[str, float, int], None]
 
@@ -108,7 +108,7 @@ def check_recording(
         return Recording(run, tuple(checks))
     speed = _speed_px_s(tracks, run.cameras)
     checks += [*_outlines(tracks, run.cameras), _exposure(speed), *_rig(tracks, speed)]
-    smoothing, found = _smoothed(tracks, calibration, run, progress)
+    smoothing, used, found = _smoothed(tracks, calibration, run, progress)
     checks += found
     expected = None
     if smoothing is None:
@@ -116,7 +116,7 @@ def check_recording(
     else:
         checks += _shake(smoothing, calibration, run.cameras)
         length = float(np.ptp(run.t_s)) if seconds is None else seconds
-        expected = _expected(run, tracks, smoothing, calibration, length)
+        expected = _expected(used, tracks, smoothing, calibration, length)
         checks.append(_verdict(expected, length, smoothing))
     return Recording(run, tuple(checks), tracks, smoothing, expected)
 
@@ -276,8 +276,8 @@ def _rig(tracks: Tracks, speed: float) -> Iterator[Check]:
 
 def _smoothed(
     tracks: Tracks, calibration: Calibration, run: RunData, progress: Progress | bool
-) -> tuple[Smoothing | None, list[Check]]:
-    """Smooth the recording, if need be without the sensors that are refused."""
+) -> tuple[Smoothing | None, RunData, list[Check]]:
+    """Smooth the recording, if need be without the sensors that are refused; also return it so."""
     said = check_sensors(run)
     checks = [_of_sensor(finding) for finding in said]
     smoothing = None
@@ -291,7 +291,7 @@ def _smoothed(
             run = _without_refused(run, error.findings)
         except TelerigError as error:
             checks.append(Check("smoothing", "failure", error.what, error.todo))
-            return None, checks
+            return None, run, checks
     warnings = [] if smoothing is None else smoothing.summary.get("warnings", ())
     known = [finding.warning for finding in said]
     checks += [Check("sensors", "warning", str(w)) for w in warnings if str(w) not in known]
@@ -299,7 +299,7 @@ def _smoothed(
         present = run.stage is not None or run.accelerometers is not None
         words = "encoder and accelerometers agree with the images" if present else "none"
         checks.append(Check("sensors", "ok" if present else "note", words))
-    return smoothing, checks
+    return smoothing, run, checks
 
 
 def _of_sensor(finding: Finding) -> Check:
@@ -344,14 +344,10 @@ def shake_line(smoothing: Smoothing, cameras: Sequence[str]) -> tuple[Array, flo
 
     The frequency is in Hz; cameras : their names.
     """
-    from scipy.signal import welch
-
     shake = smoothing.shake
     columns = [f"{camera}_{axis}_mm" for camera in cameras for axis in AXES]
     values = shake[columns].to_numpy(float)
-    rate = 1 / float(np.median(np.diff(shake["t_s"])))
-    length = min(_SEGMENT, len(values))
-    hz, density = welch(values, rate, nperseg=length, detrend="linear", axis=0)
+    hz, density = welch_density(shake["t_s"].to_numpy(float), values, _SEGMENT)
     rms = values.std(0).reshape(len(cameras), 3)
     return rms, float(hz[1 + np.argmax(density.sum(1)[1:])])
 

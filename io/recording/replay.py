@@ -250,9 +250,8 @@ def _times(line: _Line, arrived_s: Array, t: Array | None, slot: Ints, start_ns:
     """Return the times of a device's readings from its stamps ``t``, its polls, or the arrivals."""
     device = line.device
     if t is not None:
-        wrap_s = 2.0**device.time_bits * device.time_unit_s if device.time_bits else 0.0
         check_unit(arrived_s, t, device)
-        clock = host_times(arrived_s, t * device.time_unit_s, wrap_s)
+        clock = host_times(arrived_s, t * device.time_unit_s, device.wrap_s)
         return _Timed(
             clock.t_s - device.latency_s, "device", "wrong or repeated stamp", clock.fits,
             clock.wraps,

@@ -25,7 +25,8 @@ from telerig.io.recording.replay import (
     replay,
 )
 from telerig.io.rig_file.description import DeviceDescription
-from telerig.io.tables.run import ACCELEROMETER
+from telerig.io.tables.run import ACCELEROMETER, STAGE
+from telerig.io.tables.table import Table
 
 _ROWS = 20_000
 _LISTED_GAPS = 200
@@ -80,10 +81,14 @@ def write_tables(
         frames = frame_times([])
         errors |= {r.device.name: error for r in of["frames"]}
     accelerometers = chain(
-        _accelerometers(of["accelerometer"]),
+        _measured(ACCELEROMETER, of["accelerometer"]),
         _of_others(out / "accelerometer.csv", {r.device.name for r in of["accelerometer"]}),
     )
-    text = {"encoder": _stage(encoder), "accelerometer": accelerometers, "frames": _frames(frames)}
+    text = {
+        "encoder": _measured(STAGE, encoder),
+        "accelerometer": accelerometers,
+        "frames": _frames(frames),
+    }
     rows: dict[str, int] = {}
     with atomic_folder(out) as beside:
         for kind, name in _TABLES.items():
@@ -129,21 +134,15 @@ def refuse_existing(folder: str | PathLike[str]) -> None:
             )
 
 
-def _stage(records: Sequence[DeviceRecord]) -> Iterator[str]:
-    yield "t_s,position_mm\n"
+def _measured(table: Table, records: Sequence[DeviceRecord]) -> Iterator[str]:
+    """Return a table of what encoders or accelerometers have measured."""
+    yield f"{','.join(table.names())}\n"
     for record in records:
         if len(record.t_s):
-            yield from _rows(f"%.{TIME_DIGITS}f,%.9g\n", [record.t_s, position_mm(record)])
-
-
-def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
-    yield f"{','.join(ACCELEROMETER.names())}\n"
-    for record in records:
-        if len(record.t_s):
-            unit = record.device.unit_m_s2
-            name = record.device.name.replace("%", "%%")
-            columns = [record.t_s, *(unit * record.values[axis] for axis in ("ax", "ay", "az"))]
-            yield from _rows(f"%.{TIME_DIGITS}f,{name},%.9g,%.9g,%.9g\n", columns)
+            columns = [record.t_s, *record.device.measured(record.values).values()]
+            name = [record.device.name.replace("%", "%%")] if table is ACCELEROMETER else []
+            line = ",".join([f"%.{TIME_DIGITS}f", *name, *["%.9g"] * (len(columns) - 1)])
+            yield from _rows(f"{line}\n", columns)
 
 
 def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
@@ -175,13 +174,6 @@ def _refused(records: Sequence[DeviceRecord]) -> Iterator[str]:
 
 
 _TABLES = {"encoder": "stage.csv", "accelerometer": "accelerometer.csv", "frames": "frames.csv"}
-
-
-def position_mm(record: DeviceRecord) -> Array:
-    """Return the encoder's readings (N,) in mm."""
-    if "position_mm" in record.values:
-        return record.values["position_mm"]
-    return record.values["counts"] / (record.device.counts_per_mm or 1.0)
 
 
 def _rows(line: str, columns: list[Array]) -> Iterator[str]:

@@ -184,6 +184,14 @@ def shrunk(image: NDArray[Any], factor: float) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
+def grey_levels(images: Sequence[NDArray[Any]]) -> tuple[float, float]:
+    """Return black and white levels for all images, from some of them; of 8 bit they stay."""
+    if not len(images) or images[0].dtype == np.uint8:
+        return 0.0, 255.0
+    ends = np.array([np.percentile(image, [0.1, 99.9]) for image in images])
+    return float(ends[:, 0].min()), float(ends[:, 1].max())
+
+
 def in_grey(grey: NDArray[np.float32], low: float, high: float) -> Picture:
     """Return 8-bit RGB (h, w, 3), black at ``low`` and white at ``high``."""
     stretched = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255)

@@ -13,6 +13,7 @@ from typing import Annotated, ClassVar, Literal, get_args
 import numpy as np
 from pydantic import ConfigDict, Field
 
+from telerig.arrays import Array
 from telerig.errors import InputError, suggestion
 from telerig.rig.target import Polarity, Target
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
@@ -252,6 +253,22 @@ class DeviceDescription(Table):
     latency_s: Annotated[float, Field(description="a number of seconds")] = 0.0
     axis: Literal["x", "y", "z"] = "x"
     cameras: Annotated[tuple[str, ...], Field(description="a list of the cameras' names")] = ()
+
+    @property
+    def wrap_s(self) -> float:
+        """Return after which time its stamps start again, in s; 0 for never."""
+        return 2.0**self.time_bits * self.time_unit_s if self.time_bits else 0.0
+
+    def measured(self, values: Mapping[str, Array]) -> dict[str, Array]:
+        """Return readings (N,), given as sent, in mm (encoder) or by axis in m/s^2.
+
+        Those of an encoder have the name "". A frame counter measures nothing.
+        """
+        if self.kind == "accelerometer":
+            return {axis: self.unit_m_s2 * values[f"a{axis}"] for axis in "xyz"}
+        if "position_mm" in values:
+            return {"": values["position_mm"]}
+        return {"": values["counts"] / (self.counts_per_mm or 1.0)} if "counts" in values else {}
 
 
 @dataclass(frozen=True)

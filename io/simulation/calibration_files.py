@@ -163,14 +163,18 @@ def write_images(
     rng: np.random.Generator,
 ) -> None:
     """Render and write a TIFF image ``folder/<camera>/<view>.tif`` for each camera of each view."""
-    import tifffile
-
     for view in views:
         for name in view.cameras:
             image = view_image(config, cameras[name], target, view.rig_from_target, rng)
-            file = folder / name / f"{view.name}.tif"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            tifffile.imwrite(file, image, metadata=None, software="telerig")
+            write_image(folder / name / f"{view.name}.tif", image)
+
+
+def write_image(file: Path, image: NDArray[Any]) -> None:
+    """Write a TIFF image, and make its folder."""
+    import tifffile
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    tifffile.imwrite(file, image, metadata=None, software="telerig")
 
 
 def view_image(

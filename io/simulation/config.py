@@ -296,9 +296,8 @@ class ImageConfig:
     lens_dirt : number of specks that stand still in the image.
     flicker : relative standard deviation of the brightness from frame to frame.
     read_noise, shot_noise : standard deviations as shares of full scale, the latter at full scale.
-    bit_depth, left_aligned : see `telerig.io.simulation.images.sensor.digitise`.
+    bit_depth : number of bits of a pixel.
     dropped : share of frames that a camera loses; the column missing of `frames.csv` names them.
-    pages : whether each camera's images are one multi-page file.
     """
 
     screen: float = 0.7
@@ -315,9 +314,7 @@ class ImageConfig:
     read_noise: float = 0.004
     shot_noise: float = 0.012
     bit_depth: int = 8
-    left_aligned: bool = False
     dropped: float = 0.0
-    pages: bool = False
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -31,6 +30,7 @@ from telerig.io.simulation.calibration_files import (
     measured_dots,
     seed_of,
     write_calibration,
+    write_image,
     write_images,
 )
 from telerig.io.simulation.config import ImageConfig, RunConfig
@@ -44,12 +44,6 @@ from telerig.io.simulation.run.sensors import accelerometer_table, stage_table
 from telerig.io.simulation.run.views import CameraView, camera_view, linear_projection, truth_rows
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    Writer = Callable[[str, int, NDArray[Any]], None]
-
 
 Views = dict[str, CameraView]
 
@@ -124,22 +118,18 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
         write_table(references_table(scene, mark_rng), run / "references.csv")
     truth: list[dict[str, Any]] = []
     detections: list[dict[str, Any]] = []
-    with ExitStack() as stack:
-        if images:
-            write = stack.enter_context(_image_files(run, config.image, list(cameras)))
-            renderer = _Renderer(scene, image_rng, strips)
-        for frame in range(config.frames):
-            views = {name: camera_view(scene, frame, j) for j, name in enumerate(cameras)}
-            truth.append(truth_rows(scene, frame, views))
-            for j, (name, view) in enumerate(views.items()):
-                if lost[j, frame]:
-                    continue
-                if images:
-                    write(name, frame, renderer.image(frame, j, view))
-                else:
-                    size = cameras[name].image_size_px
-                    rows = _detected(config, frame, name, view, scene, size, table_rng)
-                    detections.append(rows)
+    renderer = _Renderer(scene, image_rng, strips) if images else None
+    for frame in range(config.frames):
+        views = {name: camera_view(scene, frame, j) for j, name in enumerate(cameras)}
+        truth.append(truth_rows(scene, frame, views))
+        for j, (name, view) in enumerate(views.items()):
+            if lost[j, frame]:
+                continue
+            if renderer is not None:
+                write_image(run / name / f"{frame:06d}.tif", renderer.image(frame, j, view))
+            else:
+                size = cameras[name].image_size_px
+                detections.append(_detected(config, frame, name, view, scene, size, table_rng))
     if not images:
         write_table(_joined(detections), run / "detections.csv")
     known = folder / "truth" / "runs" / config.name
@@ -187,7 +177,6 @@ class _Renderer:
             read_noise=image.read_noise,
             shot_noise=image.shot_noise,
             bit_depth=image.bit_depth,
-            left_aligned=image.left_aligned,
         )
 
     def _marks(self, frame: int, index: int) -> list[Silhouette]:
@@ -221,30 +210,6 @@ def _window_dirt(
     share = float(np.prod(high - low) / np.prod(size))
     count = round(image.window_dirt * share)
     return random_specks(rng, count, low, high, sigma_px=(0.7, 2.2), depth=(0.05, 0.5))
-
-
-@contextmanager
-def _image_files(run: Path, image: ImageConfig, cameras: list[str]) -> Iterator[Writer]:
-    """Return a function (camera, frame, pixels) that writes single files, or pages of one file."""
-    import tifffile
-
-    for name in cameras:
-        (run if image.pages else run / name).mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        files = {
-            name: stack.enter_context(tifffile.TiffWriter(run / f"{name}.tif"))
-            for name in cameras
-            if image.pages
-        }
-
-        def write(name: str, frame: int, pixels: NDArray[Any]) -> None:
-            if image.pages:
-                files[name].write(pixels, contiguous=False, metadata=None, software="telerig")
-            else:
-                file = run / name / f"{frame:06d}.tif"
-                tifffile.imwrite(file, pixels, metadata=None, software="telerig")
-
-        yield write
 
 
 def _detected(

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
-from telerig.io.report.plot.axes import KEPT, LEFT_OUT, camera_colour
+from telerig.io.report.overlays import grey_levels
+from telerig.io.report.plot.axes import KEPT, LEFT_OUT, camera_colour, rgb
 from telerig.io.report.plot.outline import camera_outline, rig_outline
 from telerig.io.results.folders.calibration import CalibrationResults
 from telerig.io.view.names import DEVIATIONS, MAGNIFIED, RIG, VIEW, need_rerun, of_image, path
-from telerig.io.view.stream import grey_levels, log_image, rgb
+from telerig.io.view.stream import log_image
 from telerig.rig.camera import Camera
 
 Images = Callable[[str, str], NDArray[Any] | None]

@@ -24,7 +24,8 @@ from telerig.io.dataset.run import RunData, RunSource, recordings
 from telerig.io.images.read import list_images, read_image
 from telerig.io.recording.clock import unwrap
 from telerig.io.report.film.views import outlines_of
-from telerig.io.report.plot.axes import COLOURS, KEPT, LEFT_OUT, MUTED
+from telerig.io.report.overlays import grey_levels
+from telerig.io.report.plot.axes import COLOURS, KEPT, LEFT_OUT, MUTED, rgb
 from telerig.io.rig_file.description import DeviceDescription
 from telerig.io.tables.run import DETECTIONS
 from telerig.io.tables.smoothing import AXES
@@ -46,7 +47,7 @@ from telerig.io.view.run import (
     log_track_series,
 )
 from telerig.io.view.show import load_for_view, log_results, served
-from telerig.io.view.stream import grey_levels, log_image, log_series, log_spectrum, rgb
+from telerig.io.view.stream import log_image, log_series, log_spectrum
 from telerig.rig.camera import Camera
 from telerig.spectra import LEAST_FRAMES, Spectrum, motion_spectrum, segment, welch_density
 
@@ -196,7 +197,7 @@ class LiveView:
         line.add(arrived_s, values)
         some = slice(None, None, -(-len(arrived_s) // _POINTS))
         plot = "encoder_mm" if line.device.kind == "encoder" else "accelerometers_m_s2"
-        for (axis, series), colour in zip(line.measured(values).items(), COLOURS):
+        for (axis, series), colour in zip(line.device.measured(values).items(), COLOURS):
             name = f"{device} {axis}".strip()
             self._series(plot, name, arrived_s[some], series[some], colour)
         if "t" in values:
@@ -235,43 +236,27 @@ class _Line:
     _clock: tuple[float, float] | None = None
     _first_ms: float = np.nan
 
-    def measured(self, values: Mapping[str, Array]) -> dict[str, Array]:
-        """Return readings in mm or m/s^2 by axis; none of a frame counter."""
-        if self.device.kind == "encoder":
-            if "position_mm" in values:
-                return {"": values["position_mm"]}
-            return {"": values["counts"] / (self.device.counts_per_mm or 1.0)}
-        if self.device.kind == "accelerometer":
-            return {axis: values[f"a{axis}"] * self.device.unit_m_s2 for axis in AXES}
-        return {}
-
     def add(self, arrived_s: Array, values: Mapping[str, Array]) -> None:
         """Keep the readings, and forget those of before the last seconds."""
         t_s = arrived_s
         if "t" in values and self.device.poll is None:
-            t_s = arrived_s[-1] + self._unwrapped(arrived_s, values["t"])
-        measured = self.measured(values)
+            stamped = unwrap(arrived_s, values["t"] * self.device.time_unit_s, self.device.wrap_s)
+            t_s = arrived_s[-1] + stamped - stamped[-1]
+        measured = self.device.measured(values)
         if measured:
             self.last.append((t_s, np.column_stack(list(measured.values()))))
         while self.last and arrived_s[-1] - self.last[0][0][-1] > SPECTRUM_S:
             self.last.popleft()
-
-    def _unwrapped(self, arrived_s: Array, stamps: Array) -> Array:
-        """Return the device's times (N,) before its last stamp, in s."""
-        bits, unit = self.device.time_bits, self.device.time_unit_s
-        times = unwrap(arrived_s, stamps * unit, 2.0**bits * unit if bits else 0.0)
-        return np.asarray(times - times[-1])
 
     def clock_ms(self, arrived_s: Array, stamps: Array) -> float:
         """Return how far the device's clock is behind the computer's, less that of the beginning.
 
         It is that of the readings that came soonest: the others waited.
         """
-        bits, unit = self.device.time_bits, self.device.time_unit_s
         before = [] if self._clock is None else [self._clock]
         host = np.array([*(b[0] for b in before), *arrived_s])
-        own = np.array([*(b[1] for b in before), *(stamps * unit)])
-        times = unwrap(host, own, 2.0**bits * unit if bits else 0.0)
+        own = np.array([*(b[1] for b in before), *(stamps * self.device.time_unit_s)])
+        times = unwrap(host, own, self.device.wrap_s)
         self._clock = float(host[-1]), float(times[-1])
         late = 1e3 * float(np.min(host - times))
         self._first_ms = late if np.isnan(self._first_ms) else self._first_ms

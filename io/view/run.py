@@ -13,7 +13,16 @@ from scipy.spatial.transform import Rotation
 from telerig.arrays import Array, Ints
 from telerig.io.dataset.run import RunData
 from telerig.io.report.film.views import outlines_px
-from telerig.io.report.plot.axes import COLOURS, MUTED, NAIVE, SMOOTHED, colour_of
+from telerig.io.report.overlays import grey_levels
+from telerig.io.report.plot.axes import (
+    COLOURS,
+    MUTED,
+    NAIVE,
+    NO_TRACK,
+    SMOOTHED,
+    colour_of,
+    rgb,
+)
 from telerig.io.report.plot.spectrum import shake_spectrum
 from telerig.io.results.bodies import ellipsoids_of
 from telerig.io.results.folders.smoothing import AXES, SmoothingResults
@@ -29,7 +38,7 @@ from telerig.io.view.names import (
     need_rerun,
     of_image,
 )
-from telerig.io.view.stream import grey_levels, log_image, log_series, log_spectrum, rgb
+from telerig.io.view.stream import log_image, log_series, log_spectrum
 from telerig.rig.camera import Camera
 
 Images = Callable[[str, int], NDArray[Any] | None]
@@ -40,7 +49,6 @@ _SURE = 0.95
 _BAND_SD = 2.0
 _MOST_SERIES = 12
 _MOST_READINGS = 20_000
-_NO_TRACK = "#fabe14"
 
 
 def log_run(
@@ -67,7 +75,7 @@ def log_run(
         _log_smoothed_series(stream, smoothing)
     if len(cameras) and len(tracks.tracks):
         log_cameras(stream, f"{SPACE}/rig", cameras, tracks.points_mm, bodies=False)
-    bodies = tracks.tracks if smoothing is None else _with_shapes(smoothing)
+    bodies = tracks.tracks if smoothing is None else smoothing.shaped
     found, in_space, tracked = map(_rows_by_frame, (detections, bodies, tracks.tracks))
     hidden = _hidden(tracks.tracks)
     unseen, none = _rows_by_frame(hidden), np.zeros(0, np.int64)
@@ -103,12 +111,6 @@ def _times(tracks: TrackResults, smoothing: SmoothingResults | None) -> dict[int
     return dict(zip(table["frame"].astype(int).tolist(), table["t_s"].tolist()))
 
 
-def _with_shapes(smoothing: SmoothingResults) -> pd.DataFrame:
-    """Return the smoothed rows with the bodies' shapes, where bubbles.csv has them."""
-    frames = smoothing.bubble_frames
-    return frames if len(frames) else smoothing.trajectories.assign(d_eq_mm=np.nan)
-
-
 def _hidden(tracks: pd.DataFrame) -> pd.DataFrame:
     """Return where bubbles are in the frames between those that see them, on straight lines."""
     parts = []
@@ -131,7 +133,7 @@ def log_outlines(stream: Any, cameras: Sequence[str], rows: pd.DataFrame) -> Non
         named = np.isfinite(mine["particle"].to_numpy(float))
         ids = np.nan_to_num(mine["particle"].to_numpy(float)).astype(int)
         colours = [
-            rgb(colour_of(k) if known else _NO_TRACK) for k, known in zip(ids.tolist(), named)
+            rgb(colour_of(k) if known else NO_TRACK) for k, known in zip(ids.tolist(), named)
         ]
         words = [f"{k if known else 'no track'} {flags}".strip()
                  for k, known, flags in zip(ids.tolist(), named, mine["flags"])]  # fmt: skip
@@ -157,7 +159,7 @@ def log_rays(stream: Any, cameras: Sequence[Camera], rows: pd.DataFrame) -> None
         uv = rows[[f"{camera.name}_u_px", f"{camera.name}_v_px"]].to_numpy(float)
         doubtful = np.flatnonzero((sure < _SURE) & np.isfinite(uv).all(1)).tolist()
         stream.log(of_image(camera.name, "uncertain_pairs"), rr.Points2D(
-            uv[doubtful], colors=rgb(_NO_TRACK), radii=rr.Radius.ui_points(4.0),
+            uv[doubtful], colors=rgb(NO_TRACK), radii=rr.Radius.ui_points(4.0),
             labels=[f"pair {sure[k]:.0%}" for k in doubtful],
         ))  # fmt: skip
         for k in np.flatnonzero(np.isfinite(uv).all(1)).tolist():

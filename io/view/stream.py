@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
-from telerig.io.report.plot.axes import COLOURS
+from telerig.io.report.overlays import in_grey, shrunk
+from telerig.io.report.plot.axes import COLOURS, rgb
 from telerig.io.tables.smoothing import AXES
 from telerig.io.view.names import FRAME, TIME, need_rerun, of_plot, of_spectrum
 from telerig.spectra import Spectrum
@@ -22,26 +23,14 @@ _MOST_PX = 1024
 """Larger images are shown smaller; outlines and pixels keep their coordinates."""
 
 
-def grey_levels(images: list[NDArray[Any]]) -> tuple[float, float]:
-    """Return black and white levels for all images, from some of them; of 8 bit they stay."""
-    if not images or images[0].dtype == np.uint8:
-        return 0.0, 255.0
-    ends = np.array([np.percentile(image, [0.1, 99.9]) for image in images])
-    return float(ends[:, 0].min()), float(ends[:, 1].max())
-
-
 def log_image(stream: Any, path: str, image: NDArray[Any], levels: tuple[float, float]) -> None:
     """Log a grey image (rows, columns) as JPEG of 8 bit; a large one is made smaller.
 
     The entity ``path`` is scaled, so that entities beside it are in pixels of the whole image.
     """
     rr = need_rerun()
-    low, high = levels
-    grey = np.clip((image.astype(np.float32) - low) * (255 / max(high - low, 1e-9)), 0, 255)
     factor = min(1.0, _MOST_PX / max(image.shape))
-    small = grey.astype(np.uint8)
-    if factor < 1:
-        small = cv2.resize(small, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    small = in_grey(shrunk(image, factor), *levels)[..., 0]
     _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     stream.log(path, rr.EncodedImage(contents=encoded.tobytes(), media_type="image/jpeg"))
     if factor < 1:
@@ -85,8 +74,3 @@ def log_spectrum(stream: Any, name: str, spectrum: Spectrum, static: bool = Fals
                 np.sqrt(density[seen]), abscissa=spectrum.frequency_hz[seen], color=rgb(colour)
             )
             stream.log(of_spectrum(name, axis), bars, static=static)
-
-
-def rgb(colour: str) -> list[int]:
-    """Return red, green and blue of a colour like "#1f5fa8"."""
-    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]

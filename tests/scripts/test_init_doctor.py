@@ -214,6 +214,14 @@ def test_a_sound_dataset_has_nothing_to_mend(data):
     assert "encoder 1000 Hz" in sensors and "arm_left 2000 Hz" in sensors
 
 
+def test_the_disk_must_hold_the_results_of_all_frames_whatever_their_files(data, monkeypatch):
+    free = shutil.disk_usage(data)._replace(free=30_000_000_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: free)
+    assert "30 GB free" in _of(check_dataset(data), "disk", "ok")
+    monkeypatch.setattr(doctor, "_RESULT_BYTES_PER_FRAME", 2_000_000_000)
+    assert "results may need 40 GB" in _of(check_dataset(data), "disk", "warning")
+
+
 def test_every_fault_of_a_run_is_found(data):
     run = data / "runs" / "rise"
     stage = run / "stage.csv"

@@ -45,7 +45,7 @@ class RunResults:
     verdict : verdict of the smoothing with its flags; "" where the run was not smoothed.
     source : the name of the file from which ``points`` was read.
     accepted : why the results are stale, if they were read although they are.
-    folder : the results folder from which they were read; None for a run in memory.
+    smoothing : the folder of a smoothed run, which also has the bubbles' shapes; None of others.
     cameras : those that the run was smoothed or tracked with; empty where the folder does not state
         them.
     """
@@ -57,7 +57,7 @@ class RunResults:
     verdict: str = ""
     source: str = ""
     accepted: tuple[str, ...] = ()
-    folder: Path | None = None
+    smoothing: SmoothingResults | None = None
     cameras: tuple[Camera, ...] = ()
 
 
@@ -103,7 +103,7 @@ def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunRes
         verdict=_verdict(lab.file) if smoothed else "",
         source=source,
         accepted=accepted,
-        folder=place,
+        smoothing=lab if smoothed else None,
         cameras=cameras,
     )
 

@@ -22,8 +22,6 @@ from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import RunResults, facts, numbered
 from telerig.io.files.atomic import atomic_folder
 from telerig.io.results.bodies import ellipsoids_of
-from telerig.io.tables.run import TRACKS
-from telerig.io.tables.table import SHAPE_COLUMNS
 
 SERIES, PATHS = "bubbles.pvd", "paths.vtp"
 _FRAMES = "frames"
@@ -89,16 +87,9 @@ def _times(results: RunResults) -> tuple[list[int], Array]:
 
 def _diameters(results: RunResults) -> Array | None:
     """Return the tensors (N, 3, 3) in mm; None where the run does not tell the bubbles' sizes."""
-    points = results.points
+    points = results.points if results.smoothing is None else results.smoothing.shaped
     if "d_eq_mm" not in points:
         return None
-    file = None if results.folder is None else results.folder / "tracks.csv"
-    if file is not None and file.is_file():
-        tracks = TRACKS.read(file, need=("frame", "particle"))
-        tracks["particle"] = tracks["particle"].astype(str)
-        shape = [name for name in SHAPE_COLUMNS if name in tracks]
-        points = points[["frame", "d_eq_mm"]].assign(particle=points["particle"].astype(str))
-        points = points.merge(tracks[["frame", "particle", *shape]], "left")
     quadrics, _ = ellipsoids_of(points)
     known = np.isfinite(quadrics).all((1, 2))
     out = np.zeros_like(quadrics)

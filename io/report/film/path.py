@@ -12,7 +12,7 @@ from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report import plot
 from telerig.io.report.film.mp4 import Picture, Progress, write_film
-from telerig.io.report.run.report import paths_in_space, up_name
+from telerig.io.report.run.report import up_name
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import read_track_results
 from telerig.io.results.manifest import reading
@@ -39,7 +39,7 @@ def write_path_film(
         results = read_track_results(folder)
         smoothing = read_smoothing_results(folder, results.up)
     smoothed = smoothing is not None and len(smoothing.trajectories) > 0
-    table = paths_in_space(smoothing) if smoothing is not None and smoothed else results.tracks
+    table = smoothing.shaped if smoothing is not None and smoothed else results.tracks
     if not np.isfinite(table[[*POINT]].to_numpy(float)).all(1).any():
         raise InputError(
             "no bubble was followed, so there is no path to film", where=str(folder),

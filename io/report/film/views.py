@@ -16,24 +16,27 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.mp4 import Progress, write_film
-from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
+from telerig.io.report.overlays import (
+    INK,
+    PAPER,
+    draw_line,
+    grey_levels,
+    in_grey,
+    shrunk,
+    write_label,
+)
+from telerig.io.report.plot.axes import NO_TRACK, colour_of, rgb
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
 from telerig.rig.outline import HARMONICS, points_on
 
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
-Colour = tuple[int, int, int]
 
 MOST_FRAMES = 1_000
 TAIL_FRAMES = 24
 WIDTH_PX = 640
 _RATE_HZ = 25.0
 _STRIP_PX, _GAP_PX, _NAME_PX = 30, 4, 13
-_ALONE: Colour = (250, 190, 20)
-_COLOURS: tuple[Colour, ...] = (
-    (20, 110, 255), (235, 70, 0), (15, 165, 60), (205, 40, 200), (225, 25, 60), (0, 165, 175),
-    (150, 120, 0), (120, 70, 240),
-)  # fmt: skip
 _SHAPE = [f"{part}{k}_px" for k in HARMONICS for part in "cs"]
 _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 _LOOKED_AT = 5
@@ -197,9 +200,7 @@ def _view(
     else:
         picture = in_grey(shrunk(image, factor), *shades)
     for bubble in found:
-        colour = _ALONE
-        if bubble.particle is not None:
-            colour = _COLOURS[bubble.particle % len(_COLOURS)]
+        colour = rgb(NO_TRACK if bubble.particle is None else colour_of(bubble.particle))
         tail, ring = ((p + 0.5) * factor - 0.5 for p in (bubble.tail_px, bubble.outline_px))
         draw_line(picture, tail, colour, closed=False)
         for u, v in np.rint(16 * tail).astype(int):
@@ -215,12 +216,8 @@ def _view(
 
 def _shades(images: Images, camera: str, frame_count: int) -> tuple[float, float]:
     """Return black and white levels for the whole film, from a few of its images."""
-    some = np.unique(np.linspace(0, frame_count - 1, _LOOKED_AT).astype(int))
-    seen = [image for image in (images(camera, int(f)) for f in some) if image is not None]
-    if not seen:
-        return 0.0, 255.0
-    ends = np.array([np.percentile(image, [0.1, 99.9]) for image in seen])
-    return float(ends[:, 0].min()), float(ends[:, 1].max())
+    some = np.unique(np.linspace(0, frame_count - 1, _LOOKED_AT).astype(int)).tolist()
+    return grey_levels([i for f in some if (i := images(camera, f)) is not None])
 
 
 def font(size_px: float) -> Any:

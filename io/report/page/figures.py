@@ -18,6 +18,7 @@ WIDTH_IN = 4.4
 _MANY, _SHADES, _DPI = 4_000, 64, 190
 _STYLE = {
     "svg.fonttype": "none",
+    "svg.hashsalt": "telerig",  # names in the picture are not random: the same page each time
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.5,

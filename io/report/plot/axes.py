@@ -19,12 +19,21 @@ KEPT, LEFT_OUT, MODEL, MUTED = "#1b7f3b", "#c62828", "#c62828", "#8a8f98"
 SMOOTHED, NAIVE, RTS = "#1f5fa8", "#9aa0a8", "#c2570c"
 BAND_SDS = 2
 
+NO_TRACK = "#fabe14"
+"""Of what belongs to no track, in images."""
+
 _MANY_COLOURS = (*COLOURS, "#0a8f8f", "#b8860b", "#ad1457", "#5d4037", "#455a64", "#7cb342")
 
 
 def colour_of(k: int) -> str:
     """Return the colour of the k-th of many groups or tracks; they repeat after ten."""
     return _MANY_COLOURS[k % len(_MANY_COLOURS)]
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Return red, green and blue of a colour like "#1f5fa8"."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
 
 
 def camera_colour(index: int) -> str:

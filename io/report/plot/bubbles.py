@@ -372,8 +372,8 @@ def _points(axes: Any, table: pd.DataFrame, x: str, y: str, by: str | None) -> t
             u[mine], v[mine], sv[mine], su[mine], fmt="o", markersize=4, color=colour_of(k),
             linewidth=1.0, capsize=2, label=names[k],
         )  # fmt: skip
-        for part in drawn.get_children():
-            part.set_gid(f"{y}.{k}.{id(part)}")
+        for number, part in enumerate(drawn.get_children()):
+            part.set_gid(f"{y}.{k}.{number}")
     return u, v
 
 

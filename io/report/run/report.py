@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report import plot
@@ -165,17 +164,11 @@ def _look_smoothed(results: SmoothingResults) -> list[Figure]:
     up = up_name(results.up)
     shaken = _by_shake(results)
     words = "In the laboratory: the travel of the stage is added and the shake is removed."
-    paths = _path(paths_in_space(results), up, words)
+    paths = _path(results.shaped, up, words)
     return [
         *([paths, _height(results, "", up)] if len(results.trajectories) else []),
         *(_shake_spectrum(results, camera) for camera in shaken[:1]),
     ]
-
-
-def paths_in_space(results: SmoothingResults) -> pd.DataFrame:
-    """Return the smoothed paths, with the shapes of the bubbles where these are known."""
-    shaped = len(results.bubble_frames) >= len(results.trajectories)
-    return results.bubble_frames if shaped else results.trajectories
 
 
 def _by_shake(results: SmoothingResults) -> list[str]:

@@ -19,7 +19,15 @@ from telerig.errors import InputError
 from telerig.io.files.csv_table import header_of
 from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import SmoothingFile
-from telerig.io.tables.smoothing import AXES, BUBBLES, SHAKE, STATE, SUMMARY, TRAJECTORIES
+from telerig.io.tables.smoothing import (
+    AXES,
+    BODY_COLUMNS,
+    BUBBLES,
+    SHAKE,
+    STATE,
+    SUMMARY,
+    TRAJECTORIES,
+)
 from telerig.io.tables.smoothing import POSITION as PLACE
 from telerig.io.tables.smoothing import VELOCITY as SPEED
 from telerig.io.tables.table import POINT
@@ -98,6 +106,16 @@ class SmoothingResults:
     def bubble_frames(self) -> pd.DataFrame:
         """bubbles.csv; empty where it is not."""
         return BUBBLES.read(self.folder / BUBBLES.file, optional=True)
+
+    @cached_property
+    def shaped(self) -> pd.DataFrame:
+        """`trajectories`, with the bubbles' sizes and shapes where bubbles.csv has them."""
+        bodies = self.bubble_frames
+        if not len(bodies):
+            return self.trajectories
+        keys = ["frame", "particle"]
+        new = [n for n in BODY_COLUMNS if n in bodies and (n in keys or n not in self.trajectories)]
+        return self.trajectories.merge(bodies[new], "left", on=keys, validate="1:1")
 
     @cached_property
     def bubble_summary(self) -> pd.DataFrame:

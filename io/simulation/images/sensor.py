@@ -17,13 +17,11 @@ def digitise(
     read_noise: float,
     shot_noise: float = 0.0,
     bit_depth: int = 8,
-    left_aligned: bool = False,
 ) -> Image:
     """Convert grey levels to the noisy integers that a camera delivers.
 
     grey : (height, width) fractions of full scale. read_noise : standard deviation. shot_noise :
-    standard deviation at full scale, which grows with the root of the grey level. left_aligned :
-    puts data of fewer than 16 bits into the high bits of 16.
+    standard deviation at full scale, which grows with the root of the grey level.
     Returns (height, width) uint8 for 8 bits, otherwise uint16. Raises InputError outside 8 to 16
     bits.
     """
@@ -36,7 +34,4 @@ def digitise(
     levels += grey
     levels *= full
     np.clip(np.rint(levels, out=levels), 0, full, out=levels)
-    if bit_depth == 8:
-        return levels.astype(np.uint8)
-    aligned = levels.astype(np.uint16) << (16 - bit_depth if left_aligned else 0)
-    return aligned.astype(np.uint16, copy=False)
+    return levels.astype(np.uint8) if bit_depth == 8 else levels.astype(np.uint16)

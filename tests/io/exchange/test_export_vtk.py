@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from filmed_run import HALF_AXES_MM, write_run
+from smoothed_folder import write_folder
 
 from telerig.errors import InputError
 from telerig.io.exchange.export.run_results import LAB, RunResults, read_results
@@ -137,3 +138,20 @@ def test_vtk_draws_the_ellipsoids(run: Path, tmp_path: Path) -> None:
     lines.SetFileName(str(tmp_path / "out" / PATHS))
     lines.Update()
     assert lines.GetOutput().GetNumberOfLines() == 1
+
+
+def test_a_smoothed_run_has_the_shapes_of_its_bubbles_csv(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "smoothed", frames=60, bubbles=2)
+    (folder / "tracks.csv").unlink()  # smoothed into another folder than that of the tracks
+    smooth = pd.read_csv(folder / "trajectories.csv")
+    bodies = smooth[["frame", "particle"]].assign(
+        d_eq_mm=2.0, equator_mm=1.6, polar_mm=0.8, pole_x=0.0, pole_y=-1.0, pole_z=0.0
+    )
+    bodies[::-1].to_csv(folder / "bubbles.csv", index=False)
+    results = read_results(folder)
+    write_vtk(results, tmp_path / "out")
+    found = arrays(list(series(tmp_path / "out").values())[7])
+    assert found["particle"].tolist() == [0, 1]
+    np.testing.assert_allclose(found["diameters_mm"][1].reshape(3, 3), np.diag([3.2, 1.6, 3.2]))
+    here = results.points[results.points["frame"] == 7]
+    np.testing.assert_array_equal(found["Points"], here[["x_mm", "y_mm", "z_mm"]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,12 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.report import trial, validation
+from telerig.io.report import plot, trial, validation
 from telerig.io.report.batch import report as batch
 from telerig.io.report.calibration import report as calibration
 from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page import page
-from telerig.io.report.page.figures import Figure
+from telerig.io.report.page.figures import Figure, drawn
 from telerig.io.report.plot.outline import common_plane, rig_outline
 from telerig.io.report.plot.rig import tilt_angles_rad
 from telerig.io.report.plot.target import target_shape
@@ -210,3 +211,12 @@ def test_a_section_that_says_nothing_is_left_out_and_a_figure_that_cannot_be_dra
     text = page.render_page(page.Page("k", "t", "n", page.Verdict("V", "good"), [empty], said))
     assert 'id="a"' in text and "words" in text
     assert not any(f'id="{name}"' in text for name in ("b", "c", "look"))
+
+
+def test_a_figure_is_the_same_each_time_it_is_drawn() -> None:
+    table = pd.DataFrame({"d_eq_mm": [1.0, 2.0], "sd_eq_mm": 0.1, "slip_mm_s": [100.0, 200.0]})
+    table["s_slip_mm_s"], table["run"] = 5.0, ["a", "b"]
+    figure = Figure("", partial(plot.speed, table, by="run"), inline=True)
+    first, second = drawn(figure), drawn(figure)
+    assert first is not None and first == second
+    assert 'id="slip_mm_s.0.' in first.svg and 'id="slip_mm_s.1.' in first.svg

@@ -331,12 +331,9 @@ def test_noise_has_the_spread_asked_for(depth, kind):
     assert image.mean() == pytest.approx(full / 2, abs=5 * expected / 300)
 
 
-def test_left_aligned_data_leave_the_low_bits_empty():
+def test_light_beyond_full_scale_is_cut_and_other_bit_depths_are_refused():
     grey = np.linspace(0, 1.2, 4096, dtype=np.float32).reshape(64, 64)
-    image = digitise(
-        grey, np.random.default_rng(0), read_noise=0.0, shot_noise=0.0, bit_depth=12,
-        left_aligned=True,
-    )  # fmt: skip
-    assert np.all(image % 16 == 0) and image.max() == 4095 * 16
+    image = digitise(grey, np.random.default_rng(0), read_noise=0.0, shot_noise=0.0, bit_depth=12)
+    assert image.min() == 0 and image.max() == 4095
     with pytest.raises(InputError, match="bit depth of 7"):
         digitise(grey, np.random.default_rng(0), read_noise=0.0, shot_noise=0.0, bit_depth=7)

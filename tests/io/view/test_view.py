@@ -15,8 +15,8 @@ from viewed import entities, needs_rerun
 
 import telerig
 from telerig.errors import InputError, TelerigWarning
+from telerig.io.report.overlays import grey_levels
 from telerig.io.view.show import frames_of
-from telerig.io.view.stream import grey_levels
 from telerig.scripts.main import app
 
 
@@ -66,6 +66,7 @@ def test_a_calibration_and_a_run_have_everything_on_one_time_line(
     found = entities(tmp_path / "r.rrd")
     assert {"/space/bubbles", "/space/paths/smoothed", "/space/paths/triangulated"} <= set(found)
     assert {"/images/left/outlines", "/images/right/rays"} <= set(found)
+    assert "/space/rig" in found, "what the cameras see moves with the stage"
     for plot in (
         "ray_miss_um",
         "speed_mm_s",

@@ -1,9 +1,9 @@
 """The command line, one module a command; a module has the name of its command.
 
-`import_files` is `telerig import`. Five modules are no commands: `main` lists the commands, `start`
-is the entry point of the installed program, `console` has messages, progress and exit codes,
-`options` the options that several commands share, and `batch_job` is the process of one job of a
-batch. Read `main` first.
+Read `main` first: it lists the commands by the steps of the work. `import_files` is `telerig
+import`. Four more modules are no commands: `start` is the entry point of the installed program,
+`console` has messages, progress and exit codes, `options` the options that several commands share,
+and `batch_job` is the process of one job of a batch.
 """
 
 import os

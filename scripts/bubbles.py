@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -48,8 +47,7 @@ def bubbles(
     if not files:
         raise InputError("holds no image", where=str(images[0]), todo="give images or a folder")
     corners = _corners(region)
-    whole = ["telerig", "bubbles", *map(str, images), "--out", str(out)]
-    again = typed_command() or shlex.join(whole)
+    again = typed_command("bubbles", *images, "--out", out)
     with progress(quiet) as stage:
         inputs = fingerprints(out, files if mask is None else [*files, mask])
         with replaced_results(out, "bubbles", again=again, inputs=inputs) as staged:

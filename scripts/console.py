@@ -46,14 +46,17 @@ def say(text: str) -> None:
     typer.echo(text)
 
 
-def typed_command() -> str:
-    """Return the command line as it was typed; "" when another program called the command."""
+def typed_command(*otherwise: object) -> str:
+    """Return the command line as it was typed.
+
+    otherwise : its words after "telerig" when another program called the command; "" without any.
+    """
     program = Path(sys.argv[0])
     here = Path(__file__).resolve().parent
     module = program.name == "__main__.py" and program.resolve().parent == _PACKAGE  # python -m
     if module or program.stem == "telerig" or program.resolve().parent == here:
         return shlex.join(["telerig", *sys.argv[1:]])
-    return ""
+    return shlex.join(["telerig", *map(str, otherwise)]) if otherwise else ""
 
 
 def say_written(folder: Path, report: bool) -> None:

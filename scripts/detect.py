@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, run_file, say, typed_command
 from telerig.short_text import counted
@@ -30,7 +28,7 @@ def detect(
     data = load_dataset(dataset, source="images")
     folder = out or data.results / "calibration"
     inputs = fingerprints(folder, sources(data))
-    again = typed_command() or shlex.join(["telerig", "detect", str(data.path)])
+    again = typed_command("detect", data.path)
     with replaced_results(folder, "detect", again=again, inputs=inputs) as staged:
         with progress(quiet) as stage:
             found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)

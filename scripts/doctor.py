@@ -81,7 +81,7 @@ def _recording(
     from telerig.errors import TelerigError
     from telerig.estimator.batch.work import load_with
     from telerig.estimator.calibration.result.calibration import calibration_for
-    from telerig.estimator.doctor.checks import Check, Status
+    from telerig.estimator.doctor.checks import Check, Status, failure
     from telerig.estimator.doctor.recording import check_recording
     from telerig.io.report.trial import write_trial_report
 
@@ -107,8 +107,7 @@ def _recording(
                 say(f"written: {page}")
         return trial.checks
     except TelerigError as error:
-        words = f"{error.where}: {error.what}" if error.where else error.what
-        return (Check("trial recording", "failure", words, error.todo),)
+        return (failure("trial recording", error),)
 
 
 if __name__ == "__main__":

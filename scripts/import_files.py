@@ -286,7 +286,7 @@ def _import_cameras(
     calibration = calibration_from_cameras(
         cameras, name=importer.program, sigma_px=sigma_px, notes=[source, *notes]
     )
-    again, inputs = typed_command() or f"telerig import {name}", fingerprints(out, files)
+    again, inputs = typed_command("import", name, *files, "--out", out), fingerprints(out, files)
     with replaced_results(out, "calibrate", again=again, inputs=inputs) as staged:
         calibration.write_files(staged)
         if len(cameras) <= MOST_CAMERAS:

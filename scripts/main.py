@@ -55,15 +55,25 @@ def _main(
     """Calibrate a telecentric stereo rig from views of dots, and track bubbles with it."""
 
 
-_COMMANDS: dict[str, Callable[..., None]] = {
-    "demo": demo, "init": init, "doctor": doctor, "plan": plan, "simulate": simulate,
-    "detect": detect, "calibrate": calibrate, "bubbles": bubbles, "track": track,
-    "correct": correct, "smooth": smooth, "validate": validate, "run": run_dataset, "batch": batch,
-    "record": record, "export": export, "report": report, "view": view,
+_RESULTS = "Results"
+_STEPS: dict[str, dict[str, Callable[..., None]]] = {
+    "Before and during a recording": {
+        "demo": demo, "simulate": simulate, "init": init, "plan": plan, "record": record,
+        "doctor": doctor,
+    },
+    "Calibration": {"detect": detect, "calibrate": calibrate},
+    "Runs": {
+        "bubbles": bubbles, "track": track, "correct": correct, "smooth": smooth,
+        "validate": validate,
+    },
+    "Whole datasets": {"run": run_dataset, "batch": batch},
+    _RESULTS: {"report": report, "view": view, "export": export},
 }  # fmt: skip
-for name, command in _COMMANDS.items():
-    app.command(name)(command)
-app.add_typer(import_files, name="import")
+"""The commands by the steps of the work, as the help shows them."""
+for step, commands in _STEPS.items():
+    for name, command in commands.items():
+        app.command(name, rich_help_panel=step)(command)
+app.add_typer(import_files, name="import", rich_help_panel=_RESULTS)
 
 
 _NEW_OBJECTS = 200_000

@@ -36,13 +36,12 @@ from telerig.estimator.batch.work import calibrate_dataset, smooth_run, track_ru
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
-from telerig.io.results.batch import BatchFile, verdict_and_flags, verdict_counts
+from telerig.io.results.batch import BatchFile, listed, verdict_and_flags, verdict_counts
 from telerig.io.results.manifest import is_whole, read_manifest, replaced_results
 from telerig.io.results.smoothing import SmoothingFile
 from telerig.io.tables.smoothing import BATCH_BUBBLES, SUMMARY
+from telerig.progress import Progress
 from telerig.version import VERSION
-
-Stage = Callable[[str, float, int], None]
 
 DONE, REJECTED, FAILED, CRASHED, LEFT_OUT = "done", "rejected", "failed", "crashed", "left out"
 _KEPT_OUTPUT = 2000
@@ -54,7 +53,7 @@ _children: set[subprocess.Popen[str]] = set()
 _stopped = threading.Event()
 
 
-def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
+def do_job(job: Job, stage: Progress | None = None) -> dict[str, Any]:
     """Do a job in this process.
 
     stage : is called with the progress; None for nobody.
@@ -173,7 +172,7 @@ def failure(status: str, words: str) -> dict[str, Any]:
     return {"status": status, "words": words, "figures": {}}
 
 
-def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
+def _calibrate(job: Job, stage: Progress | None) -> dict[str, Any]:
     """Calibrate a dataset and write its results."""
     from telerig.io.results.findings import objections
 
@@ -194,7 +193,7 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
     return {"status": REJECTED if rejected else DONE, "words": words, "figures": figures}
 
 
-def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
+def _track(job: Job, stage: Progress | None) -> dict[str, Any]:
     """Track a run and write its results."""
     from telerig.estimator.tracking.tracks import tracking_words
 
@@ -210,7 +209,7 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
     return {"status": DONE, "words": words, "figures": figures}
 
 
-def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
+def _smooth(job: Job, stage: Progress | None) -> dict[str, Any]:
     """Smooth a tracked run and write its results."""
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
 
@@ -373,18 +372,13 @@ def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
         if of_kind:
             counts = Counter(r["status"] for r in of_kind)
             found = verdict_counts(of_kind)
-            words = ", ".join(f"{n} {status}" for status, n in counts.items())
-            lines.append(f"{kind}: {words}" + (f" ({_listed(found)})" if found else ""))
+            lines.append(f"{kind}: {listed(counts)}" + (f" ({listed(found)})" if found else ""))
     for record in records:
         if record["status"] != DONE:
             where = record["dataset"] + (f", run {record['run']}" if record["run"] else "")
             reason = _first_line(record["words"])
             lines.append(f"  {where}: {record['kind']} {record['status']}: {reason}")
     return "\n".join(lines)
-
-
-def _listed(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{n} {word}" for word, n in counts.items())
 
 
 Tell = Callable[[Job, dict[str, Any], int, int], None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,12 +16,11 @@ from telerig.io.dataset.run import RunData, load_run, recordings, run_folder
 from telerig.io.results.inputs import fingerprints
 from telerig.io.results.manifest import check_place
 from telerig.live import publish
+from telerig.progress import Progress
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.smoothing.result import Smoothing
-
-Stage = Callable[[str, float, int], None]
 
 
 def default_folder(run: Path) -> Path:
@@ -61,7 +60,7 @@ def calibrate_dataset(
     *,
     again: str,
     report: bool = True,
-    stage: Stage | None = None,
+    stage: Progress | None = None,
 ) -> Calibration:
     """Calibrate a dataset and write the results; again : the command line that does the same."""
     from telerig.estimator.calibration.calibrate import run_calibration
@@ -88,7 +87,7 @@ def track_run(
     *,
     again: str,
     report: bool = True,
-    stage: Stage | None = None,
+    stage: Progress | None = None,
 ) -> dict[str, Any]:
     """Track a run and write the results; returns the content of tracking.json.
 
@@ -150,7 +149,7 @@ def smooth_run(
     tracks: Path,
     again: str,
     report: bool = True,
-    stage: Stage | None = None,
+    stage: Progress | None = None,
 ) -> Smoothing:
     """Smooth a tracked run and write the results.
 

@@ -172,7 +172,7 @@ def check_dataset(place: Path) -> Iterator[Check]:
     try:
         data = load_dataset(place, need_views=False)
     except TelerigError as error:
-        yield _failure("dataset", error)
+        yield failure("dataset", error)
         return
     cameras = ", ".join(
         f"{c.name} {c.image_size_px[0]} x {c.image_size_px[1]}" for c in data.rig.cameras.values()
@@ -251,7 +251,7 @@ def _decoded(data: Dataset) -> Iterator[Check]:
         try:
             kinds = {data.image(v, camera).dtype.name for v in mine[:_DECODED_IMAGES]}
         except TelerigError as error:
-            yield _failure(f"images of {camera}", error)
+            yield failure(f"images of {camera}", error)
         else:
             yield Check(f"images of {camera}", "ok", f"{len(mine)}, {', '.join(sorted(kinds))}")
 
@@ -265,7 +265,7 @@ def _run(data: Dataset, name: str) -> Generator[Check, None, int]:
         source = "detections" if (path / "detections.csv").is_file() else None
         run = data.runs[name].load(source=source)
     except TelerigError as error:
-        yield _failure(what, error)
+        yield failure(what, error)
         return 0
     span = float(run.t_s[-1] - run.t_s[0]) if run.frame_count > 1 else 0.0
     rate = (run.frame_count - 1) / span if span else 0.0
@@ -310,7 +310,7 @@ def _crowds(run: RunData, what: str) -> Iterator[Check]:
                 words = f"camera {camera}: {found.bright_spots} outlines are {NOT_BACKLIT_WORDS}"
                 yield Check(f"{what} bubbles", "warning", words)
     except TelerigError as error:
-        yield _failure(f"{what} images", error)
+        yield failure(f"{what} images", error)
 
 
 def _clocks(run: RunData, what: str) -> Iterator[Check]:
@@ -337,7 +337,7 @@ def _sensors(run: RunData, what: str) -> Iterator[Check]:
     try:
         warnings = settled(check_sensors(run), frozenset())
     except TelerigError as error:
-        yield _failure(f"{what} sensors", error)
+        yield failure(f"{what} sensors", error)
         return
     found = [f"encoder {_rate(run.stage['t_s'].to_numpy(float))}"] if run.stage is not None else []
     if run.accelerometers is not None:
@@ -368,6 +368,7 @@ def _disk(data: Dataset, frames: int) -> Check:
     return Check("disk", "ok", words)
 
 
-def _failure(what: str, error: TelerigError) -> Check:
+def failure(what: str, error: TelerigError) -> Check:
+    """Return the check of something that cannot be used because of an error."""
     words = f"{error.where}: {error.what}" if error.where else error.what
     return Check(what, "failure", words, error.todo)

@@ -7,7 +7,7 @@ what to do where the number is beyond it.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,10 +34,9 @@ from telerig.io.results.smoothing import SmoothingFile, Verdict
 from telerig.io.results.verdict_words import number_words
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.tables.smoothing import AXES
+from telerig.progress import Progress
 from telerig.short_text import counted, share
 from telerig.spectra import motion_spectrum, welch_density
-
-Progress = Callable[[str, float, int], None]
 
 LEAST_LEVEL = 0.3
 """Least level of the backlight as a share of full scale. A pixel's shot noise is the square root of

@@ -79,6 +79,11 @@ def verdict_counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     return dict(Counter(word for word in found if word))
 
 
+def listed(counts: Mapping[str, int]) -> str:
+    """Return numbers with what they count, as in "3 done, 1 failed"."""
+    return ", ".join(f"{n} {what}" for what, n in counts.items())
+
+
 def short_names(datasets: Iterable[str]) -> dict[str, str]:
     """Return for each dataset's folder the shortest end of its path that no other one has."""
     every = list(dict.fromkeys(datasets))

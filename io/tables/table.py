@@ -201,7 +201,6 @@ OF_SHAPE = (
     *may("noise_stretch", "", "part of its standard deviation by the noise of the outlines"),
 )  # fmt: skip
 """What outlines tell of a bubble's shape; blank where one is missing, cut or covered."""
-SHAPE_COLUMNS = [column.name for column in OF_SHAPE]
 
 
 def covariance_of_image(dots: pd.DataFrame) -> NDArray[np.float64]:

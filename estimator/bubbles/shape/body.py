@@ -145,7 +145,7 @@ def fit_bodies(
 
 
 def body_columns(bodies: Bodies, up: Array) -> dict[str, Array]:
-    """Return size and shape of B bodies as columns: ``d_eq_mm``, ``sd_eq_mm`` and `SHAPE_COLUMNS`.
+    """Return size and shape of B bodies as columns: ``d_eq_mm``, ``sd_eq_mm`` and `OF_SHAPE`.
 
     The shape is NaN where a part of an outline is missing.
 

@@ -28,7 +28,13 @@ from telerig.io.report.page.page import (
     texts,
 )
 from telerig.io.report.plot.axes import colour_of
-from telerig.io.results.batch import short_names, verdict_and_flags, verdict_counts, verdict_of
+from telerig.io.results.batch import (
+    listed,
+    short_names,
+    verdict_and_flags,
+    verdict_counts,
+    verdict_of,
+)
 from telerig.io.results.folders.batch import BatchResults, read_batch_results
 from telerig.io.results.smoothing import Verdict as Resolved
 from telerig.short_text import ABSENT, counted, is_number, number
@@ -119,8 +125,8 @@ def _words(jobs: Sequence[Job]) -> str:
     for kind, subject in (("calibrate", "calibration"), ("smooth", "smoothed run")):
         counts = verdict_counts(j for j in jobs if j["kind"] == kind)
         if counts:
-            listed = ", ".join(f"{n} {word}" for word, n in counts.items())
-            words.append(f"Verdicts of {counted(sum(counts.values()), subject)}: {listed}.")
+            of = counted(sum(counts.values()), subject)
+            words.append(f"Verdicts of {of}: {listed(counts)}.")
     unclear = verdict_counts(j for j in jobs if j["kind"] == "smooth").keys() - set(SOUND)
     if unclear:
         words.append(
@@ -172,8 +178,8 @@ def _key_numbers(jobs: Sequence[Job]) -> list[Tile]:
         if mine:
             counts = Counter(j["status"] for j in mine)
             rest = {s: n for s, n in counts.items() if s != _DONE} | verdict_counts(mine)
-            remark = ", ".join(f"{n} {s}" for s, n in rest.items())
-            figures.append(Tile(word, f"{counts[_DONE]} of {len(mine)}", remark or "none failed"))
+            remark = listed(rest) or "none failed"
+            figures.append(Tile(word, f"{counts[_DONE]} of {len(mine)}", remark))
     seconds = [float(j["seconds"]) for j in jobs if is_number(j.get("seconds"))]
     if seconds:
         hosts = len({j.get("host") for j in jobs if j.get("host")})

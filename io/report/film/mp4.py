@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from telerig.errors import need_package
 from telerig.io.files.atomic import atomic_path
+from telerig.progress import Progress
 
 Picture = NDArray[np.uint8]
-Progress = Callable[[str, int, int], None]
 
 _CODECS = ("libx264", "h264", "mpeg4")
 _QUALITY = "20"

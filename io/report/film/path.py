@@ -11,12 +11,13 @@ import pandas as pd
 from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report import plot
-from telerig.io.report.film.mp4 import Picture, Progress, write_film
+from telerig.io.report.film.mp4 import Picture, write_film
 from telerig.io.report.run.report import up_name
 from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import read_track_results
 from telerig.io.results.manifest import reading
 from telerig.io.tables.table import POINT
+from telerig.progress import Progress
 
 STEP_DEG = 3
 SIZE_IN, DPI = (6.4, 7.2), 120

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from telerig.errors import InputError
 from telerig.io.dataset.run import load_run, recordings
-from telerig.io.report.film.mp4 import Progress
 from telerig.io.report.film.path import write_path_film
 from telerig.io.report.film.views import write_views_film
 from telerig.io.results.folders.tracking import read_track_results
+from telerig.progress import Progress
 from telerig.short_text import counted
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.report.film.mp4 import Progress, write_film
+from telerig.io.report.film.mp4 import write_film
 from telerig.io.report.overlays import (
     INK,
     PAPER,
@@ -27,6 +27,7 @@ from telerig.io.report.overlays import (
 )
 from telerig.io.report.plot.axes import NO_TRACK, colour_of, rgb
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
+from telerig.progress import Progress
 from telerig.rig.outline import HARMONICS, points_on
 
 Picture = NDArray[np.uint8]

@@ -6,7 +6,7 @@ in NumPy and then given to GTSAM one by one. GTSAM's `JacobianFactor` takes up t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, cast
@@ -27,6 +27,7 @@ class LinearFactors:
     log_det : (M,) logarithm of the determinant of each factor's whitening matrix.
     weight : (M,) weights from 0 to 1 of a robust fit, with which blocks and rhs are already
         multiplied; None for no weights.
+    kind : name by which some of a graph's factors are found; "" for all others.
     """
 
     keys: tuple[ArrayLike, ...]
@@ -34,6 +35,7 @@ class LinearFactors:
     rhs: Array
     log_det: Array
     weight: Array | None = None
+    kind: str = ""
 
     def of(self, which: Ints) -> LinearFactors:
         """Return the factors with the indices (m,)."""
@@ -41,20 +43,7 @@ class LinearFactors:
         keys = tuple(np.asarray(k)[which] if np.ndim(k) else k for k in self.keys)
         blocks = tuple(np.broadcast_to(b, (count, *b.shape[-2:]))[which] for b in self.blocks)
         weight = None if self.weight is None else self.weight[which]
-        return LinearFactors(keys, blocks, self.rhs[which], self.log_det[which], weight)
-
-    def squared(self, increments: Callable[[ArrayLike, int], Array]) -> float:
-        """Return the sum of all squared residuals.
-
-        increments : function that returns the increments (M, size) of the variables for given keys
-            (M,) and a size.
-        """
-        error = -self.rhs
-        for key, block in zip(self.keys, self.blocks):
-            if block.shape[-1]:
-                step = increments(key, block.shape[-1])
-                error = error + np.einsum("...ij,...j->...i", block, step)
-        return float((error**2).sum())
+        return LinearFactors(keys, blocks, self.rhs[which], self.log_det[which], weight, self.kind)
 
     def log_norm(self) -> float:
         """Return the sum of the logarithms of the factors' normalisation constants."""

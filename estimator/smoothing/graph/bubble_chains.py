@@ -16,6 +16,7 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.layout import GraphLayout
+from telerig.estimator.smoothing.graph.linear import MEANS, PIXELS, STARTS, STEPS
 from telerig.factors.linear_factors import LinearFactors
 
 
@@ -130,18 +131,16 @@ def bubble_chains(graph: GraphLayout, factors: Sequence[LinearFactors]) -> Bubbl
     used = np.zeros(graph.rows, np.int64)
     for linear in factors:
         key = np.asarray(linear.keys[0])
-        if not linear.rhs.size or not base.bubbles <= key.flat[0] < base.sensors:
-            continue
-        if key.flat[0] >= base.means:
+        if linear.kind == MEANS:
             start[rank[key - base.means], size:, size:] = linear.blocks[0]
-        elif linear.weight is not None:
+        elif linear.kind == PIXELS:
             row = places.place_of_row[key - base.bubbles]
             at = used[row][:, None] + np.arange(2)
             seen[row[:, None], at] = linear.blocks[0]
             used[row] += 2
-        elif len(linear.keys) == 3:
+        elif linear.kind == STEPS:
             step = linear
-        else:
+        elif linear.kind == STARTS:
             mine = rank[graph.bubble_of_row[key - base.bubbles]]
             start[mine, :size, :size] = linear.blocks[0]
             start[mine, :size, size:] = linear.blocks[1]

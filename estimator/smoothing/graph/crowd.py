@@ -36,7 +36,13 @@ from telerig.estimator.smoothing.graph.layout import (
     graph_layout,
     points_in_rig,
 )
-from telerig.estimator.smoothing.graph.linear import priors_and_motion
+from telerig.estimator.smoothing.graph.linear import (
+    MEANS,
+    OF_BUBBLES,
+    PIXELS,
+    STEPS,
+    bubble_priors,
+)
 from telerig.estimator.smoothing.problem.problem import Bubble, Observations
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 from telerig.io.machine.parallel import give_back_freed_memory
@@ -349,31 +355,26 @@ def mean_graph(
         replace(problem, bubbles=bubbles, observations=Observations.none()),
         graph.model, graph.delays_s,
     )  # fmt: skip
-    base, theirs, out = graph.base(), mean.base(), []
-    for linear in factors:
-        keys = [np.asarray(k) for k in linear.keys]
-        if any(base.bubbles <= k.flat[0] < base.sensors for k in keys if k.size):
-            continue
-        moved = tuple(k + (theirs.sensors - base.sensors) * (k >= base.sensors) for k in keys)
-        out.append(replace(linear, keys=moved))
+    out = [_in_mean_graph(graph, mean, f) for f in factors if f.kind not in OF_BUBBLES]
     typical = np.sqrt(np.array([alive[b.first : b.last + 1].mean() for b in bubbles]))
     begun = np.sqrt(alive[[b.first for b in bubbles]])
-    for linear in priors_and_motion(mean, first_guess(mean)):
-        key = np.asarray(linear.keys[0])
-        if not linear.rhs.size or not theirs.bubbles <= key.flat[0] < theirs.sensors:
-            continue
-        if len(linear.keys) == 3:
+    for linear in bubble_priors(mean, first_guess(mean)):
+        if linear.kind == STEPS:
             root = _step_roots(graph, mean, chains, linear, alive, staying)
         else:
-            each = typical if key.flat[0] >= theirs.means else begun
+            each = typical if linear.kind == MEANS else begun
             root = each[:, None, None] * np.eye(linear.rhs.shape[1])
         blocks = tuple(root @ b for b in linear.blocks)
         out.append(replace(linear, blocks=blocks, rhs=np.zeros_like(linear.rhs)))
-    for linear in factors:
-        key = np.asarray(linear.keys[0])
-        if linear.weight is not None and base.bubbles <= key.flat[0] < base.means:
-            out.append(_mean_image(graph, mean, linear))
+    out += [_mean_image(graph, mean, f) for f in factors if f.kind == PIXELS]
     return mean, out
+
+
+def _in_mean_graph(graph: GraphLayout, mean: GraphLayout, linear: LinearFactors) -> LinearFactors:
+    """Return factors with the keys that their variables have in the graph of the mean bubble."""
+    first = graph.base().sensors
+    more, keys = mean.base().sensors - first, map(np.asarray, linear.keys)
+    return replace(linear, keys=tuple(k + more * (k >= first) for k in keys))
 
 
 def _step_roots(
@@ -421,13 +422,10 @@ def _mean_image(graph: GraphLayout, mean: GraphLayout, linear: LinearFactors) ->
     square = np.bincount(place, (of_bubble**2).sum((1, 2)), len(frames))
     length = (total[0] ** 2).sum((1, 2))
     factor = np.sqrt(square / np.where(length > 0, length, 1.0))[:, None, None]
-    base, theirs = graph.base(), mean.base()
-    keys = (theirs.bubbles + rows, mean.nodes.of_frame[frames],
-            np.asarray(linear.keys[2]) + theirs.sensors - base.sensors)  # fmt: skip
-    nothing = np.zeros((len(frames), 2))
-    return LinearFactors(
-        keys, tuple(t * factor for t in total), nothing, nothing[:, 0], nothing[:, 0] + 1
-    )
+    theirs, nothing = mean.base(), np.zeros((len(frames), 2))
+    keys = (theirs.bubbles + rows, mean.nodes.of_frame[frames], theirs.constants)
+    blocks = tuple(t * factor for t in total)
+    return LinearFactors(keys, blocks, nothing, nothing[:, 0], nothing[:, 0] + 1, PIXELS)
 
 
 def _summed(block: Array, place: Ints, count: int) -> Array:
@@ -442,17 +440,13 @@ def _parts(
     graph: GraphLayout, mean: GraphLayout, factors: Sequence[LinearFactors], chains: BubbleChains
 ) -> tuple[list[LinearFactors], list[LinearFactors], list[LinearFactors]]:
     """Return the rig's factors, pixels by the rig, and pixels by the bubbles; nothing is copied."""
-    base, theirs = graph.base(), mean.base()
     rig, by_rig, by_bubble = [], [], []
     for linear in factors:
-        keys = [np.asarray(k) for k in linear.keys]
-        if not linear.rhs.size:
-            continue
-        moved = tuple(k + (theirs.sensors - base.sensors) * (k >= base.sensors) for k in keys)
-        if linear.weight is not None and base.bubbles <= keys[0].flat[0] < base.means:
-            place = chains.places.place_of_row[keys[0] - base.bubbles]
-            by_rig.append(replace(linear, keys=moved[1:], blocks=linear.blocks[1:]))
+        moved = _in_mean_graph(graph, mean, linear)
+        if linear.kind == PIXELS:
+            place = chains.places.place_of_row[np.asarray(linear.keys[0]) - graph.base().bubbles]
+            by_rig.append(replace(moved, keys=moved.keys[1:], blocks=linear.blocks[1:]))
             by_bubble.append(replace(linear, keys=(place,), blocks=linear.blocks[:1]))
-        elif not any(base.bubbles <= k.flat[0] < base.sensors for k in keys):
-            rig.append(replace(linear, keys=moved))
+        elif linear.kind not in OF_BUBBLES:
+            rig.append(moved)
     return rig, by_rig, by_bubble

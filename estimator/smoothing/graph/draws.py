@@ -17,6 +17,7 @@ from telerig.arrays import Array
 from telerig.estimator.smoothing.graph.crowd import EliminatedCrowd
 from telerig.estimator.smoothing.graph.elimination import EliminatedGraph, starts_of
 from telerig.estimator.smoothing.graph.layout import GraphLayout
+from telerig.estimator.smoothing.graph.linear import ENCODER, MARKS, PIXELS
 from telerig.estimator.smoothing.problem.problem import Observations
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 
@@ -81,19 +82,14 @@ def _drawn(
         errors += root.solved(transposed_product(factors, starts, left))
         fitted = product(factors, starts, errors)
         left = [np.subtract(whole, part, out=part) for whole, part in zip(noise, fitted)]
-    base, problem = graph.base(), graph.problem
-    pixels, marks, readings = [], [], np.zeros((0, count))
-    for linear, rest in zip(factors, left):
-        key = int(np.min(linear.keys[0])) if len(linear.rhs) else -1
-        if linear.weight is not None and base.bubbles <= key < base.means:
-            pixels.append(rest)
-        elif linear.weight is not None and base.marks <= key < base.clocks:
-            marks.append(rest)
-        elif linear.rhs.shape[1] == 1 and len(linear.keys) == 2:
-            readings = rest[:, 0]
+    pixels, marks, readings = (
+        [rest for linear, rest in zip(factors, left) if linear.kind == kind]
+        for kind in (PIXELS, MARKS, ENCODER)
+    )
     return Draws(
-        errors, _by_camera(problem.observations, pixels), _by_camera(problem.references, marks),
-        readings,
+        errors, _by_camera(graph.problem.observations, pixels),
+        _by_camera(graph.problem.references, marks),
+        np.concatenate([np.zeros((0, count)), *(rest[:, 0] for rest in readings)]),
     )  # fmt: skip
 
 

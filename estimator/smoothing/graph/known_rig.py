@@ -15,7 +15,7 @@ from telerig.estimator.smoothing.graph.accelerations import add_slow_noise
 from telerig.estimator.smoothing.graph.bubble_chains import BubbleChains, bubble_chains
 from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State, variances
-from telerig.estimator.smoothing.graph.linear import SampleWeights, all_factors
+from telerig.estimator.smoothing.graph.linear import PIXELS, SampleWeights, all_factors
 from telerig.factors.linear_factors import LinearFactors
 
 _STILL_MM_S = 1e-9
@@ -41,7 +41,7 @@ def shake_known_variances(
         return variance
     pushed = np.zeros((graph.rows, graph.bubble.size, graph.share_size))
     information = np.eye(graph.share_size)
-    for linear in _bubbles_images(graph, factors):
+    for linear in (f for f in factors if f.kind == PIXELS):
         by_share = linear.blocks[2][..., graph.encoder_size :]
         row = np.asarray(linear.keys[0]) - graph.base().bubbles
         np.add.at(pushed, row, -linear.blocks[0].mT @ by_share)
@@ -55,16 +55,6 @@ def shake_known_variances(
     ])  # fmt: skip
     root = np.linalg.inv(np.linalg.cholesky(information))
     return np.asarray(variance + ((moved @ root.T) ** 2).sum(-1))
-
-
-def _bubbles_images(graph: GraphLayout, factors: Sequence[LinearFactors]) -> list[LinearFactors]:
-    """Return the factors of the bubbles' pixels."""
-    base = graph.base()
-    keys = [np.asarray(linear.keys[0]) for linear in factors]
-    return [
-        linear for linear, key in zip(factors, keys)
-        if linear.weight is not None and key.size and base.bubbles <= key.flat[0] < base.means
-    ]  # fmt: skip
 
 
 def way_variances(
@@ -97,7 +87,7 @@ def way_variances(
     own = np.add.reduceat((by_state * _solved(chains, by_state)).sum(1), first)
     pushed = np.zeros((graph.rows, graph.bubble.size, draws.errors.shape[-1]))
     shake, constants = draws.of_family(graph, 0), draws.of_family(graph, 4)[0]
-    for linear in _bubbles_images(graph, factors):
+    for linear in (f for f in factors if f.kind == PIXELS):
         by_rig = linear.blocks[1] @ shake[np.asarray(linear.keys[1])]
         by_rig += linear.blocks[2] @ constants
         row = np.asarray(linear.keys[0]) - graph.base().bubbles

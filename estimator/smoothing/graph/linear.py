@@ -7,7 +7,7 @@ shake and bubble states are in their whitening basis.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,11 @@ from telerig.factors.linear_factors import LinearFactors, prior_factors
 from telerig.factors.motion import start_factors
 from telerig.factors.state_space import log_det_of, whitener_of
 from telerig.rig.triangulation import rig_jacobian, stacked_jacobian
+
+STARTS, STEPS, MEANS, PIXELS = OF_BUBBLES = ("starts", "steps", "means", "pixels")
+"""Kinds of the factors of the bubbles' states: priors of the first ones, motion, priors of the mean
+velocities, images. `MARKS` and `ENCODER` are those of the rig that are found by their kind, too."""
+MARKS, ENCODER = "marks", "encoder"
 
 SampleWeights = tuple[Array | None, ...]
 """Weights (N,) of the samples of each accelerometer; None where all are 1."""
@@ -90,7 +95,9 @@ def bubble_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
         graph.bubble_basis(firsts),
         state.means,
     )
+    begin = replace(begin, kind=STARTS)
     means = _priors(base.means, state.means, graph.model.bubble.mean_sigma_mm_s)
+    means = replace(means, kind=MEANS)
     if not len(rows):
         return [begin, means]
     owner = graph.bubble_of_row[rows]
@@ -100,7 +107,7 @@ def bubble_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
         state.means[owner],
         graph.row_basis[rows + 1],
     )
-    return [begin, between, means]
+    return [begin, replace(between, kind=STEPS), means]
 
 
 def constant_values(graph: GraphLayout, state: State) -> dict[str, Array]:
@@ -214,7 +221,7 @@ def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
         noise = white[obs.camera[mine]]
         return _Moving(each @ layout.position.T, by_state, shift, by_shift, noise)
 
-    return _seen(graph, state, obs, weight, graph.base().bubbles + rows, states)
+    return _seen(graph, state, obs, weight, (PIXELS, graph.base().bubbles + rows), states)
 
 
 def references(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
@@ -229,7 +236,7 @@ def references(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
         shift = np.zeros((len(mine), 2))
         return _Moving(state.marks[obs.item[mine]], by_state, shift, np.zeros((1, 2, 3)), np.eye(2))
 
-    return _seen(graph, state, obs, weight, graph.base().marks + obs.item, states)
+    return _seen(graph, state, obs, weight, (MARKS, graph.base().marks + obs.item), states)
 
 
 class _Moving(NamedTuple):
@@ -247,15 +254,17 @@ class _Moving(NamedTuple):
 
 
 def _seen(
-    graph: GraphLayout, state: State, obs: Observations, weight: Array | None, keys: Ints,
-    states: Callable[[Ints], _Moving],
+    graph: GraphLayout, state: State, obs: Observations, weight: Array | None,
+    items: tuple[str, Ints], states: Callable[[Ints], _Moving],
 ) -> Seen:  # fmt: skip
-    """``states`` returns what is seen in some of the observations; (M,) keys of its states.
+    """``states`` returns what is seen in some of the observations.
+
+    items : kind of the factors, and keys (M,) of the states of what is seen.
 
     The cameras' pixels are worked out some thousand at a time, since what is worked out on the way
     takes several times the memory of the factors.
     """
-    problem, base = graph.problem, graph.base()
+    problem, base, (kind, keys) = graph.problem, graph.base(), items
     out, residual = [], np.zeros((len(obs), 2))
     at_frames = graph.shake_at_frames(state.shake)
     for c in range(len(problem.cameras)):
@@ -280,7 +289,7 @@ def _seen(
             continue
         node = graph.nodes.of_frame[obs.frame[mine]]
         every = (keys[mine], node, base.constants)
-        out.append(LinearFactors(every, tuple(blocks), rhs, log_det, weight[mine]))
+        out.append(LinearFactors(every, tuple(blocks), rhs, log_det, weight[mine], kind))
     return Seen(out, residual)
 
 
@@ -358,11 +367,8 @@ def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
     sigma = model.encoder_sigma_mm
     blocks = (by_shake / sigma, nothing)
     log_det = np.full(len(node), -np.log(sigma))
-    return [
-        LinearFactors(
-            (node, graph.base().constants), blocks, (reading - position)[:, None] / sigma, log_det
-        )
-    ]
+    keys, rhs = (node, graph.base().constants), (reading - position)[:, None] / sigma
+    return [LinearFactors(keys, blocks, rhs, log_det, kind=ENCODER)]
 
 
 def accelerometers(

@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError
@@ -26,7 +25,7 @@ from telerig.estimator.smoothing.graph.crowd import (
     eliminated,
 )
 from telerig.estimator.smoothing.graph.draws import Draws, draws_of
-from telerig.estimator.smoothing.graph.elimination import EliminatedGraph
+from telerig.estimator.smoothing.graph.elimination import EliminatedGraph, starts_of
 from telerig.estimator.smoothing.graph.known_rig import way_variances
 from telerig.estimator.smoothing.graph.layout import (
     GraphLayout,
@@ -44,7 +43,7 @@ from telerig.estimator.smoothing.graph.linear import (
     sample_weights,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
-from telerig.factors.linear_factors import LinearFactors
+from telerig.factors.linear_factors import LinearFactors, product
 from telerig.factors.robust_loss import truncation_weights
 from telerig.io.machine.parallel import give_back_freed_memory
 from telerig.live import due, publish
@@ -344,20 +343,9 @@ def _linear_solve(
     if not np.all(np.isfinite(done.vector)):
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
     largest = _largest_shift_px(graph, done.vector)
-    squared = _squared(graph, factors, done.vector)
+    fitted = product(factors, starts_of(graph), done.vector[:, None])
+    squared = sum(float(((f.rhs - a[..., 0]) ** 2).sum()) for f, a in zip(factors, fitted))
     return _Pass(factors, done, largest, _log_norm(graph, factors), squared)
-
-
-def _squared(graph: GraphLayout, factors: list[LinearFactors], vector: Array) -> float:
-    """Sum of squares of all factors after the step."""
-    base, columns = np.array(graph.base()), graph.columns()
-
-    def of_keys(keys: ArrayLike, size: int) -> Array:
-        key = np.asarray(keys)
-        family = int(np.searchsorted(base, key.flat[0], "right")) - 1
-        return np.asarray(vector[columns[family]].reshape(-1, size)[key - base[family]])
-
-    return sum(f.squared(of_keys) for f in factors)
 
 
 def _log_norm(graph: GraphLayout, factors: list[LinearFactors]) -> float:

@@ -26,7 +26,7 @@ from telerig.factors.bubble_motion import (
     learned_names,
     line_process,
 )
-from telerig.factors.state_space import Component, broad_band
+from telerig.factors.state_space import broad_band
 
 FORCE = "modes.force_hz"
 """Low-pass cut-off of the force that drives the modes, one for all."""
@@ -162,12 +162,6 @@ def moving_processes(signal: Signal, model: ShakeModel) -> list[Process]:
     if not signal.moving.any():
         return []
     return bubble_processes(model.bubble, signal.direction, bubbles=signal.pooled, mean_known=True)
-
-
-def processes(signal: Signal, model: ShakeModel) -> list[Component]:
-    """Return all processes, the shake's first. Those that two models share are the same object."""
-    found = shake_processes(signal, model) + moving_processes(signal, model)
-    return [p.component for p in found]
 
 
 def depends_on(signal: Signal, model: ShakeModel, names: Sequence[str]) -> bool:

@@ -236,12 +236,12 @@ def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
     row = solution.graph.bubble.position[1]
     step = (moved[0].state.bubbles - moved[1].state.bubbles) @ row / 2
     added = wider.covariances.bubbles - solution.covariances.bubbles
-    np.testing.assert_allclose(np.einsum("d,nde,e->n", row, added, row), step**2, atol=1e-9)
+    np.testing.assert_allclose(row @ added @ row, np.mean(step**2), rtol=1e-3)
     offset = solution.graph.shake.offset[1][1]
     nodes = solution.graph.nodes.of_frame
     step = (moved[0].state.shake - moved[1].state.shake)[nodes] @ offset / 2
     added = wider.covariances.shake - solution.covariances.shake
-    np.testing.assert_allclose(np.einsum("d,nde,e->n", offset, added, offset), step**2, atol=1e-9)
+    np.testing.assert_allclose(offset @ added @ offset, np.mean(step**2), rtol=1e-3)
     plain = solve(problem, true_model(), Options(robust=False))
     assert with_hyperparameter_uncertainty(plain) is plain
     nothing = (np.zeros_like(solution.weights[0]), np.zeros_like(solution.weights[1]))

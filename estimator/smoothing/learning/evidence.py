@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -47,110 +46,43 @@ from telerig.factors.state_space import (
     whitener_of,
 )
 
-_STEADY = 1e-14
-"""Largest relative change of a block between frames that are alike: at 1e-12 a chain that converges
-over 1,000 frames is cut off at half of them, where the evidence is off by 0.2."""
-_EVERY = 8
-
 
 @dataclass(frozen=True)
 class Chain:
     """Cholesky factor of a block tridiagonal precision matrix with F blocks of D states.
 
-    upper : (F, D, D) L_t^T, the transposed diagonal blocks.
-    sides : (F, S, D) right-hand sides times L_t^-T.
-    following : (F - 1, D, D) M_t, the blocks below the diagonal.
-    steady : first and last frame between which the blocks are constant.
+    lower : (F, D, D) L_t.
+    rows : (F, S + D, D) right-hand sides times L_t^-T, then M_t, which is 0 in the last frame.
     """
 
-    upper: Array
-    sides: Array
-    following: Array
-    steady: tuple[int, int] = (0, 0)
+    lower: Array
+    rows: Array
+
+    @property
+    def sides(self) -> Array:
+        """The right-hand sides (F, S, D) times L_t^-T."""
+        return self.rows[:, : -self.lower.shape[-1]]
 
     def log_det(self) -> float:
         """Return half the logarithm of the precision's determinant."""
-        return float(np.log(np.diagonal(self.upper, axis1=-2, axis2=-1)).sum())
-
-    def inverses(self) -> Array:
-        """Return the inverses (F, D, D) of L_t^T."""
-        from scipy.linalg.lapack import dtrtri
-
-        out = self.upper.copy()
-        first, end = self.steady
-        for t in (*range(min(first + 1, end)), *range(end, len(out))):
-            dtrtri(out[t].T, lower=1, overwrite_c=1)
-        out[first + 1 : end] = out[first]
-        return out
-
-    def means(self, sides: Array) -> Array:
-        """Return the solutions (F, K, D) for eliminated right-hand sides (F, K, D)."""
-        turned = np.swapaxes(self.inverses(), -1, -2)
-        out, gain = sides @ turned, self.following @ turned[:-1]
-        part = np.empty(out.shape[1:])
-        for t in range(len(gain) - 1, -1, -1):
-            np.matmul(out[t + 1], gain[t], out=part)
-            out[t] -= part
-        return np.asarray(out)
+        return float(np.log(np.diagonal(self.lower, axis1=-2, axis2=-1)).sum())
 
     def moments(self, sides: Array) -> tuple[Array, Array, Array]:
-        """Return means as `means` does, covariances (F, D, D), and cross-covariances (F - 1, D, D).
+        """Return means (F, K, D) for eliminated right-hand sides (F, K, D), covariances (F, D, D),
+        and cross-covariances (F - 1, D, D).
 
         The cross-covariances are those of a frame's states (rows) with the states one frame before.
         """
-        inverse = self.inverses()
-        turned = np.swapaxes(inverse, -1, -2)
-        size = self.upper.shape[-1]
-        gain = self.following @ turned[:-1]
-        back = np.swapaxes(gain, -1, -2)
-        both = np.concatenate([inverse @ turned, sides @ turned], 1)
-        own, mean = both[:, :size], both[:, size:]
-        carried = np.empty((len(gain), *both.shape[1:]))
-        part = np.empty((size, size))
-        (first, end), t = self.steady, len(gain) - 1
-        while t >= 0:
-            product = carried[t]
-            np.matmul(both[t + 1], gain[t], out=product)
-            np.matmul(back[t], product[:size], out=part)
-            own[t] += part
-            mean[t] -= product[size:]
-            inside = first < t < end - 1 and not t % _EVERY
-            if inside and _alike(own[t], own[t + 1]):
-                break
-            t -= 1
-        if t > first:
-            own[first:t] = own[t]
-            carried[first:t, :size] = own[t] @ gain[first]
-            _carry_on(mean[first : t + 1][::-1], gain[first])
-            for t in range(first - 1, -1, -1):
-                product = carried[t]
-                np.matmul(both[t + 1], gain[t], out=product)
-                own[t] += back[t] @ product[:size]
-                mean[t] -= product[size:]
-        return mean, own, -carried[:, :size]
+        from telerig.estimator.smoothing.learning.kernels import swept_back
 
-
-def _alike(one: Array, other: Array) -> bool:
-    """Return whether two blocks (D, D) agree within `_STEADY` of each column's largest entry."""
-    return bool((np.abs(one - other) <= _STEADY * np.abs(one).max(0)).all())
-
-
-def _carry_on(values: Array, gain: Array) -> None:
-    """Apply the recursion values[t] -= values[t - 1] @ gain in place.
-
-    values : (n, K, D).  gain : (D, D).
-    """
-    part = np.empty(values.shape[1:])
-    for before, value in pairwise(values):
-        np.matmul(before, gain, out=part)
-        value -= part
+        mean, own = np.array(sides, order="C"), np.empty_like(self.lower)
+        below = np.empty_like(own[1:])
+        swept_back(self.lower, self.rows, mean, own, below)
+        return mean, own, below
 
 
 def eliminated(own: Array, following: Array, sides: Array) -> Chain:
     """Factorise a block tridiagonal precision matrix.
-
-    Where consecutive frames have equal blocks, the recursion converges; from then on only the
-    right-hand sides are updated.
 
     own : (F, D, D) diagonal blocks; overwritten.
     following : (F - 1, D, D) blocks below the diagonal.
@@ -158,47 +90,15 @@ def eliminated(own: Array, following: Array, sides: Array) -> Chain:
 
     Raises numpy.linalg.LinAlgError if the matrix is not positive definite.
     """
-    from scipy.linalg.blas import dtrsm
-    from scipy.linalg.lapack import dpotrf, dtrtri
+    from telerig.estimator.smoothing.learning.kernels import factorised
 
-    after, last = sides.shape[1], len(own) - 1
-    joined = np.zeros((len(own), after + own.shape[-1], own.shape[-1]))
-    joined[:, :after], joined[:-1, after:] = sides, following
-    product = np.empty(joined.shape[1:])
-    ends = _ends_of_alike(own, joined[:, after:])
-    steady, t = (0, 0), 0
-    while t <= last:
-        if dpotrf(own[t].T, lower=1, clean=1, overwrite_a=1)[1]:
-            raise np.linalg.LinAlgError(f"frame {t}")
-        rows = joined[t]
-        dtrsm(1.0, own[t].T, rows.T, lower=1, overwrite_b=1)
-        end = ends[t]
-        tried = not t % _EVERY and t > 0 and end - t > max(_EVERY, steady[1] - steady[0])
-        if tried and ends[t - 1] == end and _alike(own[t], own[t - 1]):
-            steady = (t, end)
-            own[t + 1 : end], joined[t + 1 : end, after:] = own[t], rows[after:]
-            inverse = dtrtri(own[t].T, lower=1)[0]
-            joined[t + 1 : end, :after] = joined[t + 1 : end, :after] @ inverse.T
-            _carry_on(joined[t:end, :after], rows[after:].T @ inverse.T)
-            t = end - 1
-            rows = joined[t]
-        if t < last:
-            np.matmul(rows, rows[after:].T, out=product)
-            own[t + 1] -= product[after:]
-            joined[t + 1, :after] -= product[:after]
-        t += 1
-    return Chain(own, joined[:, :after], joined[:-1, after:], steady)
-
-
-def _ends_of_alike(own: Array, following: Array) -> list[int]:
-    """Return for each frame the end of the run of frames with equal blocks that it belongs to."""
-    root = np.sqrt(np.abs(np.diagonal(own, axis1=-2, axis2=-1)).max(0))
-    scale = 1e-13 * root[:, None] * root
-    same = [(np.abs(a[1:] - a[:-1]) <= scale).all((1, 2)) for a in (own, following)]
-    breaks = np.flatnonzero(~(same[0] & same[1])) + 1
-    at = np.searchsorted(breaks, np.arange(len(own)), "right")
-    out: list[int] = np.append(breaks, len(own))[at].tolist()
-    return out
+    count = sides.shape[1]
+    rows = np.zeros((len(own), count + own.shape[-1], own.shape[-1]))
+    rows[:, :count], rows[:-1, count:] = sides, following
+    frame = factorised(own, rows)
+    if frame >= 0:
+        raise np.linalg.LinAlgError(f"frame {frame}")
+    return Chain(own, rows)
 
 
 _STILL_MM = 1e-6
@@ -373,7 +273,7 @@ class Factor:
     def posterior(self) -> SignalPosterior:
         """Return the states and constants that the signal gives, with their covariances."""
         system, signal, count = self.system, self.signal, self.count
-        states = self.chain.means(self.spread()[0][:, :count])
+        states = self.chain.moments(self.spread()[0][:, :count])[0]
         states = states @ np.swapaxes(self.bases, -1, -2)[self.which]
         movers = np.flatnonzero(signal.moving)
         speed = (self.guess + self.constants)[movers, :, None]

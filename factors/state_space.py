@@ -272,27 +272,6 @@ def broad_band(
     return _scaled("broad_band", chain, chain[0] + floor * a * np.eye(size)[0], rms_mm)
 
 
-def broad_band_density(
-    frequency_hz: Array,
-    rms_mm: float,
-    *,
-    low_hz: float,
-    high_hz: float,
-    floor: float,
-    tail: int = 2,
-) -> Array:
-    """Return the one-sided spectral density (N,) of `broad_band` in mm^2/Hz at frequencies (N,)."""
-    a, b = low_hz, high_hz
-
-    def shape(f: Array) -> Array:
-        f2 = f * f
-        return (f2 + (floor * a) ** 2) / ((f2 + a * a) ** 3 * (f2 + b * b) ** tail)
-
-    whole = np.concatenate([[0.0], np.geomspace(1e-3 * a, 1e2 * b, 2000)])
-    density: Array = rms_mm**2 * shape(frequency_hz) / np.trapezoid(shape(whole), whole)
-    return density
-
-
 def _scaled(name: str, drift: Array, position: Array, rms: float) -> Component:
     """Return a process that is driven at its last state, scaled such that its displacement has the
     RMS.

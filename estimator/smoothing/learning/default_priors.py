@@ -26,7 +26,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Stage,
 )
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
-from telerig.factors.state_space import broad_band_density, forced_mass
+from telerig.factors.state_space import broad_band, forced_mass
 from telerig.statistics import robust_sd
 
 SHAKE_RMS_MM = 0.2
@@ -392,18 +392,19 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
     if np.count_nonzero(low) < _FEWEST_BINS:
         return None
     score = -0.5 * (np.log(_FLOORS / DEFAULT_FLOOR) / _FLOOR_SPREAD) ** 2
+    low_hz, high_hz = bands[0].low_hz, bands[0].high_hz  # all have one shape
+    unit = [
+        broad_band(1.0, low_hz=low_hz, high_hz=high_hz, floor=floor).density(frequency[low])
+        for floor in _FLOORS.tolist()
+    ]
     for band in bands:
         for axis in range(3):
             series = np.interp(even, t, offsets_mm[:, band.camera, axis])
             if series.std() < _UNSEEN_MM:
                 continue
+            density = band.rms_mm[axis] ** 2 * np.array(unit)
             seen = _periodogram(series, step)[low]
-            for i, floor in enumerate(_FLOORS):
-                density = broad_band_density(
-                    frequency[low], band.rms_mm[axis], low_hz=band.low_hz, high_hz=band.high_hz,
-                    floor=float(floor), tail=band.tail,
-                )  # fmt: skip
-                score[i] -= _INDEPENDENT * float(np.sum(np.log(density) + seen / density))
+            score -= _INDEPENDENT * np.sum(np.log(density) + seen / density, axis=-1)
     return float(_FLOORS[np.argmax(score)])
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from telerig.estimator.smoothing.learning.evidence import Factor
-from telerig.estimator.smoothing.learning.learn import Learning, free_names, groups_of
+from telerig.estimator.smoothing.learning.learn import free_names, groups_of
 from telerig.estimator.smoothing.learning.likelihood import laplace_covariance, maximise
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.learning.parameters import value_of
@@ -74,12 +74,12 @@ def _compared(window: Window, model: ShakeModel) -> OtherWindow | None:
     signals = tuple(s for s in signals_of(problem) if s.samples)
     if not signals:
         return None
-    group = groups_of(signals, problem.up)[0]
+    group = groups_of(signals)[0]
     parts = group.fast
     found = [Factor(part, model) for part in parts]
     count = sum(one.count * int((one.weight > 0).sum()) for one in found)
     square = sum(one.square for one in found) / max(count, 1)
-    free = free_names(model, group, Learning(), True)
+    free = free_names(model, group)
     names = [n for n in free if n.startswith("modes.") and n.endswith("frequency_hz")]
     fit = maximise(parts, model, names, steps=_STEPS)
     here = np.diag(laplace_covariance(parts, fit.model, names)) if names else np.zeros(0)

@@ -42,7 +42,6 @@ from telerig.factors.state_space import (
     Steps,
     discretise,
     distinct_steps,
-    slow_ou,
     whitener_of,
 )
 
@@ -101,7 +100,6 @@ def eliminated(own: Array, following: Array, sides: Array) -> Chain:
     return Chain(own, rows)
 
 
-_STILL_MM = 1e-6
 _DIFFERENCE = 1e-4
 
 
@@ -155,8 +153,6 @@ def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
 def _system(signal: Signal, model: ShakeModel) -> _System:
     shake = [(p.component, p.camera) for p in shake_processes(signal, model)]
     bubble = [p.component for p in moving_processes(signal, model)]
-    if not shake and not signal.moving.any():
-        shake = [(slow_ou(_STILL_MM, 1.0), CARRIAGE)]
     parts = [c for c, _ in shake] + bubble * int(signal.moving.sum())
     size, shaken = sum(c.size for c in parts), sum(c.size for c, _ in shake)
     offset = np.zeros((len(signal.cameras), size))

@@ -5,7 +5,7 @@ a mode of each camera's arm, one low-pass of the force that drives them, and the
 bubbles. Its hyper-parameters are optimised from a few starts, of which the most probable end
 counts, and Laplace's approximation gives their covariance. Which of them are the rig's is told by
 bubbles: what several have in common is the rig's, how they differ is their own. Fewer than three do
-not tell. The best source is a run in which the stage moves in front of a target at rest.
+not tell.
 """
 
 from __future__ import annotations
@@ -66,54 +66,40 @@ _LOG_RATIOS = np.linspace(-3.0, 2.0, 11)
 def learn(
     problem: SmoothingProblem,
     start: ShakeModel,
-    options: Learning | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> ShakeModel:
     """Return the model with the most probable modes, dampings and noise intensities for a run.
 
     problem : of a long run only the frames of `learning_signals` are used.
-    start : the model to begin from, which also supplies what is not learned. Its modes are kept and
-        optimised, except the guessed ones of the model named "default". A default start is
-        returned unchanged with accelerometers, since its broad band needs no modes, and where
+    start : the default model, which supplies what is not learned; its guessed modes do not count.
+        It is returned unchanged with accelerometers, since its broad band needs no modes, and where
         fewer than `FEWEST_BUBBLES` bubbles are seen, which do not tell their motion from the rig's.
-    options : what to learn.
     progress : called with a text and the completed share, from 0 to 1.
 
     In the returned model ``name`` is "learned", and ``learned`` contains the standard deviation of
     the logarithm of each learned parameter.
     """
-    options, guessed = options or Learning(), start.name == "default"
-    if guessed and problem.accelerometers:
+    if problem.accelerometers:
         return start
-    signals = learning_signals(problem, fixed=options.target)
-    bubbles = max((_bubbles(signal) for signal in signals), default=0)
-    if guessed and not options.target and bubbles < FEWEST_BUBBLES:
+    signals = learning_signals(problem)
+    if max((int(s.moving.sum()) for s in signals), default=0) < FEWEST_BUBBLES:
         return start
     keep_freed_memory()
-    model = replace(start, modes=()) if guessed else start
-    if options.target:
-        model = replace(model, bubble=replace(model.bubble, zigzags=()))
-    groups, learned = groups_of(signals, problem.up), dict[str, float]()
+    model, learned = replace(start, modes=()), dict[str, float]()
+    groups = groups_of(signals)
     for index, group in enumerate(groups):
         if progress is not None:
             where = "across" if index else "the shared axis"
             progress(where, index / len(groups))
-        seeds = dict[str, float]()
-        if index:  # the first group has the strongest shake, which shows the corner of its force
-            options = replace(options, hold=(*options.hold, FORCE))
-        if index and not options.target:
-            model, options, seeds = _seeded(model, group, options)
-        models = [model]
-        if guessed and (options.target or not index):
+        if index:
+            model, free, medians = _repeated(model, group)
+            model, sigma = _learn_group(group, [model], free, medians)
+        else:
             models = [_with_modes(model, group, *each) for each in _STARTS_HZ]
-        model, sigma = _learn_group(group, models, options, seeds, first=index == 0)
+            free = free_names(models[0], group)
+            model, sigma = _learn_group(group, models, free, {})
         learned |= sigma
     return replace(model, name="learned", learned=learned)
-
-
-def _bubbles(signal: Signal) -> int:
-    """Return how many moving items a signal has; of pieces of a run, on average."""
-    return int(signal.moving.sum())
 
 
 def _with_modes(model: ShakeModel, group: Group, common_hz: float, arm_hz: float) -> ShakeModel:
@@ -122,7 +108,7 @@ def _with_modes(model: ShakeModel, group: Group, common_hz: float, arm_hz: float
     modes = [
         RigMode(
             common_hz if where == CARRIAGE else arm_hz, _START_DAMPING, (x, y, z), where,
-            model.force_hz or _START_FORCE_HZ,
+            _START_FORCE_HZ,
         )
         for where in group.owners
     ]  # fmt: skip
@@ -130,44 +116,36 @@ def _with_modes(model: ShakeModel, group: Group, common_hz: float, arm_hz: float
 
 
 def _learn_group(
-    group: Group,
-    models: Sequence[ShakeModel],
-    options: Learning,
-    seeds: dict[str, float],
-    *,
-    first: bool,
+    group: Group, models: Sequence[ShakeModel], names: list[str], medians: dict[str, float]
 ) -> tuple[ShakeModel, dict[str, float]]:
     """Return the most probable model, and {hyper-parameter: standard deviation of its logarithm}.
 
-    models : starts.  seeds : {name of an RMS that the data may hardly determine: its prior median}.
+    models : starts.  names : of what is learned.
+    medians : {name of a mode's RMS: its prior median}, where it is not that of `prior_of`.
     """
     t_s = group.signals[0].t_s
     factor = averaging_factor(t_s, _HIGHEST_HZ)
     coarse = replace(group, signals=tuple(averaged(c, factor) for c in group.signals))
     starts = [_averaged_rms(model, factor, t_s) for model in models]
-    names, model = free_names(starts[0], coarse, options, first), starts[0]
+    model = starts[0]
     if len(starts) > 1:
         fits = [maximise(coarse.fast, m, names, steps=_FEW_STEPS) for m in starts]
         model = max(fits, key=lambda fit: fit.log_posterior).model
     fit = maximise(coarse.fast, model, names)
     if len(starts) > 1:
         others = [maximise(coarse.fast, m, names) for m in overlooked(fit.model, coarse)]
-        fit = max((fit, *others), key=lambda fit: fit.log_posterior)
-        if first:
-            fit = _with_shared_line(coarse, fit, options)
-            names = free_names(fit.model, coarse, options, first)
+        fit = _with_shared_line(coarse, max((fit, *others), key=lambda fit: fit.log_posterior))
+        names = free_names(fit.model, coarse)
     sigma = np.sqrt(np.diag(laplace_covariance(coarse.fast, fit.model, names)))
     found = dict(zip(names, sigma.tolist()))
-    model = fit.model
-    if not options.target:
-        medians = {n: prior_of(n).median for n in names if fnmatch(n, "modes.*.rms_mm")} | seeds
-        vague = [n for n in medians if found.get(n, 0.0) > _VAGUE_LOG_SIGMA]
-        likely = [posterior_rms(coarse.fast, model, n, medians[n]) for n in vague]
-        model = with_values(model, vague, likely)
+    medians = {n: prior_of(n).median for n in names if fnmatch(n, "modes.*.rms_mm")} | medians
+    vague = [n for n in medians if found.get(n, 0.0) > _VAGUE_LOG_SIGMA]
+    likely = [posterior_rms(coarse.fast, fit.model, n, medians[n]) for n in vague]
+    model = with_values(fit.model, vague, likely)
     return _averaged_rms(model, factor, t_s, back=True), found
 
 
-def _with_shared_line(group: Group, fit: Fit, options: Learning) -> Fit:
+def _with_shared_line(group: Group, fit: Fit) -> Fit:
     """Return the fit with one more common mode, at the frequency of an arm's, where the evidence is
     clearly larger.
 
@@ -181,7 +159,7 @@ def _with_shared_line(group: Group, fit: Fit, options: Learning) -> Fit:
         if mode.camera != CARRIAGE:
             shared = replace(mode, camera=CARRIAGE, damping=_START_DAMPING)
             model = replace(fit.model, modes=(*fit.model.modes, shared))
-            names = free_names(model, group, options, first=True)
+            names = free_names(model, group)
             trials.append(maximise(group.fast, model, names))
     best = max(trials, key=lambda trial: trial.log_posterior, default=fit)
     clear = best.log_posterior - fit.log_posterior > chi2.isf(_FALSE_LINE, _PARAMETERS) / 2
@@ -214,24 +192,23 @@ def overlooked(model: ShakeModel, group: Group) -> list[ShakeModel]:
     return out
 
 
-def _seeded(
-    model: ShakeModel, group: Group, options: Learning
-) -> tuple[ShakeModel, Learning, dict[str, float]]:
+def _repeated(model: ShakeModel, group: Group) -> tuple[ShakeModel, list[str], dict[str, float]]:
     """Return the model with each mode of the first group repeated along the second group's
-    directions, and {name of the RMS of each: its prior median in mm}.
+    directions, the names of what is learned there, and {name of each mode's RMS: its prior median
+    in mm}.
 
-    Frequencies and dampings are held, the RMS is learned. One camera and one bubble cannot show
-    whether the rig vibrates there, too.
+    The first group has the strongest shake, which shows frequencies, dampings and the corner of the
+    force. One camera and one bubble cannot show whether the rig vibrates across, too.
     """
     at, rig = len(model.modes), [m for m in model.modes if max(m.rms_mm) > 0]
     added = []
     for mode in rig:
         x, y, z = (_ACROSS * max(mode.rms_mm) * p for p in group.pattern)
         added.append(replace(mode, rms_mm=(x, y, z)))
-    held = [f"modes.{at + i}.{f}" for i in range(len(added)) for f in ("frequency_hz", "damping")]
-    seeds = {f"modes.{at + i}.rms_mm": max(mode.rms_mm) for i, mode in enumerate(added)}
+    medians = {f"modes.{at + i}.rms_mm": max(mode.rms_mm) for i, mode in enumerate(added)}
     model = replace(model, modes=(*model.modes, *added))
-    return model, replace(options, hold=(*options.hold, *held)), seeds
+    swings = [n for n in free_names(model, group) if n.startswith("bubble.zigzags")]
+    return model, [*medians, *swings], medians
 
 
 def posterior_rms(signals: Sequence[Signal], model: ShakeModel, name: str, median: float) -> float:
@@ -253,7 +230,7 @@ def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = Fa
     """Return the model with the RMS of lines as they are after averaging over frames, or back."""
     if factor < 2:
         return model
-    lines = [n for n in names_of(model) if n.endswith("rms_mm") and not n.startswith("broad")]
+    lines = [n for n in names_of(model) if n.endswith("rms_mm")]
     values = []
     for n in lines:
         fade = averaging_loss(value_of(model, n.replace("rms_mm", "frequency_hz")), factor, t_s)
@@ -262,32 +239,16 @@ def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = Fa
 
 
 @dataclass(frozen=True)
-class Learning:
-    """Options of learning.
-
-    hold : patterns of names of hyper-parameters (see ``parameters``) that keep their start values,
-        for example "modes.*" for a known rig. If all parameters of a mode are held, so is the
-        cut-off of the forces.
-    target : whether the tracks are those of a target at rest.
-    """
-
-    hold: tuple[str, ...] = ()
-    target: bool = False
-
-
-@dataclass(frozen=True)
 class Group:
     """Line-of-sight signals from which hyper-parameters are learned together.
 
     pattern : (3,) relative RMS of a line along each axis of the rig.
     owners : what of the rig moves along these directions: all cameras together, one camera's arm.
-    up : (3,) unit vector against gravity.
     """
 
     signals: tuple[Signal, ...]
     pattern: Triple
     owners: tuple[int, ...]
-    up: Array
 
     @cached_property
     def fast(self) -> tuple[Signal, ...]:
@@ -295,21 +256,18 @@ class Group:
         return tuple(part for signal in self.signals for part in pooled(signal))
 
 
-def groups_of(signals: Sequence[Signal], up: Array) -> list[Group]:
-    """Return two groups of signals: those of the shared coordinate, and the others.
-
-    up : (3,) unit vector against gravity.
-    """
+def groups_of(signals: Sequence[Signal]) -> list[Group]:
+    """Return two groups of signals: those of the shared coordinate, and the others."""
     if not signals:
         return []
     shared = signals[0]
     own = shared.cameras if len(shared.cameras) > 1 else ()
     square = shared.direction**2
-    groups = [Group((shared,), _pattern(square), (CARRIAGE, *own), up)]
+    groups = [Group((shared,), _pattern(square), (CARRIAGE, *own))]
     if len(signals) > 1:
         directions = np.array([c.direction for c in signals[1:]])
         across = np.diagonal(np.linalg.pinv(directions) @ directions)
-        groups.append(Group(tuple(signals[1:]), _pattern(across), (CARRIAGE,), up))
+        groups.append(Group(tuple(signals[1:]), _pattern(across), (CARRIAGE,)))
     return groups
 
 
@@ -318,33 +276,17 @@ def _pattern(square: Array) -> Triple:
     return x, y, z
 
 
-def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) -> list[str]:
-    """Return the names of the free hyper-parameters that a group determines.
-
-    first : whether it is the first group.
-    """
+def free_names(model: ShakeModel, group: Group) -> list[str]:
+    """Return the names of the hyper-parameters that a group determines."""
     names = []
     for name in names_of(model):
-        if is_held(name, model, options):
-            continue
         if name == FORCE:
             low = (i for i, mode in enumerate(model.modes) if mode.force_hz is not None)
             if any(_concerns(group, model, f"modes.{i}.rms_mm") for i in low):
                 names.append(name)
-        elif name.startswith(("modes", "bubble.zigzags", "broad_bands")):
-            if _concerns(group, model, name):
-                names.append(name)
-        elif first and not (options.target and name.startswith("bubble")):
+        elif not name.startswith(("modes", "bubble.zigzags")) or _concerns(group, model, name):
             names.append(name)
     return names
-
-
-def is_held(name: str, model: ShakeModel, options: Learning) -> bool:
-    """Return whether a hyper-parameter is held at its start value."""
-    names = [name]
-    if name == FORCE:
-        names += [f"modes.{i}.force_hz" for i in range(len(model.modes))]
-    return any(fnmatch(n, pattern) for n in names for pattern in options.hold)
 
 
 def _concerns(group: Group, model: ShakeModel, name: str) -> bool:
@@ -353,6 +295,4 @@ def _concerns(group: Group, model: ShakeModel, name: str) -> bool:
     lines = model.bubble.zigzags if parts[0] == "bubble" else getattr(model, parts[0])
     rms = np.asarray(lines[int(parts[-2])].rms_mm)
     inside = np.asarray(group.pattern) > 0.7
-    if parts[0] == "bubble" and group.signals[0].moving.sum() == 0:
-        return False
     return bool(rms[inside].max(initial=0.0) > rms[~inside].max(initial=0.0))

@@ -92,28 +92,25 @@ def _signed(direction: Array) -> Array:
     return np.asarray(direction * np.sign(direction[np.abs(direction).argmax()]))
 
 
-def signals_of(problem: SmoothingProblem, *, fixed: bool = False) -> tuple[Signal, ...]:
-    """Return the signals of a problem, from its marks and up to `MOST_BUBBLES` bubbles.
-
-    fixed : whether the tracks are those of a target at rest.
-    """
-    chosen, position = _chosen(problem, fixed), problem.encoder_mm
+def signals_of(problem: SmoothingProblem) -> tuple[Signal, ...]:
+    """Return the signals of a problem, from its marks and up to `MOST_BUBBLES` bubbles."""
+    chosen, position = _chosen(problem), problem.encoder_mm
     out = []
     for direction, cameras in sight_directions(problem):
         parts = [
             _bubble_rows(problem, problem.observations, chosen, position, direction, cameras),
             _mark_rows(problem, problem.references, len(chosen), position, direction, cameras),
         ]
-        out.append(_signal(problem, direction, cameras, parts, chosen, fixed))
+        out.append(_signal(problem, direction, cameras, parts, chosen))
     return tuple(out)
 
 
-def _chosen(problem: SmoothingProblem, fixed: bool) -> Ints:
+def _chosen(problem: SmoothingProblem) -> Ints:
     """Return the indices of the bubbles that are seen longest, or of all that can be `pooled`."""
     seen = np.zeros((len(problem.bubbles), len(problem.cameras)), np.int64)
     np.add.at(seen, (problem.observations.item, problem.observations.camera), 1)
     present = np.flatnonzero(seen.min(1) >= PRESENT * len(problem.t_s))
-    if len(present) > MOST_BUBBLES and not (fixed or problem.marks):
+    if len(present) > MOST_BUBBLES and not problem.marks:
         return present
     return np.sort(np.argsort(-seen.sum(1), kind="stable")[:MOST_BUBBLES])
 
@@ -174,7 +171,7 @@ def _along(
 
 def _signal(
     problem: SmoothingProblem, direction: Array, cameras: tuple[int, ...], parts: list[_Rows],
-    chosen: Ints, fixed: bool,
+    chosen: Ints,
 ) -> Signal:  # fmt: skip
     item, frame, camera, value, variance = (np.concatenate(p) for p in zip(*parts))
     count = len(chosen) + len(problem.marks)
@@ -193,7 +190,7 @@ def _signal(
     values[frame, place] = value - start[item]
     weight[frame, place] = 1 / variance
     sigma = np.r_[np.full(len(chosen), 100.0), [m.sigma_mm for m in problem.marks]]
-    moving = np.arange(count) < (0 if fixed else len(chosen))
+    moving = np.arange(count) < len(chosen)
     bubble_of = np.r_[chosen, np.full(len(problem.marks), -1)].astype(np.int64)
     return Signal(
         direction, cameras, problem.t_s, values, weight, pairs // len(cameras),

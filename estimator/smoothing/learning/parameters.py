@@ -36,7 +36,6 @@ PRIORS: dict[str, Prior] = {
     "modes.*.frequency_hz": Prior(1.0, 150.0, 15.0, 1.5, 0.02),
     "modes.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
     "modes.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
-    "broad_bands.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
     **BUBBLE_PRIORS,
     "pixel_inflation": Prior(0.3, 5.0, 1.0, 0.3, 0.02),
 }
@@ -114,7 +113,6 @@ def names_of(model: ShakeModel) -> list[str]:
     out += [f"modes.{i}.{f}" for i in range(len(model.modes)) for f in fields]
     if model.force_hz is not None:
         out.append(FORCE)
-    out += [f"broad_bands.{i}.rms_mm" for i in range(len(model.broad_bands))]
     return [*out, *learned_names(model.bubble), "pixel_inflation"]
 
 
@@ -158,9 +156,7 @@ def _along(signal: Signal, rms_mm: tuple[float, float, float], camera: int) -> f
 
 
 def moving_processes(signal: Signal, model: ShakeModel) -> list[Process]:
-    """Return the processes of one bubble along the signal's direction; none if nothing moves."""
-    if not signal.moving.any():
-        return []
+    """Return the processes of one bubble along the signal's direction."""
     return bubble_processes(model.bubble, signal.direction, bubbles=signal.pooled, mean_known=True)
 
 

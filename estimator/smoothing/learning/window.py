@@ -28,21 +28,20 @@ much the steps of frames may differ then."""
 
 
 def learning_signals(
-    problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
+    problem: SmoothingProblem, weights: tuple[Array, Array] | None = None
 ) -> tuple[Signal, ...]:
     """Return the signals of `learning_parts`; several parts become replicates of one signal.
 
     weights : of the observations of bubbles and of marks; those below 0.5 are left out.
-    fixed : whether the tracks are those of a target at rest.
     """
-    parts = [part.problem for part in learning_parts(problem, weights, fixed=fixed)]
+    parts = [part.problem for part in learning_parts(problem, weights)]
     if len(parts) > 1:
         return tuple(stacked(some) for some in zip(*map(signals_of, parts)))
-    return tuple(c for c in signals_of(parts[0], fixed=fixed) if c.samples)
+    return tuple(c for c in signals_of(parts[0]) if c.samples)
 
 
 def learning_parts(
-    problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
+    problem: SmoothingProblem, weights: tuple[Array, Array] | None = None
 ) -> list[Window]:
     """Return the parts of a run that hyper-parameters are learned from, in order of time.
 
@@ -50,7 +49,7 @@ def learning_parts(
     some bubbles are always seen. Arguments as for `learning_signals`.
     """
     window = learning_window(problem, weights)
-    return ([] if fixed else _pieces(problem, weights, window)) or [window]
+    return _pieces(problem, weights, window) or [window]
 
 
 def _pieces(

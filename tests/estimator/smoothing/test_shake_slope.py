@@ -88,19 +88,15 @@ def test_slope_equals_differences_of_the_evidence(kind: str, kept: float, marks:
             np.testing.assert_allclose(slope, differences(part, model, names), atol=0.03, rtol=1e-4)
 
 
-def test_slope_with_frames_at_uneven_times_and_a_still_target() -> None:
+def test_slope_with_frames_at_uneven_times() -> None:
     problem, _, _ = run(np.random.default_rng(4), bubbles=2, seconds=0.3, kept=0.7)
     uneven = problem.t_s + np.random.default_rng(5).uniform(0, 4e-3, len(problem.t_s))
     names = names_of(true_model())
-    for fixed in (False, True):
-        signal = signals_of(replace(problem, t_s=uneven), fixed=fixed)[0]
-        slope = signal_gradient(signal, true_model(), names)[1]
-        np.testing.assert_allclose(
-            slope, differences(signal, true_model(), names), atol=2e-3, rtol=1e-5
-        )
-        # what does not move has no motion to learn
-        moves = [n.startswith("bubble") and slope[i] != 0 for i, n in enumerate(names)]
-        assert any(moves) != fixed
+    signal = signals_of(replace(problem, t_s=uneven))[0]
+    slope = signal_gradient(signal, true_model(), names)[1]
+    np.testing.assert_allclose(
+        slope, differences(signal, true_model(), names), atol=2e-3, rtol=1e-5
+    )
 
 
 def test_the_chains_solution_and_covariances_equal_dense_algebra() -> None:

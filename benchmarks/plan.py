@@ -18,8 +18,9 @@ import numpy as np
 import pandas as pd
 
 import telerig
+from telerig.command_options import Experiment
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
-from telerig.estimator.plan import Experiment, expect
+from telerig.estimator.plan import expect
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.config import RunConfig
 from telerig.io.simulation.presets import run_preset

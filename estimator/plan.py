@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Ints
+from telerig.command_options import Experiment
 from telerig.errors import InputError
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
 from telerig.estimator.calibration.result.calibration import (
@@ -68,62 +69,24 @@ MOST_STATES = 20_000
 """Largest product of frames and bubbles: the covariances of more would take minutes."""
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """Describe a planned run. The rig, its stage and its sensors are those of rig.toml.
-
-    rate_hz, seconds : frame rate, and duration of the run.
-    bubbles : number of bubbles in sight.
-    diameter_mm : diameter of a bubble.
-    sigma_px : standard deviation of the centre of a bubble's outline in px; None takes the one that
-        `centre_sigma_px` gives for the diameter.
-    rise_mm_s : rise velocity, with which the stage follows the bubbles.
-    zigzag_hz, zigzag_mm : frequency and RMS of the path's zigzag across the vertical.
-    shake_hz, shake_mm : frequency of the rig's shake, and its RMS along the vertical; the RMS
-        across the vertical is half of this.
-    marks : number of marks in each view that are fixed to the tank.
-    mark_sigma_px : standard deviation of a mark's centre.
-    arms : whether each camera's arm carries an accelerometer in addition to those of rig.toml.
-    """
-
-    rate_hz: float = 500.0
-    seconds: float = 0.5
-    bubbles: int = 1
-    diameter_mm: float = 3.0
-    sigma_px: float | None = None
-    rise_mm_s: float = 250.0
-    zigzag_hz: float = 6.0
-    zigzag_mm: float = 1.4
-    shake_hz: float = 20.0
-    shake_mm: float = 0.15
-    marks: int = 0
-    mark_sigma_px: float = 0.1
-    arms: bool = False
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return round(self.rate_hz * self.seconds)
-
-    def check(self) -> None:
-        """Raise InputError for a value that is impossible or beyond what can be planned."""
-        for name in ("rate_hz", "seconds", "diameter_mm", "zigzag_hz", "shake_hz", "mark_sigma_px"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} is {value}", where="plan", todo="give a positive number")
-        for name in ("rise_mm_s", "zigzag_mm", "shake_mm", "marks"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"{name} is {value}", where="plan", todo="give 0 or more")
-        if self.sigma_px is not None and not (np.isfinite(self.sigma_px) and self.sigma_px > 0):
-            raise InputError(f"sigma_px is {self.sigma_px}", where="plan", todo="give > 0 px")
-        if self.bubbles < 1 or self.frames < 10 or self.frames * self.bubbles > MOST_STATES:
-            raise InputError(
-                f"{counted(self.bubbles, 'bubble')} in {self.frames:.6g} frames",
-                where="plan",
-                todo="plan 1 or more bubbles in 10 or more frames, bubbles times frames at most "
-                f"{MOST_STATES}; a longer run will be at least as accurate as this plan says",
-            )
+def check(planned: Experiment) -> None:
+    """Raise InputError for a value that is impossible or beyond what can be planned."""
+    positive = ("rate_hz", "seconds", "diameter_mm", "sigma_px", "zigzag_hz", "shake_hz")
+    for name in (*positive, "mark_sigma_px"):
+        value = getattr(planned, name)
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value}", where="plan", todo="give a positive number")
+    for name in ("rise_mm_s", "zigzag_mm", "shake_mm", "marks"):
+        value = getattr(planned, name)
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"{name} is {value}", where="plan", todo="give 0 or more")
+    if planned.bubbles < 1 or planned.frames < 10 or planned.frames * planned.bubbles > MOST_STATES:
+        raise InputError(
+            f"{counted(planned.bubbles, 'bubble')} in {planned.frames:.6g} frames",
+            where="plan",
+            todo="plan 1 or more bubbles in 10 or more frames, bubbles times frames at most "
+            f"{MOST_STATES}; a longer run will be at least as accurate as this plan says",
+        )
 
 
 @dataclass(frozen=True)
@@ -239,7 +202,7 @@ def expect(rig: RigDescription, calibration: Calibration, planned: Experiment) -
 
     Raises InputError for an impossible experiment.
     """
-    planned.check()
+    check(planned)
     calibration = of_run(calibration, rig.tracking_cameras)
     sigma_px = planned.sigma_px
     if sigma_px is None:

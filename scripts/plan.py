@@ -7,33 +7,18 @@ from typing import Annotated
 
 import typer
 
+from telerig.command_options import Experiment
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, run_file, say
 
 
+@options.with_options()
 @errors_in_words()
 def plan(
     dataset: Annotated[
         Path, typer.Argument(help="Dataset folder. Its rig.toml is enough: see telerig init.")
     ],
-    rate_hz: Annotated[float, typer.Option(help="Frame rate in Hz.")] = 500.0,
-    seconds: Annotated[float, typer.Option(help="Duration of the run in s.")] = 0.5,
-    bubbles: Annotated[int, typer.Option(help="Number of bubbles in sight.")] = 1,
-    diameter_mm: Annotated[float, typer.Option(help="Diameter of a bubble in mm.")] = 3.0,
-    sigma_px: Annotated[
-        float | None,
-        typer.Option(help="Noise of a bubble's centre in px [from its diameter]."),
-    ] = None,
-    rise_mm_s: Annotated[float, typer.Option(help="Rise velocity in mm/s.")] = 250.0,
-    zigzag_hz: Annotated[float, typer.Option(help="Frequency of the path's zigzag in Hz.")] = 6.0,
-    zigzag_mm: Annotated[float, typer.Option(help="RMS of the zigzag in mm.")] = 1.4,
-    shake_hz: Annotated[float, typer.Option(help="Frequency of the rig's shake in Hz.")] = 20.0,
-    shake_mm: Annotated[
-        float, typer.Option(help="RMS of the shake in mm, vertical; each horizontal axis has half.")
-    ] = 0.15,
-    marks: Annotated[
-        int, typer.Option(help="Number of marks in each view that are fixed to the tank.")
-    ] = 0,
+    planned: Experiment,
     views: Annotated[
         int, typer.Option(help="Number of views of the target, if it is not calibrated yet.")
     ] = 12,
@@ -56,8 +41,8 @@ def plan(
     Exit code 0: planned. 2: the input cannot be used.
     """
     from telerig.estimator.plan import (
-        Experiment,
         calibration_of,
+        check,
         expect,
         plan_table,
         plan_words,
@@ -70,11 +55,7 @@ def plan(
     if out is not None:
         check_file(out)
     rig = read_rig_toml(dataset / "rig.toml")
-    planned = Experiment(
-        rate_hz, seconds, bubbles, diameter_mm, sigma_px, rise_mm_s, zigzag_hz, zigzag_mm, shake_hz,
-        shake_mm, marks,
-    )  # fmt: skip
-    planned.check()
+    check(planned)
     chosen = variants(rig, planned)
     expected = {}
     with progress(quiet) as stage:

@@ -14,12 +14,13 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
+from telerig.command_options import Experiment
 from telerig.errors import TelerigError
 from telerig.estimator.bubbles.background.screen import screen_level
 from telerig.estimator.bubbles.flat_field import full_scale
 from telerig.estimator.calibration.result.calibration import Calibration, of_run
 from telerig.estimator.doctor.checks import Check, Status
-from telerig.estimator.plan import MOST_STATES, Experiment, expect
+from telerig.estimator.plan import MOST_STATES, expect
 from telerig.estimator.rig_drift.change import LATE_SIGMAS
 from telerig.estimator.rig_drift.estimate import with_speeds
 from telerig.estimator.sensors.checks import check_sensors

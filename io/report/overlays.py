@@ -21,6 +21,7 @@ Colour = tuple[int, int, int]
 Rejected = tuple[float, float, float, str]
 
 GREEN, RED, PAPER, INK = (40, 200, 70), (235, 45, 45), (255, 255, 255), (30, 30, 30)
+_LUMINANCE = (0.299, 0.587, 0.114)
 _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 _LARGEST_ID = 9999
 _FRACTION_BITS = 4
@@ -221,7 +222,8 @@ def write_label(
         if taken[place].any():
             return False
         taken[place] = True
-    for shade, thickness in ((PAPER if colour == INK else INK, 2), (colour, 1)):
+    rim = INK if np.dot(colour, _LUMINANCE) > 128 else PAPER
+    for shade, thickness in ((rim, 2), (colour, 1)):
         cv2.putText(
             picture, label, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _SCALE, shade, thickness, cv2.LINE_AA
         )

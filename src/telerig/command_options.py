@@ -1,4 +1,4 @@
-"""The options of the commands that calibrate, track and smooth, each declared once.
+"""The options of the commands that calibrate, track, smooth and plan, each declared once.
 
 The command lines, with those of `run` and `batch`, the jobs of a batch, the options in `run.json`
 and the command line that makes results again are made from these classes.
@@ -203,6 +203,39 @@ class SmoothingOptions(Options):
     def keywords(self) -> dict[str, Any]:
         """The options as keywords of `telerig.smooth`."""
         return {field: getattr(self, field) for field in self.settings()}
+
+
+@dataclass(frozen=True)
+class Experiment(Options):
+    """A planned run, for `telerig plan`. The rig, its stage and its sensors are those of rig.toml.
+
+    rise_mm_s : with this velocity the stage follows the bubbles. zigzag_mm : across the vertical.
+    mark_sigma_px : standard deviation of a mark's centre.
+    arms : whether each camera's arm carries an accelerometer in addition to those of rig.toml.
+    """
+
+    rate_hz: float = _setting(500.0, "Frame rate in Hz.", "--rate-hz")
+    seconds: float = _setting(0.5, "Duration of the run in s.", "--seconds")
+    bubbles: int = _setting(1, "Number of bubbles in sight.", "--bubbles")
+    diameter_mm: float = _setting(3.0, "Diameter of a bubble in mm.", "--diameter-mm")
+    sigma_px: float | None = _setting(
+        None, "Noise of a bubble's centre in px [from its diameter].", "--sigma-px"
+    )
+    rise_mm_s: float = _setting(250.0, "Rise velocity in mm/s.", "--rise-mm-s")
+    zigzag_hz: float = _setting(6.0, "Frequency of the path's zigzag in Hz.", "--zigzag-hz")
+    zigzag_mm: float = _setting(1.4, "RMS of the zigzag in mm.", "--zigzag-mm")
+    shake_hz: float = _setting(20.0, "Frequency of the rig's shake in Hz.", "--shake-hz")
+    shake_mm: float = _setting(
+        0.15, "RMS of the shake in mm, vertical; each horizontal axis has half.", "--shake-mm"
+    )
+    marks: int = _setting(0, "Number of marks in each view that are fixed to the tank.", "--marks")
+    mark_sigma_px: float = _setting(0.1, "", "")
+    arms: bool = _setting(False, "", "")
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return round(self.rate_hz * self.seconds)
 
 
 KINDS: dict[Kind, type[Options]] = {

@@ -11,11 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 import telerig
+from telerig.command_options import Experiment
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.plan import (
-    Experiment,
     centre_sigma_px,
+    check,
     expect,
     expected_calibration,
     plan_words,
@@ -117,7 +118,7 @@ def test_variants_add_only_what_is_missing(rig: RigDescription) -> None:
 )
 def test_impossible_experiments(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="plan"):
-        replace(S2, **wrong).check()
+        check(replace(S2, **wrong))
 
 
 def test_a_rig_that_does_not_shake(rig: RigDescription, calibration: telerig.Calibration) -> None:

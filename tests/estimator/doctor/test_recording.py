@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import telerig
+from telerig.command_options import Experiment
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.doctor import recording
 from telerig.estimator.doctor.recording import Recording, check_recording, sensor_shake
-from telerig.estimator.plan import Experiment
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.io.dataset.run import RunData
 from telerig.io.results.smoothing import Verdict

@@ -53,7 +53,7 @@ from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.io.tables.smoothing import AXES
 from telerig.rig.camera import Camera
-from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.rig.units import MICRO_G_M_S2
 from telerig.short_text import counted, share
 
 _SAMPLE_HZ = 2000.0
@@ -64,7 +64,6 @@ _INSIDE = 0.8
 _MARK_SIGMA_MM = 30.0
 _DENSITY_UG = 25.0
 _BLUR_PX, _IMAGE_NOISE = 1.0, 0.01
-_UG_MM_S2 = 1e-3 * STANDARD_GRAVITY_M_S2
 MOST_STATES = 20_000
 """Largest product of frames and bubbles: the covariances of more would take minutes."""
 
@@ -311,7 +310,7 @@ def _accelerometers(
         Accelerometer(
             name, CARRIAGE if mount not in cameras else cameras.index(mount), times,
             np.broadcast_to(axes @ at_rest, (len(times), 3)).copy(), axes,
-            (density or _DENSITY_UG) * _UG_MM_S2 * np.sqrt(_SAMPLE_HZ / 2),
+            (density or _DENSITY_UG) * 1e3 * MICRO_G_M_S2 * np.sqrt(_SAMPLE_HZ / 2),
         )
         for name, mount, axes, density in planned
     )  # fmt: skip

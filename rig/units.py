@@ -9,6 +9,9 @@ A sensor that reads in g uses this value everywhere on Earth. The local gravity 
 differs from it by up to 0.03 m/s^2 and is given in rig.toml, `[stage] gravity_m_s2`.
 """
 
+MICRO_G_M_S2 = 1e-6 * STANDARD_GRAVITY_M_S2
+"""The unit of noise densities in data sheets."""
+
 ACCELERATION_UNITS = {
     "m/s^2": 1.0,
     "g": STANDARD_GRAVITY_M_S2,

@@ -14,9 +14,7 @@ from telerig.estimator.bubbles.pairing.model import Finding
 from telerig.estimator.rig_drift.movement import p_value_of
 from telerig.estimator.rig_drift.ray_misses import Pair, offset_roll_pitch
 from telerig.rig.pose import Pose
-from telerig.rig.triangulation import (
-    POSE_COMPONENTS,
-)
+from telerig.rig.triangulation import POSE_COMPONENTS
 
 if TYPE_CHECKING:
     from telerig.estimator.bubbles.pairing.model import PairModel

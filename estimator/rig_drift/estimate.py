@@ -26,10 +26,7 @@ from telerig.estimator.rig_drift.movement import (
 )
 from telerig.estimator.rig_drift.noise import Noise, Series, information, learned_noise
 from telerig.estimator.rig_drift.ray_misses import ray_misses
-from telerig.rig.triangulation import (
-    midpoint,
-    nearly_parallel,
-)
+from telerig.rig.triangulation import midpoint, nearly_parallel
 from telerig.statistics import robust_sd
 
 if TYPE_CHECKING:

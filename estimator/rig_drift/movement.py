@@ -14,11 +14,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.rig_drift.ray_misses import (
-    Free,
-    Pair,
-    common_perpendicular,
-)
+from telerig.estimator.rig_drift.ray_misses import Free, Pair, common_perpendicular
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.triangulation import (

@@ -16,12 +16,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import (
-    LEAST_SINE,
-    midpoint,
-    rig_jacobian,
-    stacked_jacobian,
-)
+from telerig.rig.triangulation import LEAST_SINE, midpoint, rig_jacobian, stacked_jacobian
 
 Free = tuple[tuple[str, ...], ...]
 Pair = tuple[Camera, Camera]

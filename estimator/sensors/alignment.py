@@ -26,7 +26,7 @@ _LONG_RECORD, _MOST_SENSORS = 200_000, 1
 """In longer records, channels that several sensors explain take gigabytes and bring little."""
 
 _LEAST_OVERLAP = 0.3
-_LEAST_SAMPLES = 60
+LEAST_SAMPLES = 60
 _END_S = 0.005
 _RIPPLE_LOG_RATIO = 0.5
 _MOST_LAG_SHARE = 0.25
@@ -150,7 +150,7 @@ def align(
     shift = round((frames.start_s - own.start_s) / frames.step_s)
     lags = np.arange(-(frames.count - 1), own.count) - shift
     most = _MOST_SENSORS if own.count > _LONG_RECORD else len(readings)
-    used = [c for c in channels if np.count_nonzero(c.known) > _LEAST_SAMPLES]
+    used = [c for c in channels if np.count_nonzero(c.known) > LEAST_SAMPLES]
     used = [c for c in used if len(c.sensors) <= most] or used
     if not used:
         return None

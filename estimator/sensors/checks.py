@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.sensors.accelerometer_checks import check_accelerometer, check_motion
 from telerig.estimator.sensors.encoder_checks import check_encoder
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.given import Sensor, given_sensors, table_columns
+from telerig.estimator.sensors.gravity import check_accelerometer
+from telerig.estimator.sensors.mounting import check_motion
 from telerig.estimator.sensors.samples import mostly_masked, screened
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 from telerig.short_text import counted
@@ -116,8 +117,9 @@ def read_sensors(
             )
         found = check_accelerometer(sensor, mounting.up, mounting.gravity_m_s2)
         if not found and encoder is not None:
-            record = np.stack([encoder.t_s, encoder.position_mm], -1)
-            found = check_motion(sensor, record, sensor.axes @ mounting.axis)
+            found = check_motion(
+                sensor, encoder.t_s, encoder.position_mm, mounting.axis, mounting.up
+            )
         findings += found
     return Sensors(encoder, tuple(kept), tuple(findings))
 

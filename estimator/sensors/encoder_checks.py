@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Code, Finding
-from telerig.estimator.sensors.samples import prediction_residual
+from telerig.estimator.sensors.samples import LONGEST_SPIKE, prediction_residual
 from telerig.short_text import counted, counted_list
 from telerig.statistics import robust_sd
 
@@ -22,7 +22,6 @@ _PAUSE = 5.0
 """Steps longer than this many median steps are pauses of the record; their motion is not judged."""
 
 _RETURNS = 0.3
-_LONGEST_SPIKE = 3
 _WRAP_OF_RANGE = 0.5
 _LEAST_RECORD = 6
 _SHARE = 0.3
@@ -178,12 +177,12 @@ def _classified(
     while left:
         i = left.pop(0)
         size, at, step = float(excess[i]), float(t[i + 1]), float(t[i + 1] - t[i])
-        near = left and left[0] - i <= _LONGEST_SPIKE
+        near = left and left[0] - i <= LONGEST_SPIKE
         if near and abs(size + float(excess[left[0]])) < _RETURNS * abs(size):
             out.append(EncoderFault(at, size, "spike", step, left.pop(0) - i))
-        elif i < _LONGEST_SPIKE and i + _LONGEST_SPIKE < last:
+        elif i < LONGEST_SPIKE and i + LONGEST_SPIKE < last:
             out.append(EncoderFault(float(t[0]), -size, "spike", step, i + 1))
-        elif last - i < _LONGEST_SPIKE:
+        elif last - i < LONGEST_SPIKE:
             out.append(EncoderFault(at, size, "spike", step, last - i + 1))
         elif size * pace < 0 and abs(size) > _WRAP_OF_RANGE * float(np.ptp(position)):
             out.append(EncoderFault(at, size, "wrap", step))

@@ -29,7 +29,9 @@ Clock = Literal["frames", "unknown"]
 
 _PLANE = 0.1
 _MOST_UNORDERED = 0.05
-_UNIT_WITHIN = 1.5
+UNIT_WITHIN = 1.5
+"""A reading at rest may be so many times gravity, or a share of it: bias, and acceleration."""
+
 _SHOWN_TYPE = 60
 
 
@@ -298,7 +300,7 @@ def unit_of_gravity(size: float) -> str | None:
     """
     for unit in ("m/s^2", "g", "mm/s^2", "mg", "ft/s^2"):
         ratio = size * ACCELERATION_UNITS[unit] / STANDARD_GRAVITY_M_S2
-        if 1 / _UNIT_WITHIN < ratio < _UNIT_WITHIN:
+        if 1 / UNIT_WITHIN < ratio < UNIT_WITHIN:
             return unit
     return None
 

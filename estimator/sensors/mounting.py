@@ -9,23 +9,26 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import permutations, product
 
 import numpy as np
 
 from telerig.arrays import Array, Bools
+from telerig.estimator.sensors.accelerations import of_positions, of_readings
 from telerig.estimator.sensors.alignment import (
+    LEAST_SAMPLES,
     beyond_chance,
     effective_size,
     filtered,
     whitening_filter,
 )
+from telerig.estimator.sensors.findings import Finding
+from telerig.estimator.sensors.given import Sensor
+from telerig.estimator.sensors.gravity import Gravity, axes_remedy, signed_permutations
+from telerig.estimator.sensors.image_motion import frame_grid
 
 _SHIFTS = 24
-_UPRIGHT_DEG = 30.0
 LEAST_BESIDE = 2.0
 """Least log-likelihood ratio by the images of axes that other sensors, too, find clearly better."""
-_LEAST_SAMPLES = 60
 
 
 @dataclass(frozen=True)
@@ -61,18 +64,8 @@ class Mounting:
     lead: float
 
 
-def signed_permutations() -> Array:
-    """Return all signed permutations of three axes (48, 3, 3), the identity first."""
-    out = [
-        np.eye(3)[list(order)] * np.array(signs)[:, None]
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-    return np.array(out)
-
-
 def mounting(
-    axes: Array, at_rest: Array, up: Array, x: Array, known: Bools, expected: Sequence[Expected]
+    axes: Array, gravity: Gravity, up: Array, x: Array, known: Bools, expected: Sequence[Expected]
 ) -> Mounting:
     """Return the axes of a sensor that agree best with gravity and expected motion.
 
@@ -82,16 +75,14 @@ def mounting(
     not tell which of them is wrong.
 
     axes : (3, 3) stated direction of each of the sensor's axes.
-    at_rest : (3,) mean reading, which has to point along up (3,).
+    gravity : reading at rest, which has to point along up (3,).
     x : (n, 3) readings on the time grid of the expected accelerations.
     known : (n,) whether there is a reading.
     expected : the accelerations that the sensor should measure.
     """
     turned = np.swapaxes(signed_permutations(), -1, -2) @ axes
-    forces = np.einsum("pij,i->pj", turned, at_rest)
-    size = np.linalg.norm(forces, axis=1)
-    upright = forces @ up > np.cos(np.radians(_UPRIGHT_DEG)) * size
-    if not upright.any() or not size.max() > 0:
+    upright = gravity.allows(turned, up)
+    if not upright.any():
         upright[:] = True
     candidates = turned[upright]
     stated = np.flatnonzero(np.abs(candidates - axes).max((1, 2)) < 1e-9)
@@ -111,6 +102,31 @@ def mounting(
     clear = lead > 0 and is_clear(partial(_scores, judging, both))
     clear |= lead > LEAST_BESIDE and is_clear(partial(_scores, rest, both))
     return Mounting(candidates[best], clear, lead)
+
+
+def check_motion(
+    sensor: Sensor, t_s: Array, position_mm: Array, axis: Array, up: Array
+) -> list[Finding]:
+    """Return a warning if other axes than stated fit the carriage's acceleration clearly better.
+
+    Gravity has to allow the stated axes; it tells all but the horizontal ones.
+
+    t_s, position_mm : (E,) of the encoder. axis, up : (3,) of the travel, and against gravity.
+    """
+    grid = frame_grid(t_s, 0.0, None)
+    if sensor.clock != "frames" or sensor.unused_axes or grid.count < 8 * grid.knots:
+        return []
+    carriage = of_positions(grid, t_s, position_mm[:, None])
+    felt = of_readings(grid, sensor.t_s, 1e3 * sensor.reading_m_s2)
+    if felt.grid.count < 2:
+        return []
+    expected = Expected(axis, carriage.values[:, 0], carriage.known)
+    gravity = Gravity.of(sensor.reading_m_s2)
+    found = mounting(sensor.axes, gravity, up, *felt.at(grid.t_s), [expected])
+    if not found.clear:
+        return []
+    words = "with its axes as stated, it does not feel the acceleration that the encoder shows"
+    return [Finding(words, sensor.where, axes_remedy(sensor.name, found.axes)[0])]
 
 
 def _scores(fits: Sequence[tuple[Expected, Regression]], axes: Array, shift: float = 0.0) -> Array:
@@ -146,12 +162,12 @@ class Regression:
     def of(cls, values: Array, known: Bools, x: Array) -> Regression | None:
         """Return the regression of values (N,) on x (N, k) by generalised least squares; None if
         too few of them are known (N,)."""
-        if np.count_nonzero(known) < _LEAST_SAMPLES:
+        if np.count_nonzero(known) < LEAST_SAMPLES:
             return None
         y, x = values - values[known].mean(), x - x[known].mean(0)
         rest = y[known] - x[known] @ np.linalg.lstsq(x[known], y[known], rcond=None)[0]
         whole, used = filtered(np.column_stack([y, x]), known, whitening_filter(rest))
-        if np.count_nonzero(used) < _LEAST_SAMPLES:
+        if np.count_nonzero(used) < LEAST_SAMPLES:
             return None
         y, x = whole[used, 0], whole[used, 1:]
         fit = x @ np.linalg.lstsq(x, y, rcond=None)[0]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from telerig.arrays import Array, Bools, Ints
 
 FALSE_ALARMS = 1e-3
 """Share of sound runs in which a factor between two records may be called wrong."""
+
+FAR_SDS = NormalDist().inv_cdf(1 - FALSE_ALARMS / 2)
+"""Standard deviations that chance exceeds as rarely."""
 
 _ARM_SD, _ARM_BANDS = 0.5, 3.0
 """Standard deviation of the logarithm of an arm's gain in a band before anything is measured, and

@@ -15,16 +15,15 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Finding
 from telerig.estimator.sensors.given import Sensor
-from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.rig.units import MICRO_G_M_S2
 from telerig.statistics import robust_sd
 
-_MICRO_G_M_S2 = 1e-6 * STANDARD_GRAVITY_M_S2
 _NEIGHBOURS = 4
 _LEAST_TO_LEARN, _MOST_TO_LEARN = 60, 8192
 _BLOCK = 1 << 16
 
 _SPIKE_SIGMAS = 20.0
-_LONGEST_SPIKE = 3
+LONGEST_SPIKE = 3
 _ALONE, _QUIET = 12, 0.1
 """A spike stands alone: it exceeds the range of the 12 samples on each side, of which none is
 predicted badly. An impact rings."""
@@ -103,7 +102,7 @@ def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
         words = f"no noise density is given; {density:.3g} ug/sqrt(Hz) are estimated"
         todo = "give noise_density_ug_sqrt_hz from the data sheet"
         findings.append(Finding(words, where, todo, is_fault=False))
-    sigma = density * _MICRO_G_M_S2 * np.sqrt(sampling_rate(t) / 2)
+    sigma = density * MICRO_G_M_S2 * np.sqrt(sampling_rate(t) / 2)
     frozen = frozen_samples(reading, sigma) & ~clipped
     if frozen.any():
         words = f"{np.count_nonzero(frozen)} of {len(t)} samples repeat the one before: the sensor "
@@ -165,7 +164,7 @@ def noise_density(t_s: ArrayLike, reading_m_s2: ArrayLike) -> float:
         return _LEAST_UG_SQRT_HZ
     level = np.quantile(np.median(power[band], axis=0) / np.log(2), 0.25, axis=-1)
     quantum = min(quantisation(axis) for axis in reading.T) ** 2 / 6 / rate
-    density = float(np.sqrt(np.mean(np.maximum(level, quantum)))) / _MICRO_G_M_S2
+    density = float(np.sqrt(np.mean(np.maximum(level, quantum)))) / MICRO_G_M_S2
     return max(density, _LEAST_UG_SQRT_HZ)
 
 
@@ -275,7 +274,7 @@ def _spikes(signal: Array) -> Bools:
         near = slice(max(first - _ALONE, 0), last + _ALONE)
         least, size = off[first:last].min(), np.abs(residual[near])
         quiet = size.max() <= max(_QUIET * least, bound[first:last].min() / 2)
-        if last - first > _LONGEST_SPIKE or least < np.ptp(clean[near]) or not quiet:
+        if last - first > LONGEST_SPIKE or least < np.ptp(clean[near]) or not quiet:
             hit[first:last] = False
     return hit
 

@@ -50,7 +50,6 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
     check_increasing,
 )
-from telerig.estimator.smoothing.problem.sensor_alignment import aligned
 from telerig.estimator.smoothing.problem.tables import (
     Tracked,
     accelerometers_of,
@@ -82,6 +81,7 @@ from telerig.estimator.smoothing.result import (
 )
 from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.results_file import StoredTables, Tables, results_file
+from telerig.estimator.smoothing.sensor_alignment.aligned import aligned
 from telerig.estimator.smoothing.unfinished import Notes, UnfinishedPieces
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
 from telerig.factors.bubble_motion import INERTIA_S, Inertia

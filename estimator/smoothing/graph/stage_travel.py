@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.estimator.sensors.response import FAR_SDS
 from telerig.estimator.smoothing.graph.layout import points_in_rig
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import Travel
@@ -22,7 +23,6 @@ from telerig.rig.pose import across
 
 SCALE_SIGMA = 1e-3
 """Of an encoder without a stated scale: lead screws, belts, thermal growth."""
-_FAR = 3.0
 
 
 def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
@@ -71,7 +71,7 @@ def wider_scale_sigma(solution: Solution) -> float | None:
     if not solution.graph.encoder_size or not assumed:
         return None
     off = abs(solution.state.encoder_scale(solution.graph))
-    return 2 * off if off > _FAR * prior else None
+    return 2 * off if off > FAR_SDS * prior else None
 
 
 def disputed_scale(solution: Solution) -> float:
@@ -83,7 +83,7 @@ def disputed_scale(solution: Solution) -> float:
     travel = solution.graph.problem.travel
     off = abs(solution.state.encoder_scale(solution.graph))
     assumed = travel is not None and travel.source == "assumed"
-    return off if assumed and off > _FAR * default_scale_sigma(travel) else 0.0
+    return off if assumed and off > FAR_SDS * default_scale_sigma(travel) else 0.0
 
 
 def scale_warnings(solution: Solution) -> list[str]:

@@ -27,7 +27,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Stage,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.rig.units import MICRO_G_M_S2
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from telerig.rig.camera import Camera
 
 
-_MICRO_G_MM_S2 = 1e-3 * STANDARD_GRAVITY_M_S2
 MARGIN_S = 0.25
 _MARK_SIGMA_MM = 100.0
 _VISIBLE_PX = 2e-3
@@ -74,7 +73,7 @@ def accelerometers_of(
     for sensor in sensors:
         assert sensor.noise_density_ug_sqrt_hz is not None, "screening estimates it"
         rate = sampling_rate(sensor.t_s)
-        sigma = sensor.noise_density_ug_sqrt_hz * _MICRO_G_MM_S2 * np.sqrt(rate / 2)
+        sigma = sensor.noise_density_ug_sqrt_hz * 1e3 * MICRO_G_M_S2 * np.sqrt(rate / 2)
         camera = CARRIAGE if sensor.mounted_on == ON_CARRIAGE else names.index(sensor.mounted_on)
         out.append(
             Accelerometer(

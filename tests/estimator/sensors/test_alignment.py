@@ -25,6 +25,7 @@ from telerig.estimator.sensors.alignment import (
     align,
     beyond_chance,
 )
+from telerig.estimator.sensors.gravity import Gravity
 from telerig.estimator.sensors.mounting import Expected, Regression, mounting
 
 GRID = Grid(0.0, 0.002, 1000, 5)
@@ -116,14 +117,14 @@ def test_a_single_frequency_is_ambiguous_by_whole_periods() -> None:
     assert found is not None and not found.unique
 
 
-def sensor(rng: Generator, rows: Array) -> tuple[Array, Accelerations, list[Expected]]:
+def sensor(rng: Generator, rows: Array) -> tuple[Gravity, Accelerations, list[Expected]]:
     """Reading at rest, readings of a sensor with these axes, and what it should feel."""
     t, place, acceleration = motion(rng, 0.5)
     reading = (acceleration + GRAVITY * UP) @ rows.T + 5.0 * rng.normal(size=acceleration.shape)
     seen = place[(t >= 0) & (t < 2)][::4] + 0.02 * rng.normal(size=(1000, 3))
     images = of_positions(GRID, GRID.t_s, seen)
     felt = [Expected(d, images.values[:, k], images.known) for k, d in enumerate(np.eye(3)[:2])]
-    return np.median(reading, axis=0), of_readings(GRID, t, reading), felt
+    return Gravity.of(reading), of_readings(GRID, t, reading), felt
 
 
 @pytest.mark.parametrize(

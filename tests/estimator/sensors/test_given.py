@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.estimator.sensors.accelerometer_checks import check_accelerometer
 from telerig.estimator.sensors.findings import Code, Finding, SensorError, settled
 from telerig.estimator.sensors.given import given_sensors, longest_increase, numbers, table_columns
+from telerig.estimator.sensors.gravity import check_accelerometer
 from telerig.estimator.sensors.samples import screened
 from telerig.io.rig_file.description import AccelerometerDescription
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2

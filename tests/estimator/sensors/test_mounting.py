@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from telerig.estimator.sensors.alignment import LEAST_LOG_RATIO
+from telerig.estimator.sensors.gravity import Gravity
 from telerig.estimator.sensors.mounting import LEAST_BESIDE, Expected, Mounting, mounting
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, -1.0, 0.0])
 SWAPPED = np.eye(3)[[2, 1, 0]]
-AT_REST = 9806.65 * UP
+AT_REST = Gravity(9806.65 * UP)
 BAND = butter(2, (5, 40), "bandpass", fs=500, output="sos")
 
 

@@ -11,8 +11,8 @@ from shake_runs import run_of
 
 import telerig
 from telerig.estimator.sensors.findings import Code, Finding, SensorError
-from telerig.estimator.smoothing.problem.mark_motion import MarkMotion
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+from telerig.estimator.smoothing.sensor_alignment.mark_motion import MarkMotion
 from telerig.estimator.smoothing.smooth import problem_of, with_sensors_aligned
 from telerig.rig.camera import Camera
 

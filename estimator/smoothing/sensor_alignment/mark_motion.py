@@ -36,9 +36,14 @@ class Judged:
     sd: Array
     reach: float
 
+    @property
+    def first(self) -> tuple[float, float]:
+        """The first number and its standard error."""
+        return float(self.value[0]), float(self.sd[0])
+
     def excludes(self, value: float) -> bool:
         """Return whether a value of the first number is excluded at the rate of false alarms."""
-        return bool(abs(self.value[0] - value) > self.reach * self.sd[0])
+        return bool(abs(self.first[0] - value) > self.reach * self.sd[0])
 
     def beyond(self, size: float) -> bool:
         """Return whether any number is clearly not 0, and larger than a size."""

@@ -1,0 +1,173 @@
+"""The accelerations that images and encoder show, on the grid on which sensors are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from telerig.arrays import Array, Bools
+from telerig.estimator.sensors.accelerations import Accelerations, Grid, of_positions, of_readings
+from telerig.estimator.sensors.alignment import Channel
+from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, SmoothingProblem
+
+SLOWEST_S = 0.05
+"""A pace of frames or samples above this shows no shake."""
+
+_MOST_STEPS = 3e6
+
+
+@dataclass(frozen=True)
+class Images:
+    """Accelerations that images and encoder show, on a common time grid.
+
+    grid : n times.
+    cameras : (camera index, "marks" or "bubbles", accelerations (n, 2)).
+    encoder : acceleration (n, 1) of the carriage along its axis; None without an encoder.
+    """
+
+    grid: Grid
+    cameras: tuple[tuple[int, str, Accelerations], ...]
+    encoder: Accelerations | None
+
+    @classmethod
+    def of(cls, problem: SmoothingProblem) -> Images | None:
+        """Return the accelerations of a problem.
+
+        Returns None for a run that is too short, a frame rate too low to show shake, or no
+        detections.
+        """
+        noise = _noise_mm(problem)
+        pace = float(np.median(np.diff(problem.t_s)))
+        if noise is None or pace > SLOWEST_S or np.ptp(problem.t_s) > _MOST_STEPS * pace:
+            return None
+
+        def sensed_rms(grid: Grid) -> float:
+            rms = [readings_on(grid, s).values.std(0).max() for s in problem.accelerometers]
+            return float(min(rms))
+
+        grid = frame_grid(problem.t_s, noise, sensed_rms if problem.accelerometers else None)
+        if grid.count < 8 * grid.knots:
+            return None
+        seen = (("marks", problem.references), ("bubbles", problem.observations))
+        cameras = []
+        for index, camera in enumerate(problem.cameras):
+            for source, observed in seen:
+                mine = observed.camera == index
+                if mine.any():
+                    part = observed.of(mine)
+                    found = accelerations(
+                        grid, problem.t_s, camera, part.item, part.frame, part.uv_px
+                    )
+                    if found.known.any():
+                        cameras.append((index, source, found))
+        stage, encoder = problem.stage, None
+        if stage is not None and len(stage.t_s) > 1:
+            encoder = of_positions(grid, stage.t_s, stage.position_mm[:, None])
+            if not encoder.known.any() or not np.ptp(stage.position_mm) > 0:
+                encoder = None
+        return cls(grid, tuple(cameras), encoder) if cameras else None
+
+    def channels(
+        self, problem: SmoothingProblem, group: Sequence[int], *, images_alone: bool = False
+    ) -> list[Channel]:
+        """Return the accelerations that a group of sensors has to explain: images and encoder.
+
+        group : indices of the sensors.
+        images_alone : leave out the encoder.
+        """
+        mounts = {i: problem.accelerometers[i].camera for i in group}
+        number = {i: n for n, i in enumerate(group)}
+        out = []
+        for camera, source, seen in self.cameras:
+            name = f"{source} in camera {problem.cameras[camera].name}"
+            mounted = tuple(number[i] for i in group if mounts[i] in (camera, CARRIAGE))
+            if mounted:
+                out += [
+                    Channel(f"{name}, {way}", seen.values[:, k], seen.known, mounted)
+                    for k, way in enumerate(("along rows", "along columns"))
+                ]
+        for source in ("marks", "bubbles"):
+            for name, values, known, two in self.differences(problem, source):
+                carried = [i for i in group if mounts[i] in two]
+                if {mounts[i] for i in carried} == set(two):
+                    out.append(Channel(name, values, known, tuple(number[i] for i in carried)))
+        if self.encoder is not None and not images_alone:
+            out += [
+                Channel(f"encoder, {problem.accelerometers[i].name}", self.encoder.values[:, 0],
+                        self.encoder.known, (number[i],))
+                for i in group
+            ]  # fmt: skip
+        return out
+
+    def differences(
+        self, problem: SmoothingProblem, source: str
+    ) -> list[tuple[str, Array, Bools, tuple[int, int]]]:
+        """Return the differential accelerations of each pair of cameras along their shared
+        direction.
+
+        In the difference the motion of the observed points cancels.
+
+        Returns (name, values (n,), known (n,), indices of both cameras).
+        """
+        seen = {camera: a for camera, kind, a in self.cameras if kind == source}
+        out = []
+        for first in seen:
+            for second in (c for c in seen if c > first):
+                shared = shared_rows(problem, first, second)
+                both = np.concatenate([seen[first].values, seen[second].values], 1)
+                names = [problem.cameras[c].name for c in (first, second)]
+                out.append(
+                    (
+                        f"{source}, cameras {names[0]} and {names[1]} against each other",
+                        both @ shared,
+                        seen[first].known & seen[second].known,
+                        (first, second),
+                    )
+                )
+        return out
+
+
+def shared_rows(problem: SmoothingProblem, first: int, second: int) -> Array:
+    """Return the combination (4,) of two cameras' image directions in which a point's motion
+    cancels.
+    """
+    seen = np.concatenate([directions(problem.cameras[c]) for c in (first, second)])
+    return np.asarray(np.linalg.svd(seen)[0][:, 3])
+
+
+def along_axis(problem: SmoothingProblem, camera: int, seen: Accelerations) -> Array | None:
+    """Return a camera's acceleration (n,) along the travel axis; None if it looks along that
+    axis."""
+    axis = directions(problem.cameras[camera]) @ problem.axis
+    size = float(axis @ axis)
+    return np.asarray(seen.values @ axis / size) if size > 0.1 else None
+
+
+def _noise_mm(problem: SmoothingProblem) -> float | None:
+    """Return the smaller sd of the mean position of marks or bubbles in a frame."""
+    found = []
+    for observed in (problem.references, problem.observations):
+        if len(observed):
+            scale = np.mean([c["scale_px_per_mm"] for c in problem.cameras])
+            sd = np.sqrt(np.median(observed.covariance_px2[:, 0, 0])) / scale
+            each = len(observed) / (len(np.unique(observed.frame)) * len(problem.cameras))
+            found.append(float(sd / np.sqrt(max(each, 1.0))))
+    return min(found, default=None)
+
+
+def readings_on(grid: Grid, sensor: Accelerometer) -> Accelerations:
+    used = sensor if sensor.kept is None else sensor.of(sensor.kept)
+    readings = used.reading_mm_s2.copy()
+    readings[:, list(used.unused_axes)] = 0.0
+    return of_readings(grid, used.t_s, readings, sensor.t_s)
+
+
+def at_frames(images: Images, sensor: Accelerometer) -> tuple[Array, Bools]:
+    """Return a sensor's smoothed readings (n, 3) on the images' grid, and which are known (n,)."""
+    found = readings_on(images.grid, sensor)
+    if found.grid.count < 2:
+        return np.zeros((images.grid.count, 3)), np.zeros(images.grid.count, bool)
+    return found.at(images.grid.t_s)

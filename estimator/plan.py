@@ -28,6 +28,8 @@ from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.sensors.checks import Mounting
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, travel_of
+from telerig.estimator.smoothing.problem.calibration_share import calibration_share
+from telerig.estimator.smoothing.problem.marks import MARK_SIGMA_MM
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     Accelerometer,
@@ -40,7 +42,6 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
     Stage,
 )
-from telerig.estimator.smoothing.problem.tables import calibration_share
 from telerig.estimator.smoothing.result import trajectories
 from telerig.estimator.smoothing.verdict.identifiability import expected_shake, verdicts
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
@@ -61,7 +62,6 @@ _DAMPING = 0.03
 _COMMON, _ARM_RATIO = 0.75, 1.6
 _EDGE = 0.1
 _INSIDE = 0.8
-_MARK_SIGMA_MM = 30.0
 _DENSITY_UG = 25.0
 _BLUR_PX, _IMAGE_NOISE = 1.0, 0.01
 MOST_STATES = 20_000
@@ -288,7 +288,7 @@ def _marks(
                     )
                 )  # fmt: skip
                 name = f"{camera.name}{len(marks)}"
-                marks.append(Mark(name, height * axis, _MARK_SIGMA_MM))
+                marks.append(Mark(name, height * axis, MARK_SIGMA_MM))
     fields = ("item", "frame", "camera", "uv_px", "covariance_px2")
     joined = (np.concatenate([getattr(part, name) for part in parts]) for name in fields)
     return tuple(marks), Observations(*joined)

@@ -42,6 +42,8 @@ from telerig.estimator.smoothing.pieces import (
     solved_pieces,
     with_clock_numbers,
 )
+from telerig.estimator.smoothing.problem.calibration_share import calibration_share
+from telerig.estimator.smoothing.problem.marks import references_of
 from telerig.estimator.smoothing.problem.problem import (
     ARMS,
     Bubble,
@@ -50,18 +52,18 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
     check_increasing,
 )
-from telerig.estimator.smoothing.problem.tables import (
-    Tracked,
+from telerig.estimator.smoothing.problem.sensor_records import (
     accelerometers_of,
-    bubbles_of,
-    calibration_share,
-    frames_between,
     near_frames,
-    parts_of,
-    read_tracks,
-    references_of,
     stage_of,
     thinned,
+)
+from telerig.estimator.smoothing.problem.tracks import (
+    Tracked,
+    bubbles_of,
+    frames_between,
+    parts_of,
+    read_tracks,
 )
 from telerig.estimator.smoothing.problem.window import Window, all_of, cut_out
 from telerig.estimator.smoothing.refined_pose import (

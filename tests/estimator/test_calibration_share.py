@@ -20,8 +20,8 @@ from telerig.estimator.calibration.result.calibration import (
 )
 from telerig.estimator.smoothing.graph import crowd
 from telerig.estimator.smoothing.graph.solve import Options, solve
+from telerig.estimator.smoothing.problem.calibration_share import calibration_share
 from telerig.estimator.smoothing.problem.problem import SmoothingProblem
-from telerig.estimator.smoothing.problem.tables import calibration_share
 from telerig.estimator.smoothing.terminal_summary import smoothing_words
 from telerig.estimator.tracking.tracks import Tracks, load_tracks, tracking_words
 from telerig.io.results.calibration_words import NO_COVARIANCE

@@ -12,7 +12,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Observations,
     SmoothingProblem,
 )
-from telerig.estimator.smoothing.problem.tables import near_frames, stage_near
+from telerig.estimator.smoothing.problem.sensor_records import near_frames, stage_near
 
 
 @dataclass(frozen=True)

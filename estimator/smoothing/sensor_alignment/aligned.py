@@ -17,7 +17,7 @@ from telerig.estimator.sensors.alignment import Alignment
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.response import FAR_SDS
 from telerig.estimator.smoothing.problem.problem import Accelerometer, SmoothingProblem
-from telerig.estimator.smoothing.problem.tables import near_frames
+from telerig.estimator.smoothing.problem.sensor_records import near_frames
 from telerig.estimator.smoothing.sensor_alignment.clocks import (
     clock_of,
     clocks,

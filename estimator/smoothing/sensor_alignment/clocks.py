@@ -15,7 +15,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
     SmoothingProblem,
 )
-from telerig.estimator.smoothing.problem.tables import near_frames
+from telerig.estimator.smoothing.problem.sensor_records import near_frames
 from telerig.estimator.smoothing.sensor_alignment.images import (
     SLOWEST_S,
     Images,

@@ -23,7 +23,7 @@ from telerig.estimator.sensors.alignment import (
 )
 from telerig.estimator.sensors.findings import Finding
 from telerig.estimator.smoothing.problem.problem import Accelerometer, SmoothingProblem
-from telerig.estimator.smoothing.problem.tables import MARGIN_S, near_frames
+from telerig.estimator.smoothing.problem.sensor_records import MARGIN_S, near_frames
 from telerig.estimator.smoothing.sensor_alignment.clocks import SAME_CLOCK_S, aligned_by
 from telerig.estimator.smoothing.sensor_alignment.images import Images, readings_on
 

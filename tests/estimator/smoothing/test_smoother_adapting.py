@@ -31,7 +31,7 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
     Stage,
 )
-from telerig.estimator.smoothing.problem.tables import thinned
+from telerig.estimator.smoothing.problem.sensor_records import thinned
 from telerig.estimator.smoothing.smooth import problem_of, with_sensors_aligned
 from telerig.factors.state_space import (
     broad_band,

@@ -27,7 +27,8 @@ from telerig.estimator.smoothing.graph.solve import (
     solve,
 )
 from telerig.estimator.smoothing.problem.problem import CarriageModel
-from telerig.estimator.smoothing.problem.tables import read_tracks, stage_of
+from telerig.estimator.smoothing.problem.sensor_records import stage_of
+from telerig.estimator.smoothing.problem.tracks import read_tracks
 from telerig.estimator.smoothing.result import Smoothing
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.smoothing.verdict.evidence import shake_of

@@ -12,7 +12,7 @@ import pytest
 import telerig
 from telerig.command_options import SmoothingOptions
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
-from telerig.estimator.smoothing.problem import tables
+from telerig.estimator.smoothing.problem import tracks as problem_tracks
 from telerig.estimator.smoothing.results_folder import smooth_run
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions
@@ -48,7 +48,7 @@ def test_a_run_is_tracked_and_smoothed_from_disk(
     whole = done(tmp_path / "whole")
     monkeypatch.setattr(frame_table, "LARGE_BYTES", 0)
     monkeypatch.setattr(frame_table, "_BLOCK_BYTES", 20_000)
-    monkeypatch.setattr(tables, "_FRAMES_AT_ONCE", 11)
+    monkeypatch.setattr(problem_tracks, "_FRAMES_AT_ONCE", 11)
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))

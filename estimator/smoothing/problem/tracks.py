@@ -1,4 +1,4 @@
-"""Converts tables to parts of a smoothing problem: encoder, accelerometers, marks, tracks."""
+"""The tracks of a run, in memory or on disk, as a smoothing problem has them."""
 
 from __future__ import annotations
 
@@ -11,239 +11,22 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.sensors.checks import Encoder
-from telerig.estimator.sensors.findings import Finding
-from telerig.estimator.sensors.given import CARRIAGE as ON_CARRIAGE
-from telerig.estimator.sensors.given import Sensor, numbers, times
-from telerig.estimator.sensors.samples import sampling_rate
-from telerig.estimator.smoothing.problem.problem import (
-    CARRIAGE,
-    DELAY_SIGMA_S,
-    Accelerometer,
-    Bubble,
-    CalibrationShare,
-    Mark,
-    Observations,
-    Stage,
-)
+from telerig.estimator.sensors.given import numbers, times
+from telerig.estimator.smoothing.problem.problem import Bubble, Observations
 from telerig.rig.camera import Camera
-from telerig.rig.units import MICRO_G_M_S2
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from telerig.estimator.calibration.result.calibration import Calibration
-    from telerig.estimator.rig_drift.movement import Movement
-    from telerig.rig.camera import Camera
-
-
-MARGIN_S = 0.25
-_MARK_SIGMA_MM = 100.0
-_VISIBLE_PX = 2e-3
-
-
-def stage_of(encoder: Encoder | None, t_s: Array, described: Any = None) -> Stage | None:
-    """Return the encoder's readings near the frames; None without an encoder.
-
-    t_s : (F,) times of the frames.
-    described : what rig.toml states of the stage; None for nothing.
-    """
-    if encoder is None:
-        return None
-    stated = getattr(described, "delay_sigma_s", None)
-    sigma = DELAY_SIGMA_S if stated is None else float(stated)
-    return stage_near(Stage(encoder.t_s, encoder.position_mm, sigma), t_s)
-
-
-def stage_near(stage: Stage, t_s: Array) -> Stage:
-    """Return the readings near frames at t_s (F,), and one more on each side: the frames of a slow
-    encoder lie between two readings."""
-    low = int(np.searchsorted(stage.t_s, t_s[0] - MARGIN_S)) - 1
-    high = int(np.searchsorted(stage.t_s, t_s[-1] + MARGIN_S)) + 1
-    near = slice(max(low, 0), high)
-    return replace(stage, t_s=stage.t_s[near], position_mm=stage.position_mm[near])
-
-
-def accelerometers_of(
-    sensors: Sequence[Sensor], cameras: Sequence[Camera]
-) -> tuple[Accelerometer, ...]:
-    """Return the accelerometers with their complete records, converted to mm/s^2."""
-    names = [c.name for c in cameras]
-    out = []
-    for sensor in sensors:
-        assert sensor.noise_density_ug_sqrt_hz is not None, "screening estimates it"
-        rate = sampling_rate(sensor.t_s)
-        sigma = sensor.noise_density_ug_sqrt_hz * 1e3 * MICRO_G_M_S2 * np.sqrt(rate / 2)
-        camera = CARRIAGE if sensor.mounted_on == ON_CARRIAGE else names.index(sensor.mounted_on)
-        out.append(
-            Accelerometer(
-                sensor.name, camera, sensor.t_s, 1000 * sensor.reading_m_s2, sensor.axes,
-                float(sigma), 1000 * sensor.bias_sigma_m_s2, clock=sensor.clock,
-                kept=None if sensor.kept.all() else sensor.kept, unused_axes=sensor.unused_axes,
-            )
-        )  # fmt: skip
-    return tuple(out)
-
-
-def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = MARGIN_S) -> Accelerometer:
-    """Return the sensor with the samples from before the first frame to after the last one.
-
-    t_s : (F,) times of the frames.
-    margin_s : how long before and after. If there is no such sample, the result has none.
-    """
-    t = sensor.t_s - sensor.delay_s
-    return sensor.of((t >= t_s[0] - margin_s) & (t <= t_s[-1] + margin_s))
-
-
-def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelerometer, ...]:
-    """Return the sensors with samples averaged in blocks of at most ``step_s``, none across gaps.
-
-    The average over a block of length T reduces a motion of angular frequency w by (w T)^2 / 24,
-    for example by 0.6 % at 60 Hz and 1 ms.
-    """
-    return tuple(_thinned(sensor, step_s) for sensor in sensors)
-
-
-def _thinned(sensor: Accelerometer, step_s: float) -> Accelerometer:
-    """Return the sensor with block averages; blocks with an unused sample are left out."""
-    block = int(step_s / np.median(np.diff(sensor.t_s)) + 1e-6)
-    count = len(sensor.t_s) // block if block > 1 else 0
-    if count < 2:
-        return sensor
-    used = count * block
-    t = sensor.t_s[:used].reshape(count, block)
-    whole = np.ptp(t, axis=1) < 1.5 * step_s
-    if sensor.kept is not None:
-        whole &= sensor.kept[:used].reshape(count, block).all(1)
-    if whole.sum() < 2:
-        return sensor
-    reading = sensor.reading_mm_s2[:used].reshape(count, block, 3)
-    return replace(
-        sensor,
-        t_s=t.mean(1)[whole],
-        reading_mm_s2=reading.mean(1)[whole],
-        sigma_mm_s2=sensor.sigma_mm_s2 / float(np.sqrt(block)),
-        kept=None,
-    )
-
-
-def references_of(
-    table: Any, cameras: Sequence[Camera], t_s: Array, positions_mm: Array, axis: Array
-) -> tuple[tuple[Mark, ...], Observations, list[Finding]]:
-    """Return marks at their triangulated positions, their pixels, and warnings.
-
-    table : marks.csv.
-    t_s, positions_mm : (F,) times of the frames and positions of the carriage.
-    axis : (3,) travel axis in the rig frame.
-
-    Raises InputError for a table that cannot be used.
-    """
-    if table is None:
-        return (), Observations.none(), []
-    _check_references(table, cameras)
-    if not len(table):
-        return (), Observations.none(), []
-    names = [c.name for c in cameras]
-    inside = ((table["frame"] >= 0) & (table["frame"] < len(t_s))).to_numpy()
-    findings = []
-    if not inside.all():
-        words = f"{np.count_nonzero(~inside)} rows are of frames outside 0 to {len(t_s) - 1}"
-        findings.append(Finding(f"{words} and are not used", "references"))
-    table = table[inside]
-    attributions = sorted(set(table["mark"].astype(str)))
-    number = {m: i for i, m in enumerate(attributions)}
-    item = table["mark"].astype(str).map(number).to_numpy(np.int64)
-    frame = table["frame"].to_numpy(np.int64)
-    camera = table["camera"].map({n: i for i, n in enumerate(names)}).to_numpy(np.int64)
-    uv = table[["u_px", "v_px"]].to_numpy(float)
-    sigma = table["sigma_px"].to_numpy(float) if "sigma_px" in table else np.full(len(uv), 0.1)
-    observations = Observations(item, frame, camera, uv, sigma[:, None, None] ** 2 * np.eye(2))
-    guesses = _marks(observations, cameras, positions_mm, axis, len(attributions))
-    marks = (Mark(name, g, _MARK_SIGMA_MM) for name, g in zip(attributions, guesses))
-    return tuple(marks), observations, findings
-
-
-def _check_references(table: Any, cameras: Sequence[Camera]) -> None:
-    """Raise InputError for a table of marks that cannot be used."""
-    where, todo = "references", "give a table with the columns frame, camera, mark, u_px, v_px"
-    if not hasattr(table, "columns"):
-        raise InputError(f"is {type(table).__name__}, not a table", where=where, todo=todo)
-    missing = [c for c in ("frame", "camera", "mark", "u_px", "v_px") if c not in table]
-    if missing:
-        raise InputError(f"has no column {', '.join(missing)}", where=where, todo=todo)
-    names = [c.name for c in cameras]
-    unknown = sorted(set(table["camera"].astype(str)) - set(names))
-    if unknown:
-        raise InputError(
-            f"there is no camera {unknown[0]!r} in the calibration",
-            where=where,
-            todo=f"it has {', '.join(names)}",
-        )
-    for column in ("frame", "u_px", "v_px", *(["sigma_px"] if "sigma_px" in table else [])):
-        values = times(table[column], where, column)
-        bad = {"frame": values % 1 != 0, "sigma_px": values <= 0}.get(column, np.zeros(0, bool))
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise InputError(
-                f"{column} is {values[row]:g} at row {row}", where=where,
-                todo="give whole numbers of frames, and standard deviations above 0",
-            )  # fmt: skip
-
-
-def _marks(
-    seen: Observations, cameras: Sequence[Camera], positions_mm: Array, axis: Array, count: int
-) -> Array:
-    """Return the laboratory points (count, 3) nearest to all rays of each mark.
-
-    Along directions that no camera resolves they are nearest to the origin.
-    """
-    normal, right = np.tile(1e-6 * np.eye(3), (count, 1, 1)), np.zeros((count, 3))
-    for c, camera in enumerate(cameras):
-        mine = seen.camera == c
-        origin, direction = camera.unproject(seen.uv_px[mine])
-        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-        lab = origin + positions_mm[seen.frame[mine], None] * axis
-        np.add.at(normal, seen.item[mine], across)
-        np.add.at(right, seen.item[mine], np.einsum("mij,mj->mi", across, lab))
-    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
-
-
-def calibration_share(
-    calibration: Calibration, points_mm: Array, sigma_px: float, drift: Movement | None = None
-) -> CalibrationShare | None:
-    """Return the uncertainty of a calibration that affects the pixels of some points.
-
-    Directions of the covariance are left out if they move the pixels by far less than the noise of
-    a mean over the run.
-
-    points_mm : (n, 3) in the rig frame.
-    sigma_px : noise of a pixel.
-    drift : a movement of a camera since the calibration; None if none has moved.
-    """
-    from telerig.estimator.rig_drift.movement import rig_block, with_drift
-    from telerig.rig.triangulation import rig_jacobian
-
-    covariance, free = calibration.covariance, calibration.free
-    if drift is not None:
-        covariance, free = rig_block(calibration)
-        covariance = with_drift(covariance, drift)
-    if not len(points_mm) or not covariance.size:
-        return None
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.clip(values, 0, None))
-    rows = rig_jacobian(calibration.cameras, free, points_mm) @ root
-    flat = rows.reshape(-1, root.shape[1])
-    _, strength, turn = np.linalg.svd(flat, full_matrices=False)
-    visible = strength / np.sqrt(len(flat)) > min(_VISIBLE_PX, 0.02 * sigma_px)
-    if not visible.any():
-        return None
-    return CalibrationShare(root @ turn[visible].T, free, covariance, drift)
-
 
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 _LOOSE_PX = 0.5
-_SHARPEST_PX, _SOME, _FRAMES_AT_ONCE = 0.01, 200, 2000
-"""Standard deviation added to that of each centre, since tables may state next to none."""
+"""Added in quadrature where a bubble's centre of volume would need a view that is missing."""
+
+_SHARPEST_PX = 0.01
+"""Added in quadrature to the standard deviation of each centre: tables may state next to none."""
+
+_SOME, _FRAMES_AT_ONCE = 200, 2000
 
 
 def frames_between(tracks: Any, first: int, end: int) -> Any:

@@ -11,16 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Code, Finding
-from telerig.estimator.sensors.samples import LONGEST_SPIKE, prediction_residual
+from telerig.estimator.sensors.record_numbers import GAP_STEPS
+from telerig.estimator.sensors.spikes import LONGEST_SPIKE, prediction_residual
 from telerig.short_text import counted, counted_list
 from telerig.statistics import robust_sd
 
 _SIGMAS = 10.0
 _COUNTS = 4.0
 _LEAST_MM = 0.002
-_PAUSE = 5.0
-"""Steps longer than this many median steps are pauses of the record; their motion is not judged."""
-
 _RETURNS = 0.3
 _WRAP_OF_RANGE = 0.5
 _LEAST_RECORD = 6
@@ -129,14 +127,14 @@ def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]
 
     The speed of a fault lies outside the speeds of the two steps before and the two after by 10
     standard deviations of the record's own noise. A strong acceleration changes the speed only
-    once, a jump twice.
+    once, a jump twice. Motion in gaps is not judged.
     """
     t, position = np.asarray(t_s, float), np.asarray(position_mm, float)
     if len(t) < _LEAST_RECORD:
         return []
     dt, step = np.diff(t), np.diff(position)
     speed = step / dt
-    known = dt <= _PAUSE * np.median(dt)
+    known = dt <= GAP_STEPS * np.median(dt)
     excess = np.where(known, _excess_speed(speed) * dt, 0.0)
     residual = np.where(known, prediction_residual(speed) * dt, 0.0)
     least = _least_fault(step)

@@ -12,7 +12,7 @@ from telerig.arrays import Array
 from telerig.estimator.sensors.checks import Encoder
 from telerig.estimator.sensors.given import CARRIAGE as ON_CARRIAGE
 from telerig.estimator.sensors.given import Sensor
-from telerig.estimator.sensors.samples import sampling_rate
+from telerig.estimator.sensors.record_numbers import sampling_rate
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     DELAY_SIGMA_S,

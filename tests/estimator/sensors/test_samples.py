@@ -11,15 +11,10 @@ from places import REAL
 
 from telerig.estimator.sensors.encoder_checks import check_encoder
 from telerig.estimator.sensors.given import Sensor
-from telerig.estimator.sensors.samples import (
-    frozen_samples,
-    mostly_masked,
-    noise_density,
-    sampling_rate,
-    screened,
-    shifted_samples,
-    spike_samples,
-)
+from telerig.estimator.sensors.record_numbers import noise_density, sampling_rate
+from telerig.estimator.sensors.samples import mostly_masked, screened
+from telerig.estimator.sensors.spikes import shifted_samples, spike_samples
+from telerig.estimator.sensors.stopped import frozen_samples
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 RATE, DENSITY = 2000.0, 22.5

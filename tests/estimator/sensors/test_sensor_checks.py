@@ -12,7 +12,7 @@ import telerig
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.sensors.encoder_checks import check_encoder, encoder_faults
 from telerig.estimator.sensors.gravity import Gravity, fitting_axes
-from telerig.estimator.sensors.samples import clippings
+from telerig.estimator.sensors.stopped import clippings
 from telerig.io.simulation.presets import run_preset
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.accelerations import Accelerations, Grid, of_positions, of_readings
-from telerig.estimator.sensors.alignment import Channel
+from telerig.estimator.sensors.alignment import LEAST_SAMPLES, Channel
 from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, SmoothingProblem
 
@@ -44,11 +44,12 @@ class Images:
         if noise is None or pace > SLOWEST_S or np.ptp(problem.t_s) > _MOST_STEPS * pace:
             return None
 
-        def sensed_rms(grid: Grid) -> float:
-            rms = [readings_on(grid, s).values.std(0).max() for s in problem.accelerometers]
-            return float(min(rms))
+        sensors = [s for s in problem.accelerometers if len(s.t_s) >= LEAST_SAMPLES]
 
-        grid = frame_grid(problem.t_s, noise, sensed_rms if problem.accelerometers else None)
+        def sensed_rms(grid: Grid) -> float:
+            return min(float(readings_on(grid, s).values.std(0).max()) for s in sensors)
+
+        grid = frame_grid(problem.t_s, noise, sensed_rms if sensors else None)
         if grid.count < 8 * grid.knots:
             return None
         seen = (("marks", problem.references), ("bubbles", problem.observations))

@@ -99,6 +99,15 @@ def test_a_sensor_of_another_time_is_left_out() -> None:
     assert [f.where for f in said] == ["accelerometer arm_left"]
 
 
+def test_a_record_of_two_samples_leaves_the_other_sensor_aligned() -> None:
+    def short(name: str, t: Any, reading: Any) -> Any:
+        return (t[:2], reading[:2]) if name == "arm_left" else (t, reading)
+
+    sensors, said = placed(905, "one", short)
+    assert list(sensors) == ["arm_right"] and sensors["arm_right"].confirmed
+    assert ["arm_left" in f.where for f in said if "not used" in f.words] == [True]
+
+
 def test_a_sensor_slower_than_the_frames_is_told() -> None:
     _, said = placed(905, "one", every=8)
     words = [f.warning for f in said if "fewer than the 500 frames" in f.warning]

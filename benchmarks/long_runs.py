@@ -1,20 +1,26 @@
 """Do memory and time of `telerig track` and `telerig smooth` stay bounded on long runs of tables?
 
 Usage: python benchmarks/long_runs.py [--frames 10000 30000 100000] [--steps track smooth]
-       [--out FILE.md]
+       [--interrupt WORDS ...] [--out FILE.md]
 
 20 bubbles in sight at 500 Hz, tracks of 0.5 s in the mean, a shaking rig, two affine cameras: the
 table of detections is written some frames at a time, and so is one of tracks, so that both commands
-can be measured by themselves. Each runs as a process of its own. Memory: the largest resident set.
+can be measured by themselves. Each runs as a process of its own. Memory: the largest resident set,
+also so far when `telerig smooth` begins a piece. With --interrupt it gets Ctrl-C as soon as its
+progress says the words, like "along the run, piece 3 of", and is given again.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +37,13 @@ UP = np.array([0.0, -1.0, 0.0])
 _AT_ONCE = 2000
 
 COMMAND = """
-import resource, sys, runpy
+import sys, runpy
 sys.argv = ["telerig", *sys.argv[1:]]
 try:
     runpy.run_module("telerig.scripts.main", run_name="__main__")
 finally:
-    own = resource.getrusage(resource.RUSAGE_SELF)
     status = dict(line.split(":", 1) for line in open("/proc/self/status"))
-    print(f"COST {own.ru_utime + own.ru_stime:.1f} {int(status['VmHWM'].split()[0]) / 1024:.0f}")
+    print(f"PEAK {int(status['VmHWM'].split()[0]) / 1024:.0f}")
 """
 
 RIG = """schema = 1
@@ -71,7 +76,9 @@ def write_run(folder: Path, frames: int, rng: np.random.Generator) -> Path:
     run.mkdir(parents=True)
     (folder / "rig.toml").write_text(RIG, encoding="utf-8")
     (run / "run.toml").write_text(f"frame_rate_hz = {RATE_HZ}\nstart_s = 0.0\n", encoding="utf-8")
-    calibration_from_cameras(list(cameras), name="truth").save(folder / "calibration")
+    known = calibration_from_cameras(list(cameras), name="truth")
+    covariance = np.diag(np.repeat([2e-4, 2e-3], 3) ** 2)  # rad, mm
+    replace(known, covariance=covariance).save(folder / "calibration")
     shake = rig_shake(
         1 / RATE_HZ, frames, rng, cameras=2, rms_mm=[0.0, 0.2, 0.0], frequency_hz=9.0
     ).offset_mm
@@ -130,27 +137,54 @@ def _append(
         ordered.to_csv(file, mode="a", index=False, header=not file.exists(), float_format="%.5f")
 
 
-def measured(step: str, run: Path, out: Path) -> tuple[float, float, float]:
-    """Processor seconds, wall seconds, and the largest resident set in MB."""
+def measured(
+    step: str, run: Path, out: Path, interrupts: Sequence[str] = ()
+) -> tuple[float, float, float]:
+    """Processor seconds, wall seconds, and the largest resident set in MB, of all calls together.
+
+    interrupts : words in lines of progress at which the command gets Ctrl-C.
+    """
     place = run.parent.parent
     more = ["--tracks", place / "tracks.csv"] if step == "smooth" else []
-    begun = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND, step, run, "--calibration",
-         place / "calibration" / "calibration.json", "--out", out, "--no-report", *more],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    cost = [line for line in done.stdout.splitlines() if line.startswith("COST")]
-    if done.returncode or not cost:
-        sys.exit(done.stdout + done.stderr)
-    cpu, peak = cost[0].split()[1:]
-    return float(cpu), time.perf_counter() - begun, float(peak)
+    begun, before, peak = time.perf_counter(), _cpu_s(), 0.0
+    left, said = list(interrupts), list[str]()
+    while True:
+        with subprocess.Popen(
+            [sys.executable, "-c", COMMAND, step, run, "--calibration",
+             place / "calibration" / "calibration.json", "--out", out, "--no-report", *more],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        ) as process:  # fmt: skip
+            assert process.stdout is not None and process.stderr is not None
+            for line in process.stderr:
+                said.append(line)
+                if " piece" in line:
+                    status = Path(f"/proc/{process.pid}/status").read_text(encoding="utf-8")
+                    held = int(status.split("VmHWM:")[1].split()[0]) / 1024
+                    words, peak = line.strip().partition("frames: ")[2], max(peak, held)
+                    after_s = time.perf_counter() - begun
+                    print(f"{words}: {held:.0f} MB, {after_s:.0f} s", flush=True)
+                if left and left[0] in line:
+                    process.send_signal(signal.SIGINT)
+                    del left[0]
+            ends = [float(line.split()[1]) for line in process.stdout if line[:4] == "PEAK"]
+        peak = max([peak, *ends])
+        if process.returncode == 0:
+            return _cpu_s() - before, time.perf_counter() - begun, peak
+        if process.returncode != 130:
+            sys.exit("".join(said))
+
+
+def _cpu_s() -> float:
+    """Processor seconds of all commands so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, nargs="+", default=[10_000, 30_000, 100_000])
     parser.add_argument("--steps", nargs="+", default=["track", "smooth"])
+    parser.add_argument("--interrupt", nargs="*", default=[])
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     lines = ["| command | frames | CPU s | wall s | memory MB | results MB |",
@@ -161,7 +195,7 @@ def main() -> None:
             run = write_run(Path(name), frames, np.random.default_rng(1))
             for step in asked.steps:
                 out = Path(name) / f"by-{step}"
-                cpu, wall, peak = measured(step, run, out)
+                cpu, wall, peak = measured(step, run, out, asked.interrupt)
                 size = sum(file.stat().st_size for file in out.iterdir()) / 1e6
                 lines.append(
                     f"| {step} | {frames:,} | {cpu:.0f} | {wall:.0f} | {peak:.0f} | {size:.0f} |"

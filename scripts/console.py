@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 import typer
+from typer.core import TyperCommand
 
 import telerig
 from telerig import live
@@ -34,10 +35,23 @@ EXIT_CLOSED_PIPE = 141
 """The exit code of a program whose reader (`| head`) has ended: 128 + SIGPIPE."""
 
 
+class Command(TyperCommand):
+    """A command that refuses empty arguments: an empty name of a folder would mean this one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line, as the class that it extends does."""
+        for arg in args:
+            option, equals, value = arg.partition("=")
+            if not arg or (option[:2] == "--" and equals and not value):
+                where = f"{option} is empty" if option else "an argument is empty"
+                raise typer.BadParameter(f"{where}: leave it out, or write . for this folder", ctx)
+        return super().parse_args(ctx, args)
+
+
 def run_file(command: Callable[..., None]) -> None:
     """Run a command's file as a program, with its help formatted as in `telerig`."""
     app = typer.Typer(rich_markup_mode="markdown", add_completion=False)
-    app.command()(command)
+    app.command(cls=Command)(command)
     app()
 
 

@@ -10,7 +10,7 @@ import typer
 from telerig.errors import InputError
 from telerig.io.exchange.formats import CAMERA_IMPORTERS, recording_words
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, say, typed_command
+from telerig.scripts.console import Command, errors_in_words, say, typed_command
 from telerig.short_text import counted
 
 if TYPE_CHECKING:
@@ -31,13 +31,13 @@ SigmaPx = Annotated[
 ]
 
 
-@app.command(help=CAMERA_IMPORTERS["openlpt"].description)
+@app.command(cls=Command, help=CAMERA_IMPORTERS["openlpt"].description)
 @errors_in_words()
 def openlpt(files: Files, out: Out, names: Names = None, sigma_px: SigmaPx = 0.1) -> None:
     _import_cameras("openlpt", files, out, sigma_px, names=options.split_names(names))
 
 
-@app.command(help=CAMERA_IMPORTERS["opencv"].description)
+@app.command(cls=Command, help=CAMERA_IMPORTERS["opencv"].description)
 @errors_in_words()
 def opencv(
     files: Files,
@@ -56,7 +56,7 @@ def opencv(
     )
 
 
-@app.command(help=CAMERA_IMPORTERS["openptv"].description)
+@app.command(cls=Command, help=CAMERA_IMPORTERS["openptv"].description)
 @errors_in_words()
 def openptv(
     files: Files,
@@ -85,7 +85,9 @@ def openptv(
     _import_cameras("openptv", files, out, sigma_px, names=chosen, sensor=sensor)
 
 
-@app.command(help="Add the recording of an accelerometer to a run's accelerometer.csv.")
+@app.command(
+    cls=Command, help="Add the recording of an accelerometer to a run's accelerometer.csv."
+)
 @errors_in_words()
 def accelerometer(
     file: Annotated[

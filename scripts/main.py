@@ -14,7 +14,7 @@ from telerig import __version__
 from telerig.scripts.batch import batch
 from telerig.scripts.bubbles import bubbles
 from telerig.scripts.calibrate import calibrate
-from telerig.scripts.console import interruptible
+from telerig.scripts.console import Command, interruptible
 from telerig.scripts.correct import correct
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
@@ -72,7 +72,7 @@ _STEPS: dict[str, dict[str, Callable[..., None]]] = {
 """The commands by the steps of the work, as the help shows them."""
 for step, commands in _STEPS.items():
     for name, command in commands.items():
-        app.command(name, rich_help_panel=step)(command)
+        app.command(name, cls=Command, rich_help_panel=step)(command)
 app.add_typer(import_files, name="import", rich_help_panel=_RESULTS)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import os
 import platform
-import shutil
 import sys
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from telerig.errors import TelerigError
 from telerig.estimator.batch.jobs import check_run_name
 from telerig.estimator.doctor.cost import cost_words
 from telerig.io.dataset.dataset import Dataset, load_dataset
+from telerig.io.machine.room import free_bytes
 from telerig.io.recording.ports import NO_PERMISSION, found_ports
 from telerig.io.results.stale import stale
 from telerig.short_text import counted
@@ -360,7 +360,7 @@ def _rate(t_s: np.ndarray) -> str:
 
 def _disk(data: Dataset, frames: int) -> Check:
     """Check that there is enough disk space for the results of so many frames."""
-    free = shutil.disk_usage(data.path).free
+    free = free_bytes(data.path)
     wanted = max(_LEAST_FREE_GB * 1e9, frames * _RESULT_BYTES_PER_FRAME)
     words = f"{free / 1e9:.3g} GB free"
     if free < wanted:

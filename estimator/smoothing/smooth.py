@@ -87,6 +87,7 @@ from telerig.estimator.smoothing.sensor_alignment.aligned import aligned
 from telerig.estimator.smoothing.unfinished import Notes, UnfinishedPieces
 from telerig.estimator.smoothing.verdict.evidence import Evidence, Span, evidence_of
 from telerig.factors.bubble_motion import INERTIA_S, Inertia
+from telerig.io.machine.room import check_room
 from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.progress import Progress as Steps
 from telerig.progress import showing_progress
@@ -103,6 +104,9 @@ if TYPE_CHECKING:
 Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _COARSE_STEP_S = 2e-3
+_ROW_BYTES = 4000
+"""On the disk for a bubble in a frame of a run in pieces. Pieces, results.h5 and tables have 5,500
+of two cameras."""
 _MOST_ALIGNED, _MOST_PIXELS = 20_000, 500_000
 _MOST_COMPARED, _BUBBLES_COMPARED = 1500, 3
 _LEAST_LEARNED_S = 0.2
@@ -226,6 +230,11 @@ def smooth(
     else:
         keep = None if folder else TemporaryDirectory(prefix="telerig-")
         place = folder or Path(keep.name if keep else "")
+        rows = sum(map(len, problem.bubbles))
+        check_room(
+            "smooth", "smooth fewer frames (telerig track --frames)", disk=_ROW_BYTES * rows,
+            folder=place,
+        )  # fmt: skip
         with ExitStack() as stack:
             if unfinished is None:
                 own = stack.enter_context(TemporaryDirectory(prefix=".pieces-", dir=place))

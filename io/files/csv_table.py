@@ -24,6 +24,7 @@ from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import atomic_path
 from telerig.io.files.names import ADVICE, fault_of_name
 from telerig.io.files.text import LARGEST_NUMBER, read_text
+from telerig.io.machine.room import check_room
 
 _EVERY_DIGIT: dict[str, Any] = (
     {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
@@ -168,13 +169,20 @@ def read_part(
     return _sound_table(file, columns, True, content, row)
 
 
+_TABLE = 1.5
+"""Memory of a table that is read, with its text, divided by the size of its file, at least."""
+_SMALLER = "take a computer with more memory, or a table of fewer frames"
+
+
 def _sound_table(
     file: Path, columns: Sequence[Column], extra: bool,
     content: bytes | None = None, row: int = 2,
 ) -> pd.DataFrame | None:  # fmt: skip
     """Read a CSV table with pandas' fast reader; None for an unusual file, left to `_cells`."""
     try:
-        content = file.read_bytes() if content is None else content
+        if content is None:
+            check_room(str(file), _SMALLER, memory=_TABLE * file.stat().st_size)
+            content = file.read_bytes()
         header = content.split(b"\n", 1)[0].decode("utf-8-sig").rstrip("\r").split(",")
     except (OSError, UnicodeDecodeError):
         return None

@@ -327,3 +327,25 @@ def test_the_time_and_memory_of_a_run_are_estimated(data: Path) -> None:
     words = next(c.words for c in checks if "tracking takes about" in c.words)
     assert "bubbles in sight: 1;" in words and "smoothing about" in words and "MB" in words
     assert not [c for c in checks if c.what.startswith("run ") and "rise" not in c.what]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("init", ""), ("calibrate", "", "--out", "x"), ("simulate", "rise", "--out="),
+     ("batch", "a", ""), ("import", "opencv", "", "--out", "x")],
+    ids=" ".join,
+)  # fmt: skip
+def test_an_empty_name_of_a_folder_is_refused(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, list(command))
+    assert done.exit_code == 2
+    assert "is empty: leave it out" in " ".join(done.output.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_current_folder_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(app, ["init", "."]).exit_code == 0
+    assert (tmp_path / "rig.toml").is_file()

@@ -17,6 +17,7 @@ from shake_cases import SCENARIOS, generate
 from shake_learning_data import run, true_model, with_comings_and_goings
 
 import telerig
+from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.smoothing import pieces as pieces_module
 from telerig.estimator.smoothing.graph.layout import clocks_of
@@ -349,6 +350,28 @@ def test_an_interrupted_smoothing_goes_on_with_the_pieces_that_it_has(
     with pytest.raises(KeyboardInterrupt):
         smoothed("parts", "b")
     assert not going_on(), "pieces of other inputs are not used"
+
+
+def test_pieces_for_which_the_disk_has_no_room_are_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, _ = crowded(120)
+    rows = sum(map(len, problem.bubbles))
+    asked = dict[Path, float]()
+
+    def free(folder: Path) -> float:
+        return asked.setdefault(folder, 3900.0 * rows)
+
+    monkeypatch.setattr("telerig.io.machine.room.free_bytes", free)
+    calibration = calibration_from_cameras(list(problem.cameras), name="truth")
+    with pytest.raises(InputError, match="on the disk") as caught:
+        telerig.smooth(
+            tracks_of(problem), calibration, model="default", t_s=problem.t_s,
+            options=Options(frames=60), folder=tmp_path,
+        )  # fmt: skip
+    assert "fewer frames" in caught.value.todo
+    assert list(asked) == [tmp_path]
+    assert not list(tmp_path.iterdir())
 
 
 def test_pieces_of_an_interrupted_call_are_not_taken_for_those_of_other_data(

@@ -87,8 +87,7 @@ def write_netcdf(results: RunResults, path: str | PathLike[str]) -> None:
     memory, content = io.BytesIO(), variables(results)
     with netcdf_file(memory, "w", version=2) as handle:
         file: Any = handle
-        for key, value in _global_attributes(results).items():
-            setattr(file, key, value)
+        _describe(file, _global_attributes(results))
         file.createDimension("trajectory", len(content["trajectory"].values))
         file.createDimension("obs", len(results.points))
         for name, one in content.items():
@@ -171,5 +170,10 @@ def _put(
         variable = file.createVariable(name, "f8", dimensions)
         variable[:] = values.astype(float)
         notes = notes if name in ("time", "x", "y", "z") else notes | {"_FillValue": np.nan}
-    for key, value in notes.items():
-        setattr(variable, key, value)
+    _describe(variable, notes)
+
+
+def _describe(thing: Any, attributes: dict[str, Any]) -> None:
+    """Give a file or a variable its attributes; texts as UTF-8, since SciPy writes only ASCII."""
+    for key, value in attributes.items():
+        setattr(thing, key, value.encode("utf-8") if isinstance(value, str) else value)

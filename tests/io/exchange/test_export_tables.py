@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -144,10 +145,11 @@ def check_netcdf(variables: dict[str, np.ndarray], points: pd.DataFrame) -> None
 
 
 def test_netcdf_is_a_contiguous_ragged_array(folder: Path, tmp_path: Path) -> None:
-    results = read_results(folder)
+    results = replace(read_results(folder), name="früh")
     path = tmp_path / "out.nc"
     write_netcdf(results, path)
     with netcdf_file(path, mmap=False) as file:
+        assert file.title.decode("utf-8") == "Bubble trajectories of run früh"
         assert (file.Conventions, file.featureType) == (b"CF-1.8", b"trajectory")
         assert file.variables["trajectory"].cf_role == b"trajectory_id"
         assert file.variables["rowSize"].sample_dimension == b"obs"

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.errors import DetectionError, InputError
+from telerig.errors import DetectionError, InputError, need_kind
 from telerig.estimator.dots.fit.candidates import Polarity
 from telerig.estimator.dots.grid.agreement import PossibleNumbers, decided_by_pair
 from telerig.estimator.dots.grid.numbering import (
@@ -53,6 +53,7 @@ class TargetDetection:
 def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     """Find the target's dots in an image (rows, columns) of grey levels and number them.
 
+    target : as rig.toml describes it, `load_dataset(folder).rig.target`.
     Returns a table with a row for each dot and the columns dot (number), row, column, u_px, v_px,
     suu_px2, suv_px2, svv_px2, a_px, b_px, angle_rad, chi2_dof, edge_suu_px2, edge_suv_px2,
     edge_svv_px2; see `locate_dots`. For a symmetric
@@ -60,6 +61,8 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     Raises DetectionError if the target is not found or its numbers are ambiguous, and InputError if
     ``image`` is no grey image.
     """
+    todo = "give the target of a rig: telerig.load_dataset(folder).rig.target"
+    need_kind(target, "polarity", "telerig.detect_target", todo)
     measured = measure_dots(image, polarity=target.polarity)
     found = _numbered(image, measured, target)
     if found.numbering.ambiguous:

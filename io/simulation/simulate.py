@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from telerig.errors import InputError
+from telerig.errors import InputError, need_kind
 from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.files.atomic import atomic_folder
 from telerig.io.machine.room import check_room
@@ -38,6 +38,8 @@ def simulate(
     Returns the dataset. Raises InputError for an unknown preset, for conditions that no pose of the
     target fulfils, for more than the computer has room for, or for a folder that is not empty.
     """
+    todo = "give numpy.random.default_rng(seed)"
+    need_kind(rng, "bit_generator", "telerig.simulate, rng", todo)
     settings = any_preset(config) if isinstance(config, str) else config
     _check_room(settings, Path(tempfile.gettempdir() if out is None else out), images=images)
     final = _new_folder(out)

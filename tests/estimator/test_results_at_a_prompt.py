@@ -219,3 +219,10 @@ def test_images_that_cannot_be_undistorted(image: np.ndarray) -> None:
 def test_a_path_in_place_of_what_it_holds_is_named(call: Callable[[], object]) -> None:
     with pytest.raises(telerig.TelerigError, match=r"was given a str\n  -> give what telerig\."):
         call()
+
+
+def test_arguments_of_another_kind_are_named() -> None:
+    with pytest.raises(telerig.TelerigError, match=r"was given a str\n  -> .*\.rig\.target"):
+        telerig.detect_target(np.zeros((40, 40)), "rig.toml")  # type: ignore[arg-type]
+    with pytest.raises(telerig.TelerigError, match=r"was given a int\n  -> .*default_rng"):
+        telerig.simulate("paper", rng=1)  # type: ignore[arg-type]

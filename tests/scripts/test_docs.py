@@ -191,6 +191,14 @@ def test_the_page_of_python_names_has_every_public_one() -> None:
     assert shown == set(telerig.__all__) - {"__version__", "plot"}
 
 
+def test_every_public_function_is_called_on_a_page() -> None:
+    blocks = [b for page in docs_pages.pages() for b in docs_pages.blocks_of(page)]
+    code = "".join(b.code for b in blocks if b.language in ("python", docs_pages.CELL))
+    functions = [name for name in telerig.__all__ if inspect.isfunction(getattr(telerig, name))]
+    called = [n for n in functions if re.search(rf"\b(telerig\.{n}\(|import .*\b{n}\b)", code)]
+    assert set(functions) - set(called) == {"view"}, "which opens a window"
+
+
 @pytest.mark.parametrize(
     ("command", "words"),
     [("record", "[until Ctrl-C]"), ("batch", "[one per core]"), ("record", "[devices.NAME]")],

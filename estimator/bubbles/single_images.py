@@ -24,6 +24,7 @@ from telerig.estimator.bubbles.lighting import NOT_BACKLIT_WORDS
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.files.csv_table import write_table
 from telerig.io.images.read import Image, read_image
+from telerig.short_text import counted
 
 CLUSTER_COLUMNS = ("image", "cluster", "u_px", "v_px")
 _MOST_NAMED = 12
@@ -99,7 +100,7 @@ def _found(name: str, bubbles: Bubbles) -> Found:
         for number, line in enumerate(_closed(outline) for outline in clusters)
     ]
     table = pd.concat(corners) if corners else pd.DataFrame(columns=list(CLUSTER_COLUMNS))
-    words = f"{name}: {_counted(bubbles)}"
+    words = f"{name}: {_how_many(bubbles)}"
     if bubbles.reason and not len(single):
         words += f" ({bubbles.reason})"
     found = len(single) + len(clusters)
@@ -110,7 +111,7 @@ def _found(name: str, bubbles: Bubbles) -> Found:
         )
     if bubbles.bright_spots:
         words += (
-            f"; warning: {_count(bubbles.bright_spots, 'outline')} left out as {NOT_BACKLIT_WORDS}"
+            f"; warning: {counted(bubbles.bright_spots, 'outline')} left out as {NOT_BACKLIT_WORDS}"
         )
     if bubbles.field is not None:
         words += f"; {bubbles.field.mean():.0%} of the image was searched"
@@ -125,21 +126,17 @@ def _closed(outline: Array) -> Array:
     return np.round(known[first], 2)
 
 
-def _counted(bubbles: Bubbles) -> str:
+def _how_many(bubbles: Bubbles) -> str:
     """Number of bubbles and of clusters; the ellipse of a region of several counts as none."""
     single = ~bubbles.accepted["flags"].astype(str).str.contains("merged")
-    bubble = _count(int(single.sum()), "bubble")
-    return f"{bubble}, {_count(len(bubbles.clusters), 'cluster')}"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+    bubble = counted(int(single.sum()), "bubble")
+    return f"{bubble}, {counted(len(bubbles.clusters), 'cluster')}"
 
 
 def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
     import cv2
 
-    from telerig.io.report.overlays import draw_bubble_overlay
+    from telerig.io.report.overlays import draw_bubble_overlay, write_picture
 
     outlines, words, colours = [], [], []
     for _, row in bubbles.accepted.iterrows():
@@ -159,10 +156,6 @@ def _draw(image: Image, bubbles: Bubbles, path: Path) -> None:
         outlines += [np.asarray(edge[:, 0], float) for edge in edges]
         words += ["the field"] * len(edges)
         colours += [(90, 160, 250)] * len(edges)
-    found = f"{_counted(bubbles)} not resolved"
+    found = f"{_how_many(bubbles)} not resolved"
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks, found=found)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    written, encoded = cv2.imencode(path.suffix, picture[..., ::-1])
-    if not written:
-        raise InputError("the picture could not be encoded", where=str(path))
-    path.write_bytes(encoded.tobytes())
+    write_picture(picture, path)

@@ -6,7 +6,7 @@ import importlib
 import os
 import platform
 import sys
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distributions, requires, version
 from pathlib import Path
@@ -16,7 +16,9 @@ import numpy as np
 
 from telerig.errors import TelerigError
 from telerig.estimator.batch.jobs import check_run_name
-from telerig.estimator.doctor.cost import cost_words
+from telerig.estimator.bubbles.detect import COVERED_LIMIT, crowded_words, is_crowded
+from telerig.estimator.bubbles.lighting import NOT_BACKLIT_WORDS
+from telerig.estimator.doctor.cost import Sample, cost_words, samples_of
 from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.machine.room import free_bytes
 from telerig.io.recording.ports import NO_PERMISSION, found_ports
@@ -274,43 +276,30 @@ def _run(data: Dataset, name: str) -> Generator[Check, None, int]:
     yield Check(what, "ok", words)
     for note in run.notes:
         yield Check(what, "note", note)
-    cost = cost_words(run)
+    samples: Mapping[str, Sample] = {}
+    try:
+        samples = samples_of(run) if run.source == "images" else {}
+    except TelerigError as error:
+        yield failure(f"{what} images", error)
+    cost = cost_words(run, samples)
     if cost:
         yield Check(f"{what} time", "ok", cost)
-    if run.source == "images":
-        yield from _crowds(run, what)
+    yield from _crowds(samples, what)
     yield from _clocks(run, what)
     yield from _sensors(run, what)
     return run.frame_count
 
 
-def _crowds(run: RunData, what: str) -> Iterator[Check]:
-    """Warn when bubbles cover more of a frame in the middle of the run than detection can take, or
-    when it is not backlit."""
-    from telerig.estimator.bubbles.detect import (
-        COVERED_LIMIT,
-        crowded_words,
-        find_bubbles,
-        is_crowded,
-    )
-    from telerig.estimator.bubbles.lighting import NOT_BACKLIT_WORDS
-    from telerig.estimator.tracking.detect_run import described_fields
-
-    try:
-        fields = described_fields(run)
-        for camera in run.cameras:
-            image = run.image(camera, run.frame_count // 2)
-            if image is None:
-                continue
-            found = find_bubbles(image, field=fields.get(camera))
-            if is_crowded(found.covered, len(found.accepted), COVERED_LIMIT):
-                words = crowded_words(f"camera {camera}", found.covered)
-                yield Check(f"{what} bubbles", "warning", words)
-            if found.bright_spots:
-                words = f"camera {camera}: {found.bright_spots} outlines are {NOT_BACKLIT_WORDS}"
-                yield Check(f"{what} bubbles", "warning", words)
-    except TelerigError as error:
-        yield failure(f"{what} images", error)
+def _crowds(samples: Mapping[str, Sample], what: str) -> Iterator[Check]:
+    """Warn when bubbles cover more of an image than detection can take, or it is not backlit."""
+    for camera, sample in samples.items():
+        found = sample.bubbles
+        if is_crowded(found.covered, len(found.accepted), COVERED_LIMIT):
+            words = crowded_words(f"camera {camera}", found.covered)
+            yield Check(f"{what} bubbles", "warning", words)
+        if found.bright_spots:
+            words = f"camera {camera}: {found.bright_spots} outlines are {NOT_BACKLIT_WORDS}"
+            yield Check(f"{what} bubbles", "warning", words)
 
 
 def _clocks(run: RunData, what: str) -> Iterator[Check]:

@@ -260,10 +260,10 @@ def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = F
 
 
 def _with_overlay(found: ImageDots, image: NDArray[Any]) -> ImageDots:
-    from telerig.io.report.overlays import overlay_jpeg
+    from telerig.io.report.overlays import draw_overlay, encoded
 
-    drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=900)
-    return replace(found, overlay=drawn)
+    drawn = draw_overlay(image, found.dots, found.rejected, max_width_px=900)
+    return replace(found, overlay=encoded(drawn))
 
 
 def _detect_task(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> ImageDots:

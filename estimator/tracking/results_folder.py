@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import pandas as pd
 
@@ -236,7 +235,7 @@ def _drawn(tables: Iterable[pd.DataFrame], frames: Sequence[int]) -> pd.DataFram
 
 
 def _draw(run: RunData, staged: Path, task: tuple[str, int, pd.DataFrame, pd.DataFrame]) -> None:
-    from telerig.io.report.overlays import draw_bubble_overlay
+    from telerig.io.report.overlays import draw_bubble_overlay, write_picture
 
     camera, frame, found, rejected = task
     image = run.image(camera, frame)
@@ -249,12 +248,4 @@ def _draw(run: RunData, staged: Path, task: tuple[str, int, pd.DataFrame, pd.Dat
     colours = [_GREEN if n else _ORANGE for n in named]
     marks = [*rejected[[*Rejected._fields]].itertuples(index=False)]
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks)
-    _write_image(staged / "overlays" / camera / f"{frame:06d}.jpg", picture[..., ::-1])
-
-
-def _write_image(path: Path, picture: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    written, encoded = cv2.imencode(path.suffix, picture)
-    if not written:
-        raise InputError("the picture could not be encoded", where=str(path))
-    path.write_bytes(encoded.tobytes())
+    write_picture(picture, staged / "overlays" / camera / f"{frame:06d}.jpg")

@@ -82,11 +82,7 @@ class RawLog:
         try:
             self._file: BinaryIO = path.open("x+b", buffering=0)
         except FileExistsError as error:
-            raise InputError(
-                "exists, and a recording is never written over",
-                where=str(path),
-                todo="give the new run another name, or move this one away",
-            ) from error
+            raise recorded_already(path) from error
         except OSError as error:
             raise log_error(path, error, recorded=False) from error
         try:
@@ -169,6 +165,15 @@ def packed(entry: Entry) -> bytes:
     head = _HEAD.pack(entry.kind, entry.device, entry.time_ns, len(entry.data))
     crc = zlib.crc32(entry.data, zlib.crc32(head))
     return b"".join((MARKER, head, entry.data, _CRC.pack(crc)))
+
+
+def recorded_already(file: Path) -> InputError:
+    """Return the error for a file that a recording would replace."""
+    return InputError(
+        "exists, and a recording is never written over",
+        where=str(file),
+        todo="give the new run another name, or move this one away",
+    )
 
 
 def log_error(path: Path, error: OSError, *, recorded: bool = True) -> InputError:

@@ -18,6 +18,7 @@ from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.recording.judgement import GAP_INTERVALS
+from telerig.io.recording.log import recorded_already
 from telerig.io.recording.replay import (
     REGULAR_CLOCK,
     TIME_DIGITS,
@@ -127,11 +128,7 @@ def refuse_existing(folder: str | PathLike[str]) -> None:
     for name in (*_TABLES.values(), REFUSED_NAME, "recording.json"):
         file = Path(folder) / name
         if file.exists():
-            raise InputError(
-                "exists, and a recording is never written over",
-                where=str(file),
-                todo="give the new run another name, or move this one away",
-            )
+            raise recorded_already(file)
 
 
 def _measured(table: Table, records: Sequence[DeviceRecord]) -> Iterator[str]:

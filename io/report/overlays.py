@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,18 +55,8 @@ def draw_overlay(
     rejected : u_px, v_px, a_px, b_px, angle_rad, reason; red with the number of the reason, which
         the legend spells out.
 
-    Raises InputError for what is no grey image or a table without these columns.
+    Raises InputError for what is no grey image.
     """
-    for table, extra, name in (
-        (accepted, ["dot", "row", "column"], "accepted"),
-        (rejected, ["reason"], "rejected"),
-    ):
-        missing = [column for column in _ELLIPSE + extra if column not in table]
-        if missing:
-            raise InputError(
-                f"the table of {name} dots lacks {', '.join(missing)}",
-                todo=f"it needs {', '.join(_ELLIPSE + extra)}",
-            )
     labels = [str(dot) for dot in accepted["dot"]]
     if len(accepted) and accepted["dot"].max() > _LARGEST_ID:
         labels = [f"{r},{c}" for r, c in zip(accepted["row"], accepted["column"])]
@@ -77,16 +68,18 @@ def draw_overlay(
     )  # fmt: skip
 
 
-def overlay_jpeg(
-    image: NDArray[Any], accepted: pd.DataFrame, rejected: pd.DataFrame, *, max_width_px: int
-) -> bytes:
-    """Return the JPEG file that `draw_overlay` draws."""
+def encoded(picture: Picture, ending: str = ".jpg") -> bytes:
+    """Return the content of an image file of an RGB picture (h, w, 3)."""
     import cv2
 
-    picture = draw_overlay(image, accepted, rejected, max_width_px=max_width_px)
     quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    _, encoded = cv2.imencode(".jpg", picture[..., ::-1], quality)
-    return encoded.tobytes()
+    return cv2.imencode(ending, picture[..., ::-1], quality)[1].tobytes()
+
+
+def write_picture(picture: Picture, file: Path) -> None:
+    """Write an RGB picture (h, w, 3) as JPEG, and make its folder."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(encoded(picture))
 
 
 def draw_bubble_overlay(
@@ -109,15 +102,10 @@ def draw_bubble_overlay(
         legend spells out.
     found : what the outlines are; None for bubbles.
 
-    Raises InputError for what is no grey image, and for labels or colours that do not fit.
+    Raises InputError for what is no grey image.
     """
     alike = len(colours) == 3 and all(np.ndim(part) == 0 for part in colours)
     shades: list[Any] = [colours] * len(outlines) if alike else list(colours)
-    if not len(outlines) == len(labels) == len(shades):
-        raise InputError(
-            f"{len(outlines)} outlines, {len(labels)} labels and {len(shades)} colours",
-            todo="pass one label and one colour for each outline",
-        )
     finest_px = _FINEST_PX / min(1.0, max_width_px / image.shape[1])
     circles = []
     for u, v, radius, _ in rejected:
@@ -151,7 +139,7 @@ def _overlay(
     counts = Counter(reasons).most_common()
     numbers = {reason: str(i + 1) for i, (reason, _) in enumerate(counts)}
     every = [*((outline, numbers[reason], RED) for outline, reason in zip(rejected, reasons)),
-             *zip(outlines, labels, colours)]  # fmt: skip
+             *zip(outlines, labels, colours, strict=True)]  # fmt: skip
     for outline, _, colour in every:
         draw_line(picture, _scaled(outline, factor), colour, closed=True)
     taken = np.zeros(picture.shape[:2], bool)

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 
@@ -14,7 +13,7 @@ from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report import plot
 from telerig.io.report.film.views import outlines_px
-from telerig.io.report.overlays import draw_bubble_overlay
+from telerig.io.report.overlays import draw_bubble_overlay, encoded
 from telerig.io.report.page.figures import Figure, Picture, data_uri
 from telerig.io.report.page.page import Page, Row, Section, Verdict, render_page, table
 from telerig.short_text import counted
@@ -73,9 +72,8 @@ def _views(run: RunData, detections: pd.DataFrame | None) -> Iterator[Picture]:
         drawn = draw_bubble_overlay(
             image, list(outlines), [""] * len(outlines), max_width_px=_WIDTH_PX
         )
-        _, png = cv2.imencode(".png", drawn[..., ::-1])
         yield Picture(
-            f"Camera {camera}, frame {frame}", data_uri("image/png", png.tobytes()),
+            f"Camera {camera}, frame {frame}", data_uri("image/png", encoded(drawn, ".png")),
             "Outlines should follow the rims, and the backlight should be even.",
         )  # fmt: skip
 

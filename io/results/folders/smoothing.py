@@ -110,12 +110,12 @@ class SmoothingResults:
     @cached_property
     def shaped(self) -> pd.DataFrame:
         """`trajectories`, with the bubbles' sizes and shapes where bubbles.csv has them."""
-        bodies = self.bubble_frames
+        keys, table = ["frame", "particle"], self.trajectories
+        bodies = self.bubble_frames.drop_duplicates(keys)
         if not len(bodies):
-            return self.trajectories
-        keys = ["frame", "particle"]
-        new = [n for n in BODY_COLUMNS if n in bodies and (n in keys or n not in self.trajectories)]
-        return self.trajectories.merge(bodies[new], "left", on=keys, validate="1:1")
+            return table
+        new = [n for n in BODY_COLUMNS if n in bodies and (n in keys or n not in table)]
+        return table.merge(bodies[new], "left", on=keys)
 
     @cached_property
     def bubble_summary(self) -> pd.DataFrame:

@@ -147,7 +147,7 @@ def test_a_smoothed_run_has_the_shapes_of_its_bubbles_csv(tmp_path: Path) -> Non
     bodies = smooth[["frame", "particle"]].assign(
         d_eq_mm=2.0, equator_mm=1.6, polar_mm=0.8, pole_x=0.0, pole_y=-1.0, pole_z=0.0
     )
-    bodies[::-1].to_csv(folder / "bubbles.csv", index=False)
+    pd.concat([bodies[::-1], bodies[:3]]).to_csv(folder / "bubbles.csv", index=False)
     results = read_results(folder)
     write_vtk(results, tmp_path / "out")
     found = arrays(list(series(tmp_path / "out").values())[7])

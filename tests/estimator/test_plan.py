@@ -121,6 +121,16 @@ def test_impossible_experiments(wrong: dict[str, float]) -> None:
         check(replace(S2, **wrong))
 
 
+@pytest.mark.parametrize(
+    ("field", "flag"),
+    [(name, one.flags[0]) for name, one in Experiment.settings().items() if one.flags[0]],
+)
+def test_every_option_of_the_command_reaches_the_plan(tank: Path, field: str, flag: str) -> None:
+    result = CliRunner().invoke(app, ["plan", str(tank), "--quiet", f"{flag}=-1"])
+    said = "-1 bubbles in" if field == "bubbles" else f"{field} is -1"
+    assert result.exit_code == 2 and said in result.output
+
+
 def test_a_rig_that_does_not_shake(rig: RigDescription, calibration: telerig.Calibration) -> None:
     """Two bubbles alone would not show that it stands still."""
     for bubbles, verdict in ((2, "UNRESOLVED"), (3, "RESOLVED")):

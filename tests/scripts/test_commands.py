@@ -248,6 +248,7 @@ def test_only_telerigs_own_command_line_is_taken(monkeypatch: pytest.MonkeyPatch
         (["simulate", "paper", "--out", "new", "--seconds", "5"], "is for --devices"),
         (["simulate", "paper", "--out", "new", "--seed", "-1"], "--seed"),
         (["simulate", "rise", "--out", "new", "--encoder-scale", "nan"], "encoder_scale is nan"),
+        (["simulate", "rise", "--out", "new", "--accelerometers", "left,roof"], "'roof' cannot"),
         (["export", "TANK", "--to", "csv"], "there is no such format"),
         (["calibrate", "TANK", "--out", "TANK/rig.toml"], "is a file"),
         (["track", "TANK"], "is not the folder of a run"),

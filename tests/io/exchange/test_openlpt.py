@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,9 @@ import pytest
 from finding_codes import codes
 from numpy.typing import NDArray
 from places import REAL
+from typer.testing import CliRunner
 
+import telerig
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.batch.work import load_with
 from telerig.estimator.calibration.result.calibration import (
@@ -20,6 +23,8 @@ from telerig.estimator.calibration.result.calibration import (
     load_calibration,
 )
 from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
+from telerig.io.results.manifest import read_manifest
+from telerig.scripts.main import app
 
 Array = NDArray[np.float64]
 
@@ -115,6 +120,21 @@ def test_one_camera_alone(tmp_path: Path) -> None:
     assert camera.name == "top" and camera.image_size_px == (1280, 800)
     assert camera["kappa_per_mm"] == pytest.approx(1 / 500, rel=1e-3)
     assert rig_from_world.apply(np.zeros((1, 3)))[0, 2] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_command_gives_names_and_keeps_how_to_make_the_folder_again(tmp_path: Path) -> None:
+    paths, _ = write_pair(tmp_path)
+    out = tmp_path / "imported"
+    words = ["openlpt", *map(str, paths), "--out", str(out)]
+    done = CliRunner().invoke(app, ["import", *words, "--names", "top, side"])
+    assert done.exit_code == 0, done.output
+    assert [c.name for c in telerig.load_calibration(out).cameras] == ["top", "side"]
+    assert "[cameras.side]" in (out / "nominal.toml").read_text()
+    made = read_manifest(out)
+    assert made is not None
+    assert made.sections["calibrate"].again == shlex.join(["telerig", "import", *words])
+    few = CliRunner().invoke(app, ["import", *words, "--names", "top"])
+    assert few.exit_code == 2 and "give 2 names" in few.output
 
 
 def test_a_rotation_with_shear_is_kept_to_the_last_digit(tmp_path: Path) -> None:

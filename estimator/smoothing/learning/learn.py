@@ -24,18 +24,11 @@ from telerig.estimator.smoothing.learning.likelihood import (
     laplace_covariance,
     maximise,
 )
-from telerig.estimator.smoothing.learning.lines_of_sight import (
-    Signal,
-    averaged,
-    averaging_factor,
-    averaging_loss,
-    pooled,
-)
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled
 from telerig.estimator.smoothing.learning.parameters import (
     FORCE,
     names_of,
     prior_of,
-    value_of,
     with_values,
 )
 from telerig.estimator.smoothing.learning.window import learning_signals
@@ -53,8 +46,6 @@ _STARTS_HZ = ((9.0, 20.0), (20.0, 9.0), (40.0, 40.0))
 """Frequencies of the common mode and of the arms' modes at the starts."""
 _START_DAMPING, _START_RMS_MM, _START_FORCE_HZ = 0.15, 0.1, 60.0
 """Of the modes at the starts: so much damping that the optimiser finds lines that are far away."""
-_HIGHEST_HZ = 50.0
-"""Frames are averaged as far as a line of this frequency bears it."""
 _FEW_STEPS = 12
 _FALSE_LINE, _PARAMETERS = 1e-3, 3
 """Of runs, the share in which a further mode of so many parameters is added for nothing."""
@@ -85,20 +76,17 @@ def learn(
     if max((int(s.moving.sum()) for s in signals), default=0) < FEWEST_BUBBLES:
         return start
     keep_freed_memory()
-    model, learned = replace(start, modes=()), dict[str, float]()
-    groups = groups_of(signals)
-    for index, group in enumerate(groups):
-        if progress is not None:
-            where = "across" if index else "the shared axis"
-            progress(where, index / len(groups))
-        if index:
-            model, free, medians = _repeated(model, group)
-            model, sigma = _learn_group(group, [model], free, medians)
-        else:
-            models = [_with_modes(model, group, *each) for each in _STARTS_HZ]
-            free = free_names(models[0], group)
-            model, sigma = _learn_group(group, models, free, {})
-        learned |= sigma
+    tell = progress or (lambda _what, _share: None)
+    along, *across = groups_of(signals)
+    tell("the shared axis", 0.0)
+    model = _best_of_starts(replace(start, modes=()), along).model
+    model, learned = _with_deviations(model, along, free_names(model, along), {})
+    for group in across:
+        tell("across", 0.5)
+        model, names, medians = _repeated(model, group)
+        model = maximise(group.fast, model, names).model
+        model, found = _with_deviations(model, group, names, medians)
+        learned |= found
     return replace(model, name="learned", learned=learned)
 
 
@@ -115,34 +103,34 @@ def _with_modes(model: ShakeModel, group: Group, common_hz: float, arm_hz: float
     return replace(model, modes=(*model.modes, *modes))
 
 
-def _learn_group(
-    group: Group, models: Sequence[ShakeModel], names: list[str], medians: dict[str, float]
-) -> tuple[ShakeModel, dict[str, float]]:
-    """Return the most probable model, and {hyper-parameter: standard deviation of its logarithm}.
+def _best_of_starts(model: ShakeModel, group: Group) -> Fit:
+    """Return the most probable fit of the modes of all possible owners.
 
-    models : starts.  names : of what is learned.
+    model : without modes.
+    """
+    starts = [_with_modes(model, group, *each) for each in _STARTS_HZ]
+    names = free_names(starts[0], group)
+    fits = [maximise(group.fast, one, names, steps=_FEW_STEPS) for one in starts]
+    fit = maximise(group.fast, max(fits, key=lambda fit: fit.log_posterior).model, names)
+    others = [maximise(group.fast, one, names) for one in overlooked(fit.model, group)]
+    return _with_shared_line(group, max((fit, *others), key=lambda fit: fit.log_posterior))
+
+
+def _with_deviations(
+    model: ShakeModel, group: Group, names: Sequence[str], medians: dict[str, float]
+) -> tuple[ShakeModel, dict[str, float]]:
+    """Return the model with likely RMS where the data hardly determine them, and {hyper-parameter:
+    standard deviation of its logarithm}.
+
+    names : of what was learned.
     medians : {name of a mode's RMS: its prior median}, where it is not that of `prior_of`.
     """
-    t_s = group.signals[0].t_s
-    factor = averaging_factor(t_s, _HIGHEST_HZ)
-    coarse = replace(group, signals=tuple(averaged(c, factor) for c in group.signals))
-    starts = [_averaged_rms(model, factor, t_s) for model in models]
-    model = starts[0]
-    if len(starts) > 1:
-        fits = [maximise(coarse.fast, m, names, steps=_FEW_STEPS) for m in starts]
-        model = max(fits, key=lambda fit: fit.log_posterior).model
-    fit = maximise(coarse.fast, model, names)
-    if len(starts) > 1:
-        others = [maximise(coarse.fast, m, names) for m in overlooked(fit.model, coarse)]
-        fit = _with_shared_line(coarse, max((fit, *others), key=lambda fit: fit.log_posterior))
-        names = free_names(fit.model, coarse)
-    sigma = np.sqrt(np.diag(laplace_covariance(coarse.fast, fit.model, names)))
+    sigma = np.sqrt(np.diag(laplace_covariance(group.fast, model, names)))
     found = dict(zip(names, sigma.tolist()))
     medians = {n: prior_of(n).median for n in names if fnmatch(n, "modes.*.rms_mm")} | medians
-    vague = [n for n in medians if found.get(n, 0.0) > _VAGUE_LOG_SIGMA]
-    likely = [posterior_rms(coarse.fast, fit.model, n, medians[n]) for n in vague]
-    model = with_values(fit.model, vague, likely)
-    return _averaged_rms(model, factor, t_s, back=True), found
+    vague = [n for n in medians if found[n] > _VAGUE_LOG_SIGMA]
+    likely = [posterior_rms(group.fast, model, n, medians[n]) for n in vague]
+    return with_values(model, vague, likely), found
 
 
 def _with_shared_line(group: Group, fit: Fit) -> Fit:
@@ -224,18 +212,6 @@ def posterior_rms(signals: Sequence[Signal], model: ShakeModel, name: str, media
     found -= 0.5 * (_LOG_RATIOS / _ACROSS_LOG_SIGMA) ** 2
     weight = np.exp(found - found.max())
     return float(np.sqrt(weight @ values**2 / weight.sum()))
-
-
-def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = False) -> ShakeModel:
-    """Return the model with the RMS of lines as they are after averaging over frames, or back."""
-    if factor < 2:
-        return model
-    lines = [n for n in names_of(model) if n.endswith("rms_mm")]
-    values = []
-    for n in lines:
-        fade = averaging_loss(value_of(model, n.replace("rms_mm", "frequency_hz")), factor, t_s)
-        values.append(value_of(model, n) * (1 / fade if back else fade))
-    return with_values(model, lines, values)
 
 
 @dataclass(frozen=True)

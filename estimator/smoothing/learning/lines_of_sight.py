@@ -25,8 +25,6 @@ _PARALLEL = 0.02
 _ACROSS = 0.2
 PRESENT = 0.75
 """Share of the frames in which bubbles have to be seen to be pooled."""
-_SMEAR_RAD, _MOST_SMEAR_RAD = 0.35, 0.7
-_ENOUGH = 500
 
 
 @dataclass(frozen=True)
@@ -252,39 +250,3 @@ def _bridged(t_s: Array, value: Array, weight: Array) -> tuple[Array, Array]:
         good = weight[:, column] > 0
         out[:, column] = np.interp(t_s, t_s[good], value[good, column])
     return out, np.broadcast_to(weight.mean(0), weight.shape)
-
-
-def averaged(signal: Signal, factor: int) -> Signal:
-    """Return the signal averaged over blocks of ``factor`` frames."""
-    if factor < 2 or len(signal.t_s) < 8 * factor:
-        return signal
-    count = len(signal.t_s) // factor
-    weight = signal.weight[: count * factor].reshape(count, factor, -1)
-    given = signal.value_mm[: count * factor]
-    total = weight.sum(1)
-    share = weight / np.where(total > 0, total, 1.0)[:, None]
-    value = given.reshape(count, factor, weight.shape[-1], -1)
-    mean = np.einsum("cfp,cfpr->cpr", share, value).reshape(count, *given.shape[1:])
-    t = signal.t_s[: count * factor].reshape(count, factor).mean(1)
-    # only whole blocks stand for the time of their middle
-    whole = (weight > 0).all(1)
-    first = np.minimum(signal.first // factor, count - 1)
-    return replace(signal, t_s=t, value_mm=mean, weight=np.where(whole, total, 0.0), first=first)
-
-
-def averaging_factor(t_s: Array, highest_hz: float) -> int:
-    """Return the largest number of frames over which a signal may be averaged in blocks.
-
-    The amplitude of a spectral line at ``highest_hz`` then falls by at most 2 %, or by at most 8 %
-    if more than 500 blocks are left.
-    """
-    step = float(np.median(np.diff(t_s)))
-    little, more = (int(s / (np.pi * highest_hz * step)) for s in (_SMEAR_RAD, _MOST_SMEAR_RAD))
-    return max(1, little, min(more, len(t_s) // _ENOUGH))
-
-
-def averaging_loss(frequency_hz: float, factor: int, t_s: Array) -> float:
-    """Return the amplitude ratio of a line after averaging over ``factor`` frames."""
-    step = float(np.median(np.diff(t_s)))
-    fine = np.sinc(frequency_hz * step)
-    return float(np.sinc(frequency_hz * step * factor) / fine)

@@ -28,9 +28,6 @@ from telerig.estimator.smoothing.learning.likelihood import (
     with_hyperparameter_uncertainty,
 )
 from telerig.estimator.smoothing.learning.lines_of_sight import (
-    averaged,
-    averaging_factor,
-    averaging_loss,
     pooled,
     sight_directions,
     signals_of,
@@ -111,21 +108,6 @@ def test_density_integrates_to_the_variance() -> None:
     f = np.arange(0.01, 1000, 0.02)
     for part in (oscillator(0.3, 8, 0.05), driven_mode(0.3, 8, 0.05), broad_band(0.3)):
         assert part.density(f).sum() * 0.02 == pytest.approx(0.09, rel=0.01)
-
-
-def test_coarser_means_fade_a_line_as_said() -> None:
-    problem, _, _ = run(np.random.default_rng(2), still=True, shake_mm=0.0, sigma_px=1e-6)
-    signal = signals_of(problem)[0]
-    wave = np.sin(2 * np.pi * 12 * signal.t_s)
-    signal = replace(signal, value_mm=np.repeat(wave[:, None], 2, 1))
-    factor = 2
-    mean = averaged(signal, factor).value_mm[:, 0]
-    assert (averaging_factor(signal.t_s, 12.0), averaging_factor(signal.t_s, 2.0)) == (1, 11)
-    exact = averaging_loss(12.0, factor, signal.t_s)
-    np.testing.assert_allclose(
-        mean, exact * np.sin(2 * np.pi * 12 * averaged(signal, factor).t_s), atol=1e-6
-    )
-    assert exact == pytest.approx(np.cos(np.pi * 12 / 200), rel=1e-6)
 
 
 def test_parameters_by_name() -> None:

@@ -13,6 +13,7 @@ from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.accelerations import Accelerations
 from telerig.estimator.smoothing.graph.layout import points_in_rig, variances
+from telerig.estimator.smoothing.graph.linear import MARKS
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     carriage,
@@ -23,7 +24,7 @@ from telerig.estimator.smoothing.graph.stage_travel import (
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.results_file import StoredTables, Tables
-from telerig.estimator.smoothing.verdict.evidence import BUBBLES, MARKS, Evidence, Pixels, Span
+from telerig.estimator.smoothing.verdict.evidence import BUBBLES, Evidence, Pixels, Span
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra
 from telerig.factors.bubble_motion import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity

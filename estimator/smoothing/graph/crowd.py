@@ -105,7 +105,7 @@ class EliminatedCrowd:
         rig, with the keys of ``mean``, and to the bubbles, with rows of ``chains`` in place of
         keys.
     starts : first column of each key of ``mean``, and of each row.
-    steps : number of conjugate-gradient steps that were needed.
+    vector : (D,) the solution of all variables, in the order of their keys.
     """
 
     graph: GraphLayout
@@ -117,7 +117,6 @@ class EliminatedCrowd:
     images_by_bubble: list[LinearFactors]
     starts: tuple[Ints, Ints]
     vector: Array
-    steps: int = 0
 
     def log_det(self) -> float:
         """Return the logarithm of the determinant of the square root of the information.
@@ -126,36 +125,32 @@ class EliminatedCrowd:
         """
         return self.chains.log_det + self.mean.log_det() - self.mean_chains.log_det
 
-    def solved(self, side: Array) -> Array:
-        """Return the solutions (D, N) of the normal equations for right sides (D, N)."""
-        return self.solved_in_steps(side)[0]
-
     def columns(self, at: Ints) -> Array:
         """Return columns (D, n) of the covariance at variables of the rig; each as good as the
         variance on its diagonal, which may be far smaller than `_LEFT`."""
-        return self.solved_in_steps(units(at, self.graph.columns().clocks.stop), relative=True)[0]
+        return self.solved(units(at, self.graph.columns().clocks.stop), relative=True)
 
-    def solved_in_steps(self, side: Array, *, relative: bool = False) -> tuple[Array, int]:
-        """Return what `solved` returns, and the number of conjugate-gradient steps.
+    def solved(self, side: Array, *, relative: bool = False) -> Array:
+        """Return the solutions (D, N) of the normal equations for right sides (D, N).
 
         relative : whether `_LEFT` is a share of the squared length that each solution has.
         """
         rig, rows, means = self._split(side)
         bubbles = self._bubbles(rows.copy(), means.copy())
-        found, steps = self._by_gradients(rig - self._pull(bubbles[0]), relative)
+        found = self._by_gradients(rig - self._pull(bubbles[0]), relative)
         pushed = self._push(found)
         rows, means = self._bubbles(rows - pushed, means)
-        return self._joined(found, rows, means), steps
+        return self._joined(found, rows, means)
 
-    def _by_gradients(self, side: Array, relative: bool) -> tuple[Array, int]:
+    def _by_gradients(self, side: Array, relative: bool) -> Array:
         """Solve the Schur complement for sides (R, N), all columns together."""
         found, rest = np.zeros_like(side), side.copy()
         way = ahead = self._preconditioned(rest)
         height = (rest * ahead).sum(0)
         enough = _LEFT * height if relative else np.maximum(_LEFT, _ROUNDING * height)
-        for step in range(_MOST_STEPS):
+        for _ in range(_MOST_STEPS):
             if (height <= enough).all():
-                return found, step
+                return found
             image = self._schur(way)
             length = height / np.where(height > 0, (way * image).sum(0), 1.0)
             found += length * way
@@ -292,16 +287,16 @@ def eliminate_crowd(
         (starts_of(mean), graph.bubble.size * np.arange(graph.rows + 1)), np.zeros(0),
     )  # fmt: skip
     starts, rest = starts_of(graph), [f.rhs[..., None] for f in factors]
-    total, steps = np.zeros((int(starts[-1]), 1)), 0
+    total = np.zeros((int(starts[-1]), 1))
     for _ in range(_MOST_REFINEMENTS):
         side = transposed_product(factors, starts, rest)
-        found, more = out.solved_in_steps(side)
-        total, steps = total + found, steps + more
+        found = out.solved(side)
+        total += found
         if float((side * found).sum()) < _LEFT:
             break
         fitted = product(factors, starts, total)
         rest = [linear.rhs[..., None] - one for linear, one in zip(factors, fitted)]
-    return replace(out, vector=total[:, 0], steps=steps)
+    return replace(out, vector=total[:, 0])
 
 
 def _mean_row(mean: GraphLayout) -> Ints:

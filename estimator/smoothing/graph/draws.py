@@ -43,13 +43,11 @@ class Draws:
     marks: Array
     encoder: Array
 
-    def of_family(self, graph: GraphLayout, family: int) -> Array:
-        """Return the errors (n, d, K) of the n keys of one family, each of d numbers, in K draws.
-
-        family : its index in `graph.counts()`.
-        """
-        mine = self.errors[graph.columns()[family]]
-        return mine.reshape(*graph.counts()[family], mine.shape[1])
+    def of_family(self, graph: GraphLayout, family: str) -> Array:
+        """Return the errors (n, d, K) of the n keys of one of `Families`, each of d numbers, in K
+        draws."""
+        mine = self.errors[getattr(graph.columns(), family)]
+        return np.asarray(mine.reshape(*getattr(graph.counts(), family), mine.shape[1]))
 
 
 def draws_of(

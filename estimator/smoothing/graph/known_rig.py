@@ -86,7 +86,7 @@ def way_variances(
     by_state = rows.mT @ by_place
     own = np.add.reduceat((by_state * _solved(chains, by_state)).sum(1), first)
     pushed = np.zeros((graph.rows, graph.bubble.size, draws.errors.shape[-1]))
-    shake, constants = draws.of_family(graph, 0), draws.of_family(graph, 4)[0]
+    shake, constants = draws.of_family(graph, "shake"), draws.of_family(graph, "constants")[0]
     for linear in (f for f in factors if f.kind == PIXELS):
         by_rig = linear.blocks[1] @ shake[np.asarray(linear.keys[1])]
         by_rig += linear.blocks[2] @ constants

@@ -57,8 +57,8 @@ class ShakeLayout:
 
     components : independent processes, whose states stand one after the other.
     labels : their names.
-    position, velocity, acceleration, jerk : (D,) rows that give the motion of the carriage along
-        the travel axis from the states.
+    position, acceleration, jerk : (D,) rows that give the motion of the carriage along the travel
+        axis from the states.
     offset, offset_velocity, offset_acceleration, offset_jerk : (C + 1, 3, D) rows that give the
         offset of each of the C cameras in rig axes, and its derivatives; the last one is that of
         the carriage itself, which all cameras share and a sensor on the carriage measures.
@@ -69,7 +69,6 @@ class ShakeLayout:
     components: tuple[Component, ...]
     labels: tuple[str, ...]
     position: Array
-    velocity: Array
     acceleration: Array
     jerk: Array
     offset: Array
@@ -173,7 +172,7 @@ def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
         at += c.size
     return ShakeLayout(
         tuple(parts), tuple(p.label for p in placed),
-        carriage[0], carriage[1], carriage[2], carriage[3],
+        carriage[0], carriage[2], carriage[3],
         offset[0], offset[1], offset[2], offset[3],
         tuple(seen_directions(c) for c in problem.cameras), _unseen(problem.cameras, model),
     )  # fmt: skip

@@ -381,7 +381,7 @@ def _finish(
     evidence += len(last.done.vector) / 2 * np.log(2 * np.pi)
     evidence -= last.done.log_det()
     draws = draws_of(graph, last.factors, last.done) if options.draws else None
-    constants = _joint_covariance(graph, last.done, (3, 4, 5, 6)) if options.constants else None
+    constants = _joint_covariance(last.done, graph.columns()[3:]) if options.constants else None
     ways = shared = None
     if draws is not None and graph.rows and graph.model.bubble.inertia is not None:
         if isinstance(last.done, EliminatedCrowd):
@@ -390,7 +390,7 @@ def _finish(
             chains = bubble_chains(graph, last.factors)
         ways = way_variances(graph, state, last.factors, chains, draws)
     if isinstance(last.done, EliminatedCrowd) and options.covariances and graph.share_size:
-        shared = _joint_covariance(graph, last.done, (4,))
+        shared = _joint_covariance(last.done, [graph.columns().constants])
     by_scale = None
     if options.covariances and graph.encoder_size and graph.rows:
         by_scale = _scale_variances(graph, last.done)
@@ -413,13 +413,10 @@ def _finish(
     )  # fmt: skip
 
 
-def _joint_covariance(
-    graph: GraphLayout, done: EliminatedGraph | EliminatedCrowd, families: Sequence[int]
-) -> Array:
+def _joint_covariance(done: EliminatedGraph | EliminatedCrowd, columns: Sequence[slice]) -> Array:
     """Return the joint covariance of some families of variables, such as what does not change along
-    a run."""
-    columns = graph.columns()
-    rows = np.r_[tuple(columns[i] for i in families)]
+    a run.  columns : the place of each in the vector of all variables."""
+    rows = np.r_[tuple(columns)]
     out = np.zeros((len(rows), len(rows)))
     for first in range(0, len(rows), _COLUMNS_AT_ONCE):
         mine = np.arange(first, min(first + _COLUMNS_AT_ONCE, len(rows)))

@@ -105,15 +105,13 @@ _DIFFERENCE = 1e-4
 
 @dataclass(frozen=True)
 class SignalPosterior:
-    """Log evidence and posterior means for one line-of-sight signal.
+    """Posterior means for one line-of-sight signal.
 
-    log_evidence : natural logarithm.
     position_mm, velocity_mm_s : (B, F) of the B moving items along the signal's direction;
         positions are relative to the item's start. R replicates of an item are consecutive rows.
     offset_mm : (J, F) shake of the J cameras.
     """
 
-    log_evidence: float
     position_mm: Array
     velocity_mm_s: Array
     offset_mm: Array
@@ -146,7 +144,7 @@ def signal_evidence(signal: Signal, model: ShakeModel) -> float:
 
 
 def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
-    """Return the log marginal likelihood of a signal, and posterior means."""
+    """Return the posterior means of a signal."""
     return Factor(signal, model).posterior()
 
 
@@ -267,7 +265,7 @@ class Factor:
         return sides, constants
 
     def posterior(self) -> SignalPosterior:
-        """Return the states and constants that the signal gives, with their covariances."""
+        """Return the positions, velocities and offsets that the signal gives."""
         system, signal, count = self.system, self.signal, self.count
         states = self.chain.moments(self.spread()[0][:, :count])[0]
         states = states @ np.swapaxes(self.bases, -1, -2)[self.which]
@@ -280,7 +278,7 @@ class Factor:
         )
         found = position + speed * since, velocity + speed, offset
         frames = len(signal.t_s)
-        return SignalPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
+        return SignalPosterior(*(a.reshape(-1, frames) for a in found))
 
 
 def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:

@@ -41,12 +41,11 @@ _FARTHEST = 0.5
 class Fit:
     """A fitted model.
 
-    log_evidence : log density of the data under the model.
-    log_posterior : the same plus the log prior density of the fitted hyper-parameters.
+    log_posterior : log density of the data under the model, plus the log prior density of the
+        fitted hyper-parameters.
     """
 
     model: ShakeModel
-    log_evidence: float
     log_posterior: float
 
 
@@ -95,8 +94,7 @@ def maximise(
     from scipy.optimize import minimize
 
     if not names:
-        found = evidence(signals, model)
-        return Fit(model, found, found)
+        return Fit(model, evidence(signals, model))
     priors = [prior_of(n) for n in names]
     scale = np.array([p.step for p in priors])
     bounds = [(float(np.log(p.low) / s), float(np.log(p.high) / s)) for p, s in zip(priors, scale)]
@@ -118,8 +116,7 @@ def maximise(
         cost, np.clip(start, low + 1e-6, high - 1e-6), jac=True, method="L-BFGS-B",
         bounds=bounds, options=options,
     )  # fmt: skip
-    best, top = at(result.x), -float(result.fun)
-    return Fit(best, top - log_prior(best, names), top)
+    return Fit(at(result.x), -float(result.fun))
 
 
 def laplace_covariance(signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]) -> Array:

@@ -78,7 +78,10 @@ def learned_inertia(solution: Solution) -> Inertia | None:
     pieces = _pieces(graph)
     if not pieces:
         return graph.model.bubble.inertia
-    rig = draws.of_family(graph, 0)[..., :_DRAWS], draws.of_family(graph, 4)[0, :, :_DRAWS]
+    rig = (
+        draws.of_family(graph, "shake")[..., :_DRAWS],
+        draws.of_family(graph, "constants")[0, :, :_DRAWS],
+    )
     place, information = _positions(solution, rig, np.concatenate(pieces))
     t_s, up, bubble = graph.problem.t_s[graph.frame_of_row], graph.problem.up, graph.model.bubble
     dt_s, step = distinct_steps(np.concatenate([np.diff(t_s[p]) for p in pieces]))

@@ -22,11 +22,12 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.layout import variances
+from telerig.estimator.smoothing.graph.linear import ENCODER, MARKS
 from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
-from telerig.estimator.smoothing.verdict.evidence import BUBBLES, ENCODER, MARKS, Evidence, Tally
+from telerig.estimator.smoothing.verdict.evidence import BUBBLES, Evidence, Tally
 from telerig.io.results.smoothing import Contradiction, Disagreement
 from telerig.io.tables.smoothing import AXES
 

@@ -16,14 +16,14 @@ import numpy as np
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.layout import variances
-from telerig.estimator.smoothing.graph.linear import encoder, white_noise
+from telerig.estimator.smoothing.graph.linear import ENCODER, MARKS, encoder, white_noise
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.verdict.shared import Shared, shared_motion
 from telerig.estimator.smoothing.verdict.whiteness import Lagged, lagged
 from telerig.io.tables.smoothing import AXES
 
-BUBBLES, MARKS, ENCODER = "bubbles", "marks", "encoder"
+BUBBLES = "bubbles"
 _STILL = 1e-12
 _WINDOW_S, _LEAST_FRAMES = 0.1, 10
 EDGE = 0.1

@@ -49,7 +49,7 @@ def uses(
     if not len(chosen):
         return []
     widen = np.asarray(inflation)
-    errors, place, speed = draws.of_family(graph, 1), *considered_variance(solution)
+    errors, place, speed = draws.of_family(graph, "bubbles"), *considered_variance(solution)
     whole = solution.velocity_variances() + speed
     shared = offset_sigma(solution)
     paths = [_Path(solution, errors, (place, speed, whole, shared), int(b), widen) for b in chosen]

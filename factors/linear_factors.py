@@ -16,6 +16,10 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 
+AT_ONCE = 4096
+"""Number of factors, or of states, that are worked on together: what is between stays in the cache
+and takes little memory."""
+
 
 @dataclass(frozen=True)
 class LinearFactors:
@@ -96,10 +100,6 @@ def add_linear_factors(
         push_back(factor(*parts, noise))
 
 
-_AT_ONCE = 8192
-"""Number of factors that are multiplied at once; intermediate results then stay in the cache."""
-
-
 def product(factors: Sequence[LinearFactors], starts: Ints, values: Array) -> list[Array]:
     """Return the product A x of the factors' Jacobians and K vectors.
 
@@ -147,7 +147,7 @@ def _places(linear: LinearFactors, starts: Ints) -> Iterator[tuple[slice, Ints, 
         if not count or not block.shape[-1]:
             continue
         first = starts[np.broadcast_to(np.asarray(key, np.int64), (count,))]
-        for begin in range(0, count, _AT_ONCE):
-            mine = slice(begin, min(begin + _AT_ONCE, count))
+        for begin in range(0, count, AT_ONCE):
+            mine = slice(begin, min(begin + AT_ONCE, count))
             part = block[mine] if len(block) == count and block.ndim == 3 else block
             yield mine, first[mine, None] + np.arange(block.shape[-1]), part

@@ -44,7 +44,7 @@ from telerig.estimator.smoothing.graph.linear import (
     bubble_priors,
 )
 from telerig.estimator.smoothing.problem.problem import Bubble, Observations
-from telerig.factors.linear_factors import LinearFactors, product, transposed_product
+from telerig.factors.linear_factors import AT_ONCE, LinearFactors, product, transposed_product
 from telerig.io.machine.parallel import give_back_freed_memory
 from telerig.rig.triangulation import point_shift_jacobian
 
@@ -58,7 +58,6 @@ _ROUNDING = 1e-16
 refinements start again from a residual that is worked out anew."""
 _MOST_STEPS = 60
 _MOST_REFINEMENTS = 8
-_AT_ONCE = 8192
 
 
 def eliminated(
@@ -235,8 +234,8 @@ class EliminatedCrowd:
         row = _mean_row(mean)[graph.frame_of_row]
         added = found[1] - chain.covariances(chain.places.place_of_row)
         own = self.chains.covariances(self.chains.places.place_of_row)
-        for first in range(0, graph.rows, _AT_ONCE):
-            mine = np.arange(first, min(first + _AT_ONCE, graph.rows))
+        for first in range(0, graph.rows, AT_ONCE):
+            mine = np.arange(first, min(first + AT_ONCE, graph.rows))
             own[mine] += _turned(added[row[mine]], _turn(mean, row[mine], graph, mine))
         segment = mean.bubble_of_row[row[graph.first_row[:-1]]]
         order = self.chains.places.order
@@ -262,8 +261,8 @@ def add_own_calibration(
     places, cameras = points_in_rig(graph, state), graph.problem.cameras
     equal = np.eye(2 * len(cameras))
     moved = np.empty((graph.rows, 3, len(calibration)))
-    for first in range(0, graph.rows, _AT_ONCE):
-        mine = slice(first, first + _AT_ONCE)
+    for first in range(0, graph.rows, AT_ONCE):
+        mine = slice(first, first + AT_ONCE)
         moved[mine] = point_shift_jacobian(cameras, share.free, places[mine], equal) @ share.root
     mean = np.zeros((len(graph.problem.t_s), *moved.shape[1:]))
     np.add.at(mean, graph.frame_of_row, moved)

@@ -16,10 +16,9 @@ from telerig.estimator.smoothing.graph.bubble_chains import BubbleChains, bubble
 from telerig.estimator.smoothing.graph.draws import Draws
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State, variances
 from telerig.estimator.smoothing.graph.linear import PIXELS, SampleWeights, all_factors
-from telerig.factors.linear_factors import LinearFactors
+from telerig.factors.linear_factors import AT_ONCE, LinearFactors
 
 _STILL_MM_S = 1e-9
-_AT_ONCE = 8192
 
 
 def shake_known_variances(
@@ -51,7 +50,7 @@ def shake_known_variances(
     information -= np.einsum("nda,ndb->ab", pushed, gain)
     moved = np.concatenate([
         graph.in_bubble_basis(at[None], mine) @ gain[mine]
-        for mine in np.array_split(np.arange(graph.rows), -(-graph.rows // _AT_ONCE))
+        for mine in np.array_split(np.arange(graph.rows), -(-graph.rows // AT_ONCE))
     ])  # fmt: skip
     root = np.linalg.inv(np.linalg.cholesky(information))
     return np.asarray(variance + ((moved @ root.T) ** 2).sum(-1))

@@ -27,6 +27,7 @@ from telerig.factors.bubble_motion import (
     bubble_processes,
     inertial_bubble_path,
 )
+from telerig.factors.linear_factors import AT_ONCE
 from telerig.factors.motion import Motion, motion
 from telerig.factors.state_space import (
     Component,
@@ -48,7 +49,7 @@ _NEAR, _NEAR_S = 0.6, 1e-3
 _TERMS = 9
 _READING_SIGMA_MM = 10.0
 _ALIGNED = 1 - 1e-9
-_FEW_KINDS, _AT_ONCE = 16, 4096
+_FEW_KINDS = 16
 
 
 @dataclass(frozen=True)
@@ -465,8 +466,8 @@ class GraphLayout:
     def bubble_covariances(self, block: Array) -> Array:
         """Return the covariances (rows, D, D) of bubbles' states, in the place of those of their
         increments, which are used up."""
-        for first in range(0, self.rows, _AT_ONCE):
-            mine = np.arange(first, min(first + _AT_ONCE, self.rows))
+        for first in range(0, self.rows, AT_ONCE):
+            mine = np.arange(first, min(first + AT_ONCE, self.rows))
             half = np.swapaxes(self.out_of_bubble_basis(block[mine], mine), -1, -2)
             block[mine] = self.out_of_bubble_basis(half, mine)
         return block
@@ -681,7 +682,7 @@ def times_chosen(blocks: Array, matrices: Array, which: Ints) -> Array:
             mine = which == value
             out[mine] = blocks[mine] @ matrices[value]
     else:
-        for first in range(0, len(which), _AT_ONCE):
-            mine = slice(first, first + _AT_ONCE)
+        for first in range(0, len(which), AT_ONCE):
+            mine = slice(first, first + AT_ONCE)
             np.matmul(blocks[mine], matrices[which[mine]], out=out[mine])
     return out

@@ -22,7 +22,7 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
 )
 from telerig.factors import measurements
-from telerig.factors.linear_factors import LinearFactors, prior_factors
+from telerig.factors.linear_factors import AT_ONCE, LinearFactors, prior_factors
 from telerig.factors.motion import start_factors
 from telerig.factors.state_space import log_det_of, whitener_of
 from telerig.rig.triangulation import rig_jacobian, stacked_jacobian
@@ -34,9 +34,6 @@ MARKS, ENCODER = "marks", "encoder"
 
 SampleWeights = tuple[Array | None, ...]
 """Weights (N,) of the samples of each accelerometer; None where all are 1."""
-
-_AT_ONCE = 8192
-"""Pixels whose factors are worked out together."""
 
 _LEAST_RISE = 1e-6
 
@@ -273,8 +270,8 @@ def _seen(
             continue
         blocks: list[Array] = []
         rhs, log_det = np.empty((len(mine), 2)), np.empty(len(mine))
-        for first in range(0, len(mine), _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
+        for first in range(0, len(mine), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
             which = mine[part]
             found = _one_camera(graph, state, obs, c, which, at_frames, states(which))
             residual[which] = -found.rhs

@@ -11,10 +11,10 @@ from shake_learning_data import run, true_model
 
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State
+from telerig.estimator.smoothing.graph.outliers import Truncation
 from telerig.estimator.smoothing.graph.solve import (
     Options,
     Solution,
-    Truncation,
     _check_converged,
     drawn,
     solve,

@@ -19,10 +19,10 @@ from shake_runs import Run, run_of, true_model_of
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.sensors.checks import Encoder
+from telerig.estimator.smoothing.graph.outliers import SampleRejection
 from telerig.estimator.smoothing.graph.solve import (
     Covariances,
     Options,
-    SampleRejection,
     _check_variances,
     solve,
 )

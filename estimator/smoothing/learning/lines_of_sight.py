@@ -34,15 +34,14 @@ class Signal:
     direction : (3,) unit vector in the rig frame.
     cameras : (J,) indices of the cameras that see it.
     t_s : (F,).
-    value_mm : (F, P) d . (item - offset) less ``start_mm``; or (F, P, R) for R replicates, which
-        share all other fields: differences of bubbles, or pieces of a run (`stacked`).
+    value_mm : (F, P) d . (item - offset) less where the item is first seen or, at rest, stated to
+        be; or (F, P, R) for R replicates, which share all other fields: differences of bubbles, or
+        pieces of a run (`stacked`).
     weight : (F, P) 1 / variance; 0 where nothing was seen.
     item, camera : (P,) of each pair, as indices into the items and into ``cameras``.
     moving : (I,) False for items at rest in the tank.
     first : (I,) frame in which it was first seen.
-    start_mm : (I,).
     start_sigma_mm : (I,) prior sd of an item at rest.
-    bubble : (I,) index into the problem's bubbles; -1 for marks.
     pooled : number of bubbles whose mean the moving item is.
     shaken : False for differences of bubbles, in which the shake cancels.
     """
@@ -56,9 +55,7 @@ class Signal:
     camera: Ints
     moving: Bools
     first: Ints
-    start_mm: Array
     start_sigma_mm: Array
-    bubble: Ints
     pooled: int = 1
     shaken: bool = True
 
@@ -178,22 +175,16 @@ def _signal(
     place = np.searchsorted(pairs, pair)
     first = np.full(count, len(problem.t_s))
     np.minimum.at(first, item, frame)
-    start = np.zeros(count)
-    for k, bubble in enumerate(chosen):
-        start[k] = problem.bubbles[bubble].start_mm @ direction
-    for k, mark in enumerate(problem.marks):
-        start[len(chosen) + k] = mark.guess_mm @ direction
+    start = [problem.bubbles[b].start_mm for b in chosen] + [m.guess_mm for m in problem.marks]
     values = np.zeros((len(problem.t_s), len(pairs)))
     weight = np.zeros_like(values)
-    values[frame, place] = value - start[item]
+    values[frame, place] = value - (np.array(start) @ direction)[item]
     weight[frame, place] = 1 / variance
     sigma = np.r_[np.full(len(chosen), 100.0), [m.sigma_mm for m in problem.marks]]
     moving = np.arange(count) < len(chosen)
-    bubble_of = np.r_[chosen, np.full(len(problem.marks), -1)].astype(np.int64)
     return Signal(
         direction, cameras, problem.t_s, values, weight, pairs // len(cameras),
-        pairs % len(cameras), moving, np.minimum(first, len(problem.t_s) - 1), start, sigma,
-        bubble_of,
+        pairs % len(cameras), moving, np.minimum(first, len(problem.t_s) - 1), sigma,
     )  # fmt: skip
 
 
@@ -220,8 +211,8 @@ def pooled(signal: Signal) -> tuple[Signal, ...]:
     one = np.zeros(cameras, np.int64)
     alike = replace(
         signal, item=one, camera=np.arange(cameras), moving=np.array([True]),
-        first=signal.first[movers].min(keepdims=True), start_mm=np.zeros(1),
-        start_sigma_mm=signal.start_sigma_mm[movers[:1]], bubble=np.array([-1]),
+        first=signal.first[movers].min(keepdims=True),
+        start_sigma_mm=signal.start_sigma_mm[movers[:1]],
     )  # fmt: skip
     mean = replace(alike, value_mm=value.mean(1), weight=each * count, pooled=count)
     apart = np.einsum("rk,fkcs->fcrs", contrasts(count), value)

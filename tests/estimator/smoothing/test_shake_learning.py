@@ -69,7 +69,8 @@ def test_evidence_and_means_equal_the_graphs(marks: int) -> None:
     states = first.state.bubbles @ first.graph.bubble.position.T
     for signal in signals[:1]:
         found = signal_posterior(signal, true_model())
-        place = (found.position_mm + signal.start_mm[:2, None]).ravel()
+        start = [bubble.start_mm @ signal.direction for bubble in problem.bubbles[:2]]
+        place = (found.position_mm + np.array(start)[:, None]).ravel()
         np.testing.assert_allclose(place, states @ signal.direction, atol=1e-6)
 
 

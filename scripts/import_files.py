@@ -265,8 +265,8 @@ def _record_words(sensor: str, table: pd.DataFrame, frames_t_s: Array | None) ->
             )
         if outside.all():
             lines.append(
-                '  the sensor seems to have its own clock: write clock = "unknown" into its table '
-                "in rig.toml, or bring it to the run's clock with --start-s"
+                "  the sensor seems to have its own clock: its table in rig.toml needs clock = "
+                '"unknown", or bring it to the run\'s clock with --start-s'
             )
     return "\n".join(lines)
 

@@ -199,7 +199,8 @@ def _times(recording: Recording, layout: Layout, name: str | None, rows: int) ->
                 "contains no times under a known name and states no sampling rate"
                 if rate is None
                 else f"rate is {rate} Hz",
-                "name the channel of times with --columns Time,x,y,z, or give --rate-hz 1600",
+                "name the channel of times with --columns Time,x,y,z, or give --rate-hz 1600. The "
+                f"channels: {', '.join(recording.channels)}",
             )
         count, of = np.arange(rows, dtype=float), "number of the sample"
         if name is not None:

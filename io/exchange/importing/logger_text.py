@@ -105,13 +105,15 @@ def _header(
             if found:
                 header = i if columns is not None and not wanted else i + 1
                 return separator, header, names if header > i else []
+    alike = [line for line in lines if wanted and all(name in line for name in wanted)]
     raise InputError(
         "does not say in a header of known names which columns are x, y and z"
         if columns is None
         else f"has no line with the columns {', '.join(map(str, columns))}",
         where=str(path),
         todo="name time, x, y and z with --columns Time,ch1,ch2,ch3, or by their numbers from 0: "
-        "--columns 0,1,2,3",
+        "--columns 0,1,2,3"
+        + (f". Give whole names, as they stand in the header: {alike[0].strip()}" if alike else ""),
     )
 
 

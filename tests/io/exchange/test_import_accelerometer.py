@@ -156,6 +156,11 @@ def test_units_and_channels_are_never_guessed(tmp_path: Path) -> None:
         readings(other, unit="g")
     with pytest.raises(InputError, match="--rate-hz"):
         readings(other, unit="g", columns=("p", "q", "r"))
+    german = write_text(tmp_path / "c.csv", ["Zeit (s);X (g);Y (g);Z (g)"], ";")
+    with pytest.raises(InputError, match=r"no times .*\n.*channels: Zeit \(s\), X \(g\)"):
+        readings(german)
+    with pytest.raises(InputError, match=r"whole names.* header: Zeit \(s\);X \(g\)"):
+        readings(german, columns=("Zeit", "X", "Y", "Z"))
 
 
 def test_a_unit_against_that_in_the_names_is_noted(tmp_path: Path) -> None:

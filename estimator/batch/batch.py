@@ -362,7 +362,8 @@ def write_batch(
 
 
 def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return a summary in words: the number of jobs of each kind and status, and every failure.
+    """Return a summary in words: the number of jobs of each kind and status, and every failure with
+    what to do.
 
     records : the journal's record of each job.
     """
@@ -378,6 +379,8 @@ def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
             where = record["dataset"] + (f", run {record['run']}" if record["run"] else "")
             reason = _first_line(record["words"])
             lines.append(f"  {where}: {record['kind']} {record['status']}: {reason}")
+            others = str(record["words"] or "").splitlines()
+            lines += [f"  {line}" for line in others if line.startswith("  -> ")]
     return "\n".join(lines)
 
 

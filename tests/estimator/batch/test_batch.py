@@ -163,6 +163,7 @@ def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path, mo
     assert list(table["status"]) == ["failed", "failed", "done"]
     assert "rig.toml" in table["words"][0]
     assert "dots.csv" in table["words"][1]
+    assert "    -> write one with `telerig init`\n" in result.output, "what to do"
     page = (out / "report.html").read_text()
     assert "What failed" in page and "dots.csv" in page
     assert 'href="../good/results/calibration/report.html"' in page

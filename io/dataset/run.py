@@ -5,7 +5,7 @@ The frames of several cameras are paired by the numbers in their names, or by th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -17,6 +17,7 @@ import pandas as pd
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError, suggestion
 from telerig.io.dataset.tables import (
+    check_frame_count,
     choose_source,
     read_accelerometer_csv,
     read_detections_csv,
@@ -188,25 +189,24 @@ def load_run(
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()} if rig else {}
     sizes |= dict(image_sizes_px or {})
     notes: list[str] = []
-    images = _choose_source(folder, names, source) == "images"
+    recorded = recordings(folder)
+    images = _choose_source(folder, recorded, names, source) == "images"
     stated = bool(cameras) or (rig is not None and rig.tracking is not None)
     if images:
-        names = _those_there(names, set(recordings(folder)), stated)
+        names = _those_there(names, set(recorded), stated)
+    file = folder / "frames.csv"
+    frames = read_frames_csv(file, every) if file.is_file() else None
     detections = None
     if not images:
-        detections, seen = _detections(folder, names, every, sizes, notes)
+        count = None if frames is None else len(frames)
+        detections, seen = _detections(folder, names, every, sizes, count, notes)
         names = _those_there(names, seen, stated)
     if len(every) > len(names):
         notes.append(f"of {', '.join(every)}, the run is that of cameras {', '.join(names)}")
-    sources = _open_sources(folder, names, every) if images else {}
-    positions = _paired(folder, sources, every, pair_by, notes) if images else {}
+    sources = _open_sources(folder, recorded, names, every) if images else {}
+    positions = _paired(folder, sources, frames, pair_by, notes) if images else {}
     sizes |= {n: _size(s) for n, s in sources.items() if n not in sizes}
-    count = len(positions[names[0]]) if images else None
-    recorded = _recorded_times(sources, positions)
-    skipped = (
-        np.flatnonzero(np.all([p < 0 for p in positions.values()], axis=0)) if images else None
-    )
-    t_s = _times(folder, every, count, detections, notes, recorded, skipped)
+    t_s = _times(folder, frames, sources, positions, detections, notes)
     lost = notes if skip_unreadable else None
     stage = _table(folder / "stage.csv", read_stage_csv, lost)
     sensors = list(rig.accelerometers) if rig else None
@@ -272,10 +272,12 @@ def run_folder(path: Path) -> Path:
     raise absent(path, "run", "check the path")
 
 
-def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSource:
+def _choose_source(
+    folder: Path, recorded: Collection[str], names: list[str], source: str | None
+) -> RunSource:
     """Return "images" or "detections". Raises InputError when the folder has none, or has both."""
     has: dict[RunSource, bool] = {
-        "images": bool(recordings(folder)),
+        "images": bool(recorded),
         "detections": (folder / "detections.csv").is_file(),
     }
     chosen = choose_source(has, source, folder)
@@ -302,9 +304,11 @@ def recordings(folder: Path) -> dict[str, Path]:
     return found
 
 
-def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str, FrameSource]:
+def _open_sources(
+    folder: Path, recorded: Mapping[str, Path], names: list[str], every: list[str]
+) -> dict[str, FrameSource]:
     """Open the frames of the cameras ``names``, of ``every`` camera of the rig."""
-    strangers = {name: p for name, p in recordings(folder).items() if name not in every}
+    strangers = {name: p for name, p in recorded.items() if name not in every}
     for name, entry in strangers.items():
         raise InputError(
             f"there is no camera {name!r} in the rig",
@@ -325,17 +329,15 @@ def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str,
 def _paired(
     folder: Path,
     sources: Mapping[str, FrameSource],
-    every: list[str],
+    frames: pd.DataFrame | None,
     pair_by: Pairing,
     notes: list[str],
 ) -> dict[str, Ints]:
     """Return `pair_frames`, with what frames.csv reports as missing; append to ``notes``."""
-    file, missing = folder / "frames.csv", None
-    if file.is_file():
-        table = read_frames_csv(file, None, every)
-        if "missing" in table:
-            dropped = table["missing"].str.split("|")
-            missing = {n: np.array([n in names for names in dropped], bool) for n in sources}
+    missing = None
+    if frames is not None and "missing" in frames:
+        dropped = frames["missing"].str.split("|")
+        missing = {n: np.array([n in names for names in dropped], bool) for n in sources}
     positions, found = pair_frames(sources, pair_by, missing, str(folder))
     notes += found
     return positions
@@ -352,14 +354,15 @@ def _detections(
     names: list[str],
     every: list[str],
     sizes: Mapping[str, tuple[int, int]],
+    count: int | None,
     notes: list[str],
 ) -> tuple[pd.DataFrame | FrameTable, set[str]]:
     """Read detections.csv and keep the rows of the cameras ``names``; append to ``notes``.
 
+    count : number of frames, None where the table decides.
     Returns the cameras that have rows, too.
     """
-    file, path = folder / "frames.csv", folder / "detections.csv"
-    count = len(read_frames_csv(file, None, every)) if file.is_file() else None
+    path = folder / "detections.csv"
     seen: set[str] = set()
 
     def read(content: bytes, row: int) -> pd.DataFrame | None:
@@ -388,33 +391,35 @@ def _detections(
 
 def _times(
     folder: Path,
-    names: list[str],
-    count: int | None,
+    frames: pd.DataFrame | None,
+    sources: Mapping[str, FrameSource],
+    positions: Mapping[str, Ints],
     detections: pd.DataFrame | FrameTable | None,
     notes: list[str],
-    recorded: tuple[Path, Array] | None = None,
-    skipped: Ints | None = None,
 ) -> Array:
     """Return the (F,) times in s of the frames from frames.csv, else from run.toml, else recorded.
 
-    count : number of frames of the images; None when the detections decide.
-    skipped : the frames of which no camera has an image.
+    positions : of the images; empty where the detections decide how many frames there are.
     """
-    file, settings = folder / "frames.csv", folder / "run.toml"
-    if file.is_file():
+    settings, count = folder / "run.toml", 0
+    if positions:
+        count = len(next(iter(positions.values())))
+    elif isinstance(detections, FrameTable):
+        count = int(detections.last[-1]) + 1
+    elif detections is not None:
+        count = int(detections["frame"].max()) + 1
+    if frames is not None:
         if settings.is_file():
             read_run_toml(settings)
             notes.append("frame times are read from frames.csv; those of run.toml are not used")
-        return np.asarray(read_frames_csv(file, count, names, skipped)["t_s"], float)
-    if count is None:
-        count = 0
-        if isinstance(detections, FrameTable):
-            count = int(detections.last[-1]) + 1
-        elif detections is not None:
-            count = int(detections["frame"].max()) + 1
+        if positions:
+            skipped = np.flatnonzero(np.all([p < 0 for p in positions.values()], axis=0))
+            check_frame_count(frames, folder / "frames.csv", count, skipped)
+        return frames["t_s"].to_numpy(float)
     if settings.is_file():
         rate, start = read_run_toml(settings)
         return start + np.arange(count) / rate
+    recorded = _recorded_times(sources, positions)
     if recorded is not None:
         notes.append(f"frame times are read from {recorded[0].name}, counted from its first frame")
         return recorded[1]

@@ -16,7 +16,7 @@ import pandas as pd
 
 from telerig.arrays import Bools, Ints
 from telerig.errors import InputError, suggestion
-from telerig.io.files.csv_table import Column, Rows, read_part, read_table, rows_of
+from telerig.io.files.csv_table import Column, read_part, read_table, rows_of
 from telerig.io.files.toml import read_toml
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
@@ -235,29 +235,33 @@ REFERENCE_SIGMA_PX = 0.1
 _RUN_KEYS = ["frame_rate_hz", "start_s"]
 
 
-def read_frames_csv(
-    path: Path, frame_count: int | None, cameras: list[str], skipped: Ints | None = None
-) -> pd.DataFrame:
+def read_frames_csv(path: Path, cameras: list[str]) -> pd.DataFrame:
     """Read `frames.csv`, which gives the time of every frame of a run.
 
-    frame_count : how many frames the images have; None where the table decides.
-    skipped : the frames among them of which no camera has an image.
     Returns one row per frame, counted from 0 without gaps, with the columns frame, t_s (the middle
     of the exposure in s) and all further ones. The optional column ``missing`` names the cameras
-    that dropped the frame, joined by ``|``.
-    Raises InputError for times that do not increase, a frame without a time or without an image,
-    and an unknown camera in ``missing``.
+    that dropped the frame, joined by ``|``. The index is the row in the file.
+    Raises InputError for times that do not increase, a frame without a time, and an unknown camera
+    in ``missing``.
     """
     table = read_table(path, FRAMES.of(), extra=True)
     rows = rows_of(table, path)
-    _check_frames(table, frame_count, rows, skipped)
-    frame, t = table["frame"].to_numpy(), table["t_s"].to_numpy()
-    rows.refuse(
-        np.diff(t, prepend=-np.inf) <= 0,
-        "t_s",
-        lambda i: f"is {t[i]:.9g} s at frame {frame[i]}, not later than {t[i - 1]:.9g} s before it",
-        "times must increase from frame to frame",
+    frame, expected = table["frame"].to_numpy(), np.arange(len(table))
+
+    def refuse(bad: Bools, what: Callable[[int], str], todo: str) -> None:
+        rows.refuse(bad, "frame", lambda i: f"is {frame[i]}{what(i)}", todo)
+
+    again = table.duplicated("frame").to_numpy()
+    rows.refuse(again, "frame", lambda i: f"{frame[i]} stands twice", "keep one of the rows")
+    refuse(frame < 0, lambda i: ", before 0", "frames count from 0")
+    falls = np.diff(frame, prepend=frame[0]) < 0
+    refuse(falls, lambda i: f" after {frame[i - 1]}", "sort the rows by frame")
+    refuse(
+        frame != expected,
+        lambda i: f", and no row gives the time of frame {expected[i]}",
+        "add the missing row; frames count from 0",
     )
+    _check_increasing(table, path, "times must increase from frame to frame")
     if "missing" in table:
         named = [cell.split("|") if cell else [] for cell in table["missing"]]
         unknown = [next((c for c in names if c not in cameras), None) for names in named]
@@ -267,47 +271,36 @@ def read_frames_csv(
             lambda i: f"names {unknown[i]!r}, which is no camera of the rig",
             f"join names of cameras by |; known: {', '.join(cameras)}",
         )
-    return table.reset_index(drop=True)
+    return table
 
 
-def _check_frames(
-    table: pd.DataFrame, frame_count: int | None, rows: Rows, skipped: Ints | None
-) -> None:
-    """Raise InputError unless the column frame counts 0, 1, 2, ... up to the last image."""
-    frame, expected = table["frame"].to_numpy(), np.arange(len(table))
+def check_frame_count(table: pd.DataFrame, path: Path, frame_count: int, skipped: Ints) -> None:
+    """Raise InputError unless `read_frames_csv` found as many frames as the images have.
 
-    def refuse(bad: Bools, what: Callable[[int], str], todo: str) -> None:
-        rows.refuse(bad, "frame", lambda i: f"is {frame[i]}{what(i)}", todo)
-
-    again = table.duplicated("frame").to_numpy()
-    rows.refuse(again, "frame", lambda i: f"{frame[i]} stands twice", "keep one of the rows")
-    refuse(frame < 0, lambda i: ", before 0", "frames count from 0")
-    if frame_count is not None:
-        end = f", but the last frame with images is {frame_count - 1}"
-        refuse(frame >= frame_count, lambda i: end, "remove the row, or add the missing images")
-    falls = np.diff(frame, prepend=frame[0]) < 0
-    refuse(falls, lambda i: f" after {frame[i - 1]}", "sort the rows by frame")
-    refuse(
-        frame != expected,
-        lambda i: f", and no row gives the time of frame {expected[i]}",
-        "add the missing row; frames count from 0",
+    skipped : the frames among them of which no camera has an image.
+    """
+    frame, rows = table["frame"].to_numpy(), rows_of(table, path)
+    rows.refuse(
+        frame >= frame_count,
+        "frame",
+        lambda i: f"is {frame[i]}, but the last frame with images is {frame_count - 1}",
+        "remove the row, or add the missing images",
     )
-    if frame_count is not None and len(frame) < frame_count:
-        what = (
-            f"has {counted(len(frame), 'row')}, but there are images of {frame_count} frames: "
-            f"frame {len(frame)} has no time"
+    if len(frame) == frame_count:
+        return
+    what = (
+        f"has {counted(len(frame), 'row')}, but there are images of {frame_count} frames: "
+        f"frame {len(frame)} has no time"
+    )
+    todo = "add the missing rows, or remove the images that do not belong to the run"
+    if len(skipped):
+        some = ", ".join(map(str, skipped[:8])) + (", ..." if len(skipped) > 8 else "")
+        what += f"; the numbers in the images' names skip {counted(len(skipped), 'frame')} ({some})"
+        todo = (
+            "add a row for each of these frames, too; or, if the images follow each other "
+            "without a gap, add a blank column `missing`: then their order counts"
         )
-        todo = "add the missing rows, or remove the images that do not belong to the run"
-        if skipped is not None and len(skipped):
-            some = ", ".join(map(str, skipped[:8])) + (", ..." if len(skipped) > 8 else "")
-            what += (
-                f"; the numbers in the images' names skip {counted(len(skipped), 'frame')} ({some})"
-            )
-            todo = (
-                "add a row for each of these frames, too; or, if the images follow each other "
-                "without a gap, add a blank column `missing`: then their order counts"
-            )
-        raise InputError(what, where=f"{rows.file} row {rows.numbers[-1]}", todo=todo)
+    raise InputError(what, where=f"{path} row {rows.numbers[-1]}", todo=todo)
 
 
 def read_run_toml(path: Path) -> tuple[float, float]:
@@ -369,14 +362,17 @@ def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFram
     return table.reset_index(drop=True)
 
 
-def _check_increasing(table: pd.DataFrame, path: Path) -> None:
+_SORT = "sort the rows by time and keep one row for each time"
+
+
+def _check_increasing(table: pd.DataFrame, path: Path, todo: str = _SORT) -> None:
     """Raise InputError for the first row whose t_s is not later than that of the row before."""
     t = table["t_s"].to_numpy()
     rows_of(table, path).refuse(
         np.diff(t, prepend=-np.inf) <= 0,
         "t_s",
         lambda i: f"is {t[i]:.9g} s, not later than {t[i - 1]:.9g} s in the row before",
-        "sort the rows by time and keep one row for each time",
+        todo,
     )
 
 

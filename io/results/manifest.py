@@ -150,7 +150,8 @@ class Section(Part):
         if self.found is None:
             return self
         now = {name: hash_if_there(folder / name) for name in self.found}
-        if now == {name: _hash_of(self.files.get(name)) for name in self.found}:
+        written = {name: one.sha256 for name, one in self.files.items() if name in self.found}
+        if now == dict.fromkeys(self.found) | written:
             return self.model_copy(update={"found": None, "replaces": None})
         if self.found_whole and now == self.found:
             return self.replaces or Section()
@@ -513,10 +514,6 @@ def _lock(handle: int, kind: int) -> None:
 def _entry(file: Path) -> Written:
     found = hashed(file)
     return Written(sha256=found.sha256, bytes=found.bytes, rows=found.rows)
-
-
-def _hash_of(entry: Written | None) -> str | None:
-    return None if entry is None else entry.sha256
 
 
 def _content(folder: Path) -> bytes:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,10 @@ def work_key(options: Mapping[str, Any], inputs: Mapping[str, Input]) -> str:
     """Return a hash of options, of the inputs' fingerprints and of the program."""
     stated = [version.VERSION, options, {k: v.model_dump() for k, v in inputs.items()}]
     found = hashlib.sha256(json.dumps(stated, default=str).encode())
-    for file in sorted(_program_files()):
+    here = Path(version.__file__).parent
+    program = (Path(folder) / name for folder, _, names in os.walk(here, followlinks=True)
+               for name in names)  # fmt: skip
+    for file in sorted(path for path in program if path.suffix == ".py"):
         found.update(hashed(file).sha256.encode())
     return found.hexdigest()
 
@@ -33,8 +36,3 @@ def empty_unless(folder: Path, key: str) -> None:
     if not (mark.is_file() and json.loads(mark.read_bytes()) == state):
         shutil.rmtree(folder, ignore_errors=True)
         write_json_atomic(mark, state)
-
-
-def _program_files() -> Iterator[Path]:
-    for folder, _, names in os.walk(Path(version.__file__).parent, followlinks=True):
-        yield from (Path(folder) / name for name in names if name.endswith(".py"))

@@ -95,10 +95,10 @@ def test_frames_csv_names_what_the_cameras_missed(
     recorded: tuple[Path, list[Truth]], sims: list[SimulatedDevice]
 ) -> None:
     log, truths = recorded
-    table = read_frames_csv(log.parent / "frames.csv", None, ["left", "right"])
+    table = read_frames_csv(log.parent / "frames.csv", ["left", "right"])
     assert table["frame"].tolist() == list(range(truths[3].sent))
-    missing = table.loc[table["missing"] != "", "missing"]
-    assert missing.to_dict() == dict.fromkeys((300, 301, 600), "left|right")
+    named = table.set_index("frame")["missing"]
+    assert named[named != ""].to_dict() == dict.fromkeys((300, 301, 600), "left|right")
     assert np.max(np.abs(table["t_s"] - sims[3].due_s(np.arange(truths[3].sent)))) < 2e-3
 
 
@@ -249,8 +249,9 @@ def test_two_counters_agree_on_the_frames_and_name_their_own_cameras(tmp_path: P
                 Entry(RECEIVED, 1, 10**7 * k + 1000, f"{10**4 * k},{k + 900}\n".encode())
             )
     write_tables(written(tmp_path / "recording.raw", entries, left, right))
-    table = read_frames_csv(tmp_path / "frames.csv", 300, ["left", "right"])
-    missing = table.loc[table["missing"] != "", "missing"].to_dict()
+    table = read_frames_csv(tmp_path / "frames.csv", ["left", "right"])
+    named = table.set_index("frame")["missing"]
+    missing = named[named != ""].to_dict()
     assert missing == {0: "right", 40: "left", 41: "right", 42: "right"}
     assert np.allclose(table["t_s"], np.arange(300) / 100, atol=1e-4)
 
@@ -261,7 +262,7 @@ def test_a_damaged_counter_line_is_no_missing_frame(tmp_path: Path) -> None:
     lines[50] = b"500\x00\xff,50\n"
     entries = [Entry(RECEIVED, 0, 10**7 * k, line) for k, line in enumerate(lines)]
     done = write_tables(written(tmp_path / "recording.raw", entries, device))
-    table = read_frames_csv(tmp_path / "frames.csv", 100, ["left", "right"])
+    table = read_frames_csv(tmp_path / "frames.csv", ["left", "right"])
     assert "missing" not in table and done.summary["frames"]["interpolated"] == [50]
     assert np.allclose(table["t_s"], np.arange(100) / 100, atol=1e-6)
 

@@ -29,6 +29,7 @@ from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
     Rejected,
+    contour_moments,
     find_blobs,
     noise_shares,
     split_blobs,
@@ -49,6 +50,7 @@ from telerig.estimator.bubbles.outline.outline_fit import (
     fit_outlines,
     fits_badly,
     implausible_outlines,
+    missed_rims,
     radius_px,
     start_outlines,
     usual_misfit,
@@ -217,8 +219,8 @@ def _found(
     rejected += slender
     clusters: list[Array] = []
     fitted = partial(fit_outlines, ratio, noise=noise, shadows=shadows)
+    parts, outlines = _undivided(blobs, parts, fitted(_start(parts, blobs)), fitted)
     start = _start(parts, blobs)
-    outlines = fitted(start)
     odd, bent = implausible_outlines(outlines)
     again = _divided(blobs, parts, outlines, odd, fitted, ratio.shape, min_diameter_px)
     if again is not None:
@@ -243,7 +245,7 @@ def _found(
     else:
         own = np.array([part.blob for part in parts], np.intp)
         kept = np.ones(len(parts), np.bool_)
-        for k in np.unique(own[merged]).tolist():
+        for k in np.unique(own[merged & ~_explained(outlines)]).tolist():
             crowd = look([blobs[k]], [], sure, around(blobs[k], ratio.shape))
             crowds.append(crowd)
             clusters += crowd.clusters
@@ -385,6 +387,36 @@ def _start(parts: list[Part], blobs: list[Blob]) -> Outlines:
         np.array([blob.blur_px for blob in own]),
         np.array([blob.inner for blob in own]),
     )
+
+
+def _explained(outlines: Outlines) -> Bools:
+    """Return whether outlines (B,) leave nothing but noise unexplained of the rims around them."""
+    seen = outlines.coverage > _KNOWN_COVERAGE
+    return np.asarray(seen & ~(fits_badly(outlines) | missed_rims(outlines)))
+
+
+def _undivided(
+    blobs: list[Blob], parts: list[Part], outlines: Outlines, fitted: Callable[..., Outlines]
+) -> tuple[list[Part], Outlines]:
+    """Return parts and outlines with one merged part for each region that its parts do not explain
+    better than a single outline with its harmonics does.
+
+    Several ellipses along such a rim may as well be one bent bubble.
+    """
+    own = np.array([part.blob for part in parts], np.intp)
+    shared = [part.shared and not blobs[part.blob].touches_border for part in parts]
+    several = np.unique(own[shared])
+    if not len(several):
+        return parts, outlines
+    ellipses = contour_moments([blobs[k].contour_px for k in several])[0]
+    ones = [Part(e, k, merged=True) for e, k in zip(ellipses, several.tolist(), strict=True)]
+    fit = fitted(_start(ones, blobs), beside=outlines.take(~np.isin(own, several)))
+    worst = np.zeros(len(blobs))
+    np.fmax.at(worst, own, outlines.chi2_dof)
+    fits = (fit.chi2_dof <= worst[several]) & _explained(fit)
+    kept = np.concatenate([~np.isin(own, several[fits]), fits])
+    parts = [part for part, good in zip([*parts, *ones], kept.tolist(), strict=True) if good]
+    return parts, Outlines.concat([outlines, fit]).take(kept)
 
 
 def _divided(

@@ -17,10 +17,12 @@ PAIR = REAL / "bubble_pair"
 WHITE = 3000.0
 
 
-def seen(bubbles: list[Drawn], shape: tuple[int, int], seed: int = 0) -> pd.DataFrame:
+def seen(
+    bubbles: list[Drawn], shape: tuple[int, int], seed: int = 0, noise: float = 0.01
+) -> pd.DataFrame:
     rng = np.random.default_rng(seed)
     clean = draw(bubbles, shape, blur_px=1.0)
-    image = np.round(WHITE * (clean + 0.01 * rng.standard_normal(shape))).clip(0).astype(np.uint16)
+    image = np.round(WHITE * (clean + noise * rng.standard_normal(shape))).clip(0).astype(np.uint16)
     return detect_bubbles(image, background=np.full(shape, WHITE, np.float32))
 
 
@@ -41,6 +43,17 @@ def test_overlapping_pair_is_split(distance: float, allowed: float, heart: float
     assert len(table) == 2
     assert all("overlap" in flags for flags in table["flags"])
     assert np.max(misses(table, [first, second])) < allowed
+
+
+@pytest.mark.parametrize("radius", [10.0, 12.0, 15.0, 20.0, 40.0])
+def test_a_bean_is_not_two_bubbles(radius: float) -> None:
+    """One outline with its harmonics fits it as well as ellipses that are merged do."""
+    middle = 1.5 * radius + 20.0
+    ellipse = (middle + 0.3, middle - 0.2, 1.15 * radius, 0.85 * radius, 0.4)
+    bean = Drawn(ellipse, harmonics={3: (0.18 * radius, 0.0)})
+    table = seen([bean], (round(2 * middle), round(2 * middle)), noise=0.02)
+    assert table["flags"].tolist() == ["merged"]
+    assert table["d_eq_px"].iloc[0] == pytest.approx(2 * radius, rel=0.01)
 
 
 def test_hidden_outlines_are_less_certain_than_whole_ones() -> None:

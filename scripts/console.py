@@ -40,11 +40,12 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line, as the class that it extends does."""
-        for arg in args:
+        for before, arg in zip(["", *args], args):
             option, equals, value = arg.partition("=")
             if not arg or (option[:2] == "--" and equals and not value):
-                where = f"{option} is empty" if option else "an argument is empty"
-                raise typer.BadParameter(f"{where}: leave it out, or write . for this folder", ctx)
+                named = option or (before if before[:2] == "--" else "an argument")
+                words = f"{named} is empty: leave it out, or write . for this folder"
+                raise typer.BadParameter(words, ctx)
         return super().parse_args(ctx, args)
 
 

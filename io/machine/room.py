@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import math
 import os
 import shutil
-import sys
 from pathlib import Path
 
 from telerig.errors import InputError
@@ -16,14 +13,8 @@ _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory
 
 
 def memory_bytes() -> float:
-    """Return the computer's memory, or what its container allows; infinity where neither says."""
-    found = [math.inf]
-    if sys.platform == "win32":
-        installed_kb = ctypes.c_ulonglong()
-        if ctypes.windll.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(installed_kb)):
-            found.append(1024.0 * installed_kb.value)
-    else:
-        found.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
+    """Return the computer's memory, or what its container allows if that is less."""
+    found = [float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")]
     for file in _LIMITS:
         text = file.read_text(encoding="utf-8").strip() if file.is_file() else ""
         found += [float(text)] if text.isdecimal() else []

@@ -52,16 +52,16 @@ class Draws:
 
 def draws_of(
     graph: GraphLayout, factors: Sequence[LinearFactors], root: EliminatedGraph | EliminatedCrowd,
-    draws: int | None = None, seed: int = 0,
+    draws: int | None = None,
 ) -> Draws:  # fmt: skip
-    """Return draws for the factors of a graph and the root of their information.
+    """Return draws for the factors of a graph and the root of their information; always the same.
 
     draws : their number; None for `DRAWS`, or fewer for a graph with many states.
     """
     rows = graph.rows or 1
     draws = draws or int(np.clip(_DRAWN_ROWS // rows, _FEWEST_DRAWS, DRAWS))
     at_once = max(1, _ROWS_AT_ONCE // rows)
-    rng, parts = np.random.default_rng(seed), list[Draws]()
+    rng, parts = np.random.default_rng(0), list[Draws]()
     for done in range(0, draws, at_once):
         parts.append(_drawn(graph, factors, root, min(at_once, draws - done), rng))
     each = zip(*((p.errors, p.pixels, p.marks, p.encoder) for p in parts))

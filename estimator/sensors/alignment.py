@@ -27,7 +27,6 @@ _LONG_RECORD, _MOST_SENSORS = 200_000, 1
 
 _LEAST_OVERLAP = 0.3
 LEAST_SAMPLES = 60
-_END_S = 0.005
 _RIPPLE_LOG_RATIO = 0.5
 _MOST_LAG_SHARE = 0.25
 _ORDER = 16
@@ -175,14 +174,13 @@ def align(
     sd *= _disagreement(forward, sizes, tried, peak + place, 2 * frames.knots)
     offsets = np.asarray(lags * frames.step_s, np.float64)
     ends = np.flatnonzero(tried)[[0, -1]]
-    edge = max(round(_END_S / frames.step_s), 1)
     near = np.abs(offsets) <= near_s + frames.step_s / 2
     return Alignment(
         float(offsets[peak] + place * frames.step_s), float(sd * frames.step_s),
         float(total[peak]), float(others[second]), float(offsets[second]),
         float(_total(backward, sizes, tried[::-1]).max()),
         float(total[near].max(initial=-np.inf)),
-        bool(np.abs(peak - ends).min() <= edge),
+        bool(np.abs(peak - ends).min() <= frames.knots),
         {p.channel.name: float(p.explained[peak]) for p in forward}, offsets, total,
     )  # fmt: skip
 

@@ -22,11 +22,23 @@ _NOISE_SHARE = 0.5
 _MOST_TRACKS = 100
 _SPIKE_SDS = 8.0
 _LEAST_SAMPLES = 8
+LEAST_SEEN = 0.1
+"""Squared share of the travel axis that a camera has to see across its line of sight."""
 
 
 def directions(camera: Camera) -> Array:
     """Return the unit vectors (2, 3) in the rig frame along which a camera sees motion."""
     return np.asarray(camera.camera_from_rig.rotation[:2])
+
+
+def seen_of(camera: Camera, axis: Array) -> Array | None:
+    """Return weights (2,) that give motion along an axis (3,) from that along both directions.
+
+    None for a camera that looks along the axis.
+    """
+    seen = directions(camera) @ axis
+    size = float(seen @ seen)
+    return np.asarray(seen / size) if size > LEAST_SEEN else None
 
 
 def frame_grid(t_s: Array, noise_mm: float, sensed_rms: Callable[[Grid], float] | None) -> Grid:

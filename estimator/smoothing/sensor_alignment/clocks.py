@@ -30,7 +30,7 @@ SAME_CLOCK_S = 3 * DELAY_SIGMA_S
 LEAST_FRAMES = 150
 """In a run with fewer frames no clock is refused, nor the times of the frames."""
 
-_MOST_REFINEMENTS = 6
+MOST_REFINEMENTS = 6
 _SHARED_S = 2.0
 """Before and after the frames, so much of a record is searched first whose clock is the frames'."""
 
@@ -148,7 +148,7 @@ def _between_steps(
     step_s = images.grid.step_s
     if not found.unique:
         return found
-    for _ in range(_MOST_REFINEMENTS):
+    for _ in range(MOST_REFINEMENTS):
         moved = [replace(s, t_s=s.t_s - found.offset_s) for s in sensors]
         near = [near_frames(s, problem.t_s) for s in moved]
         again = aligned_by(images, channels, near)

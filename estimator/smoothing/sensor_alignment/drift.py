@@ -24,10 +24,13 @@ from telerig.estimator.sensors.alignment import (
 from telerig.estimator.sensors.findings import Finding
 from telerig.estimator.smoothing.problem.problem import Accelerometer, SmoothingProblem
 from telerig.estimator.smoothing.problem.sensor_records import MARGIN_S, near_frames
-from telerig.estimator.smoothing.sensor_alignment.clocks import SAME_CLOCK_S, aligned_by
+from telerig.estimator.smoothing.sensor_alignment.clocks import (
+    MOST_REFINEMENTS,
+    SAME_CLOCK_S,
+    aligned_by,
+)
 from telerig.estimator.smoothing.sensor_alignment.images import Images, readings_on
 
-_MOST_REFINEMENTS = 6
 _LEAST_PARTS = 3
 _REACH = 2
 """So many lags from the best line, each part has its own peak."""
@@ -52,7 +55,7 @@ def without_drift(
         return -np.inf if found is None else found.log_ratio
 
     best = sensors
-    for _ in range(_MOST_REFINEMENTS if t[-1] - t[0] >= _LONG_S else 0):
+    for _ in range(MOST_REFINEMENTS if t[-1] - t[0] >= _LONG_S else 0):
         corrected = _corrected_drift(best, t, channels, images)
         needed = LEAST_LOG_RATIO if best is sensors else 0.0
         if corrected is None or not log_ratio(corrected) > log_ratio(best) + needed:

@@ -18,7 +18,7 @@ from telerig.estimator.smoothing.problem.problem import Accelerometer, Smoothing
 from telerig.estimator.smoothing.sensor_alignment.clocks import LEAST_FRAMES, SAME_CLOCK_S
 from telerig.estimator.smoothing.sensor_alignment.images import Images, along_axis, at_frames
 from telerig.estimator.smoothing.sensor_alignment.mark_motion import LENS_SIGMA, MarkMotion
-from telerig.estimator.smoothing.sensor_alignment.stuck_encoder import stuck
+from telerig.estimator.smoothing.sensor_alignment.stuck_encoder import stuck, unfollowed
 from telerig.rig.pose import across
 
 _KNOWN_GAIN = 0.01
@@ -64,6 +64,9 @@ def encoder_findings(
         gain, sd, least = *found.first, FAR_SDS * _stated_sigma(problem)
         if found.excludes(0.0) and found.excludes(1.0) and abs(gain - 1) > least:
             return [_gain_finding(gain, max(FAR_SDS * sd / abs(gain), least), sd, where)]
+        halted = unfollowed(problem)
+        if halted:
+            return halted
     elif images.encoder is not None:
         common = CommonGain.of(_responses(problem, images, images.encoder, sensors))
     if common is not None and (common.excludes(1.0) or common.opposed):

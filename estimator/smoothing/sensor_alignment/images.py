@@ -10,7 +10,7 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.accelerations import Accelerations, Grid, of_positions, of_readings
 from telerig.estimator.sensors.alignment import LEAST_SAMPLES, Channel
-from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
+from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid, seen_of
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, SmoothingProblem
 
 SLOWEST_S = 0.05
@@ -142,9 +142,8 @@ def shared_rows(problem: SmoothingProblem, first: int, second: int) -> Array:
 def along_axis(problem: SmoothingProblem, camera: int, seen: Accelerations) -> Array | None:
     """Return a camera's acceleration (n,) along the travel axis; None if it looks along that
     axis."""
-    axis = directions(problem.cameras[camera]) @ problem.axis
-    size = float(axis @ axis)
-    return np.asarray(seen.values @ axis / size) if size > 0.1 else None
+    weights = seen_of(problem.cameras[camera], problem.axis)
+    return None if weights is None else np.asarray(seen.values @ weights)
 
 
 def _noise_mm(problem: SmoothingProblem) -> float | None:

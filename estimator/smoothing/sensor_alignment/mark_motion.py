@@ -15,14 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.sensors.image_motion import directions
+from telerig.estimator.sensors.image_motion import LEAST_SEEN, directions
 from telerig.estimator.sensors.response import FALSE_ALARMS
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
 
 _STRETCHES = 12
 _LEAST_TRAVEL_MM = 0.3
-_SEEN = 0.1
-"""Squared share of the travel axis that a camera has to see across its line of sight."""
 
 LENS_SIGMA = 1e-3
 """Standard deviation of a magnification's change since the calibration: warmth, a touched lens."""
@@ -112,7 +110,7 @@ class MarkMotion:
     def along(self) -> Array:
         """The travel axis (C, 2) in each camera; 0 in cameras that hardly see it or no marks."""
         along = self.rows @ self.axis
-        used = ((along**2).sum(-1) > _SEEN) & (self.square.sum(0) > 0)
+        used = ((along**2).sum(-1) > LEAST_SEEN) & (self.square.sum(0) > 0)
         return np.asarray(along * used[:, None])
 
     def gain(self) -> Judged:

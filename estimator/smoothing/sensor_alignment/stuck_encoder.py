@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from telerig.arrays import Array
 from telerig.estimator.sensors.findings import Code, Finding
-from telerig.estimator.sensors.image_motion import directions
-from telerig.estimator.smoothing.problem.problem import SmoothingProblem
+from telerig.estimator.sensors.image_motion import directions, seen_of
+from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
 
 _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
+_BEHIND = 0.2
+"""An encoder is stuck if so large a share of all marks' sightings moves without it."""
 
 
 def stuck(problem: SmoothingProblem) -> list[Finding]:
@@ -38,15 +41,37 @@ def stuck(problem: SmoothingProblem) -> list[Finding]:
     if not moving:
         return []
     return [
-        Finding(
+        _finding(
             f"the encoder reads {x[first]:.6g} mm from {t[first]:.6g} to {t[last]:.6g} s without "
-            "any change, while the carriage moves: it is stuck",
-            "stage",
-            "leave those rows out or repair the encoder; without the stage's positions, positions "
-            "and velocities are relative to the carriage",
-            Code.ENCODER_STUCK,
+            "any change, while the carriage moves: it is stuck"
         )
     ]
+
+
+def unfollowed(problem: SmoothingProblem) -> list[Finding]:
+    """Return a finding if marks sweep through the images and the encoder hardly moves meanwhile.
+
+    The reading of an encoder that is stuck may still change, by noise or a count to and fro.
+    """
+    seen, read, count = _speeds(problem, problem.references).T
+    behind = (seen > _MOVING_MM_S) & (read < seen / 2)
+    if not count[behind].sum() > _BEHIND * count.sum():
+        return []
+    fast, slow = (float(np.median(speed[behind])) for speed in (seen, read))
+    return [
+        _finding(
+            f"marks move at {fast:.3g} mm/s, and the encoder at {slow:.3g} mm/s in the same "
+            "frames: it is stuck"
+        )
+    ]
+
+
+def _finding(words: str) -> Finding:
+    todo = (
+        "leave those rows out or repair the encoder; without the stage's positions, positions "
+        "and velocities are relative to the carriage"
+    )
+    return Finding(words, "stage", todo, Code.ENCODER_STUCK)
 
 
 def _sweeps(problem: SmoothingProblem) -> bool:
@@ -54,20 +79,30 @@ def _sweeps(problem: SmoothingProblem) -> bool:
 
     It does if marks move through the images, or if there are none and all bubbles rest in them.
     """
-    speeds = []
     for observed in (problem.references, problem.observations):
-        for c, camera in enumerate(problem.cameras):
-            mine = np.flatnonzero(observed.camera == c)
-            axis = directions(camera) @ problem.axis
-            if not len(mine) or axis @ axis < 0.1:
-                continue
-            place = camera.unproject(observed.uv_px[mine])[0] @ directions(camera).T @ axis
-            for item in np.unique(observed.item[mine])[:50]:
-                one = mine[observed.item[mine] == item]
-                x, t = place[observed.item[mine] == item], problem.t_s[observed.frame[one]]
-                if len(one) > 10:
-                    speeds.append(abs(float(np.polyfit(t - t[0], x, 1)[0])))
-        if speeds:
-            fast = float(np.median(speeds)) > _MOVING_MM_S
+        speeds = _speeds(problem, observed)
+        if len(speeds):
+            fast = float(np.median(speeds[:, 0])) > _MOVING_MM_S
             return fast if observed is problem.references else not fast
     return False
+
+
+def _speeds(problem: SmoothingProblem, observed: Observations) -> Array:
+    """Return the mean speeds (mm/s) along the travel axis of up to 50 marks or bubbles of each
+    camera, of the encoder in the same frames, and the number of these, as rows (n, 3).
+    """
+    rows = []
+    for c, camera in enumerate(problem.cameras):
+        mine = np.flatnonzero(observed.camera == c)
+        weights = seen_of(camera, problem.axis)
+        if not len(mine) or weights is None:
+            continue
+        place = camera.unproject(observed.uv_px[mine])[0] @ directions(camera).T @ weights
+        for item in np.unique(observed.item[mine])[:50]:
+            one = observed.item[mine] == item
+            frame = observed.frame[mine[one]]
+            if len(frame) > 10:
+                both = np.column_stack([place[one], problem.encoder_mm[frame]])
+                t = problem.t_s[frame]
+                rows.append([*np.abs(np.polyfit(t - t[0], both, 1)[0]), len(frame)])
+    return np.array(rows).reshape(-1, 3)

@@ -146,6 +146,21 @@ def test_an_encoder_of_another_clock_unit_hardly_moves() -> None:
     assert "hardly any motion" in finding.warning and "t_s is in s" in finding.todo
 
 
+@pytest.mark.parametrize("begin_s", [0.0, 0.8])
+def test_a_stuck_encoder_whose_reading_changes_by_noise_is_refused(begin_s: float) -> None:
+    """Paths were RESOLVED 210 mm off."""
+    run = run_of("S6", 905, None, around_s=2.0)
+    inputs = run.inputs("references")
+    rng, t = np.random.default_rng(0), run.stage["t_s"].to_numpy()
+    position = run.stage["position_mm"].to_numpy().copy()
+    stuck = t >= begin_s
+    position[stuck] = position[stuck][0] + 1e-3 * rng.standard_normal(stuck.sum())
+    given = inputs | {"accelerometers": None, "stage": run.stage.assign(position_mm=position)}
+    problem, _, _, known = problem_of(given.pop("tracks"), given.pop("calibration"), **given)
+    _, said = with_sensors_aligned(problem, known)
+    assert [f.code for f in said if f.code is not None] == ["ENCODER_STUCK"]
+
+
 def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known() -> None:
     """By marks. Beside one bubble 4 times could be a resonance of the arms."""
     _, said = placed(906, "references", scenario="S2", encoder=1 / 4, around_s=10.0)

@@ -20,7 +20,9 @@ from telerig.estimator.sensors.response import FALSE_ALARMS
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
 
 _STRETCHES = 12
-_LEAST_TRAVEL_MM = 0.3
+LEAST_TRAVEL_MM = 0.3
+"""Marks and encoder that move less (RMS) are not compared."""
+
 
 LENS_SIGMA = 1e-3
 """Standard deviation of a magnification's change since the calibration: warmth, a touched lens."""
@@ -87,7 +89,7 @@ class MarkMotion:
             np.add.at(square[:, c], part[mine], each[:, 0] ** 2)
             np.add.at(product[:, c], part[mine], each[:, :1] * each[:, 1:])
             rest += float((each[:, 1:] ** 2).sum())
-        if max(float(square.sum()), rest) < _LEAST_TRAVEL_MM**2 * len(seen) or not square.any():
+        if max(float(square.sum()), rest) < LEAST_TRAVEL_MM**2 * len(seen) or not square.any():
             return None
         used = square.sum(1) > 0
         return cls(square[used], product[used], rows, problem.axis)

@@ -8,6 +8,7 @@ from telerig.arrays import Array
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import directions, seen_of
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
+from telerig.estimator.smoothing.sensor_alignment.mark_motion import LEAST_TRAVEL_MM
 
 _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
@@ -16,7 +17,10 @@ _BEHIND = 0.2
 
 
 def stuck(problem: SmoothingProblem) -> list[Finding]:
-    """Return a finding if the encoder's reading is constant while the carriage must be moving."""
+    """Return a finding if the encoder's reading stays while the carriage must be moving.
+
+    It stays if it changes by noise only in the whole run, or not at all in a part of it.
+    """
     stage = problem.stage
     if stage is None:
         return []
@@ -25,20 +29,19 @@ def stuck(problem: SmoothingProblem) -> list[Finding]:
     t, x = t[inside], x[inside]
     if len(t) < 20:
         return []
-    change = np.flatnonzero(np.diff(x) != 0)
-    ends = np.r_[-1, change, len(x) - 1]
+    trend = np.polyval(np.polyfit(t - t[0], x, 1), t - t[0])
+    if np.ptp(x) < LEAST_TRAVEL_MM and np.ptp(trend) <= np.ptp(x - trend):
+        if not _sweeps(problem):
+            return []
+        words = f"the encoder reads {np.median(x):.6g} mm and changes by {np.ptp(x):.2g} mm in all"
+        return [_finding(f"{words}, while the carriage moves: it is stuck")]
+    ends = np.r_[-1, np.flatnonzero(np.diff(x) != 0), len(x) - 1]
     longest = int(np.argmax(np.diff(ends)))
     first, last = int(ends[longest]) + 1, int(ends[longest + 1])
-    length = float(t[last] - t[first])
-    if length < _STUCK_S or last - first < 10:
+    around = np.r_[np.diff(x[: first + 1])[-10:], np.diff(x[last:])[:10]]
+    if t[last] - t[first] < _STUCK_S or last - first < 10 or not len(around):
         return []
-    if len(change):
-        around = np.r_[np.diff(x[: first + 1])[-10:], np.diff(x[last:])[:10]]
-        pace = float(np.median(np.diff(t)))
-        moving = len(around) > 0 and np.median(np.abs(around)) / pace > _MOVING_MM_S
-    else:
-        moving = _sweeps(problem)
-    if not moving:
+    if np.median(np.abs(around)) / float(np.median(np.diff(t))) <= _MOVING_MM_S:
         return []
     return [
         _finding(
@@ -75,7 +78,7 @@ def _finding(words: str) -> Finding:
 
 
 def _sweeps(problem: SmoothingProblem) -> bool:
-    """Return whether the carriage moves according to the images, although the encoder is constant.
+    """Return whether the carriage moves according to the images, although the encoder stands.
 
     It does if marks move through the images, or if there are none and all bubbles rest in them.
     """

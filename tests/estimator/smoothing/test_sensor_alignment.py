@@ -146,11 +146,15 @@ def test_an_encoder_of_another_clock_unit_hardly_moves() -> None:
     assert "hardly any motion" in finding.warning and "t_s is in s" in finding.todo
 
 
-@pytest.mark.parametrize("begin_s", [0.0, 0.8])
-def test_a_stuck_encoder_whose_reading_changes_by_noise_is_refused(begin_s: float) -> None:
-    """Paths were RESOLVED 210 mm off."""
+@pytest.mark.parametrize(
+    ("information", "begin_s"), [("references", 0.0), ("references", 0.8), ("one", 0.0)]
+)
+def test_a_stuck_encoder_whose_reading_changes_by_noise_is_refused(
+    information: str, begin_s: float
+) -> None:
+    """Paths were RESOLVED 210 mm off. A bubble that rests in all images moves with the carriage."""
     run = run_of("S6", 905, None, around_s=2.0)
-    inputs = run.inputs("references")
+    inputs = run.inputs(information)
     rng, t = np.random.default_rng(0), run.stage["t_s"].to_numpy()
     position = run.stage["position_mm"].to_numpy().copy()
     stuck = t >= begin_s

@@ -203,6 +203,7 @@ def rig_change(
     def series_of(part: pd.DataFrame) -> Series:
         misses = ray_misses(cameras, free, _points(part), *_pixels(part, names))
         speed = part[_speed_columns(names)].to_numpy(float).reshape(-1, 2, 2)
+        middle = float(np.median(misses.variance_mm2))  # 0 if the tracks state no noise
         # half of it in each view, for then errors of both speeds and curved paths cancel
         by_delay = 0.5 * _LATE_S * np.einsum("mci,mci,c->m", misses.by_pixel, speed, [-1.0, 1.0])
         return Series(
@@ -210,7 +211,7 @@ def rig_change(
             part["particle"].to_numpy(np.int64),
             part["t_s"].to_numpy(float),
             misses.miss_mm,
-            misses.variance_mm2 / float(np.median(misses.variance_mm2)),
+            misses.variance_mm2 / middle if middle > 0 else np.ones(len(part)),
             np.column_stack([misses.by_rig @ root, by_delay]),
         )
 

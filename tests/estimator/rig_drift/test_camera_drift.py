@@ -260,6 +260,17 @@ def test_wrong_pairs_do_not_count() -> None:
     assert change.pairs < len(tracks) - 0.8 * some.sum()
 
 
+@pytest.mark.parametrize("stated", [0.0, np.nan])
+def test_tracks_that_state_no_noise_are_tested_as_well(stated: float) -> None:
+    cameras = rig(90.0)
+    tracks = Run().tracks(cameras, cameras, np.random.default_rng(0))
+    noise = [f"{c.name}_{name}_px2" for c in cameras for name in ("suu", "suv", "svv")]
+    known = rig_change(tracks, calibration(cameras))
+    bare = rig_change(tracks.assign(**dict.fromkeys(noise, stated)), calibration(cameras))
+    assert known is not None and bare is not None
+    np.testing.assert_allclose(bare[0].tangent, known[0].tangent, rtol=1e-6)
+
+
 def test_the_noise_is_learned() -> None:
     rng = np.random.default_rng(9)
     t = np.arange(500) / 100

@@ -39,13 +39,11 @@ class Channel:
 
     The readings of some accelerometers are fitted to it, to find their clocks, units and axes.
 
-    name : for messages.
     values : (n,) acceleration in mm/s^2 at the times of the frames.
     known : (n,) True where it is valid.
     sensors : indices of the accelerometers whose readings are fitted to it.
     """
 
-    name: str
     values: Array
     known: Bools
     sensors: tuple[int, ...]
@@ -82,7 +80,6 @@ class Alignment:
     reversed_log_ratio : the largest value with the record reversed in time, which is due to chance.
     at_zero_log_ratio : the largest value at lags that are possible for the clock of the frames.
     at_end : whether the best lag is the first or the last one that was tried.
-    explained : {channel: share of its variance that the sensors explain at the best lag}.
     lags_s, lag_log_ratio : all lags, and the log-likelihood ratio at each; -inf if not tried.
     """
 
@@ -94,7 +91,6 @@ class Alignment:
     reversed_log_ratio: float
     at_zero_log_ratio: float
     at_end: bool
-    explained: dict[str, float]
     lags_s: Array
     lag_log_ratio: Array
 
@@ -181,7 +177,7 @@ def align(
         float(_total(backward, sizes, tried[::-1]).max()),
         float(total[near].max(initial=-np.inf)),
         bool(np.abs(peak - ends).min() <= frames.knots),
-        {p.channel.name: float(p.explained[peak]) for p in forward}, offsets, total,
+        offsets, total,
     )  # fmt: skip
 
 

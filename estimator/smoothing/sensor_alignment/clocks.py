@@ -52,8 +52,8 @@ def encoder_clock(problem: SmoothingProblem, images: Images) -> Alignment | None
     if images.encoder is None:
         return None
     channels = [
-        Channel(f"{source} in camera {problem.cameras[c].name}", values, seen.known, (0,))
-        for c, source, seen in images.cameras
+        Channel(values, seen.known, (0,))
+        for c, _, seen in images.cameras
         if (values := along_axis(problem, c, seen)) is not None
     ]
     return align(images.grid, channels, [images.encoder], SAME_CLOCK_S) if channels else None
@@ -115,11 +115,7 @@ def clock_of(
     for other in beside:
         values, known = at_frames(images, other)
         force = values @ other.axes
-        channels += [
-            Channel(f"{other.name}, {axis}, {n}", force[:, k], known, (n,))
-            for k, axis in enumerate("xyz")
-            for n in range(len(group))
-        ]
+        channels += [Channel(f, known, (n,)) for f in force.T for n in range(len(group))]
     found = None
     if all(s.clock == "frames" for s in sensors):
         near = [near_frames(s, problem.t_s, _SHARED_S) for s in sensors]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -82,53 +83,34 @@ class Images:
         mounts = {i: problem.accelerometers[i].camera for i in group}
         number = {i: n for n, i in enumerate(group)}
         out = []
-        for camera, source, seen in self.cameras:
-            name = f"{source} in camera {problem.cameras[camera].name}"
+        for camera, _, seen in self.cameras:
             mounted = tuple(number[i] for i in group if mounts[i] in (camera, CARRIAGE))
             if mounted:
-                out += [
-                    Channel(f"{name}, {way}", seen.values[:, k], seen.known, mounted)
-                    for k, way in enumerate(("along rows", "along columns"))
-                ]
-        for source in ("marks", "bubbles"):
-            for name, values, known, two in self.differences(problem, source):
-                carried = [i for i in group if mounts[i] in two]
-                if {mounts[i] for i in carried} == set(two):
-                    out.append(Channel(name, values, known, tuple(number[i] for i in carried)))
+                out += [Channel(v, seen.known, mounted) for v in seen.values.T]
+        for values, known, two in self.differences(problem):
+            carried = [i for i in group if mounts[i] in two]
+            if {mounts[i] for i in carried} == set(two):
+                out.append(Channel(values, known, tuple(number[i] for i in carried)))
         if self.encoder is not None and not images_alone:
-            out += [
-                Channel(f"encoder, {problem.accelerometers[i].name}", self.encoder.values[:, 0],
-                        self.encoder.known, (number[i],))
-                for i in group
-            ]  # fmt: skip
+            carriage = self.encoder
+            out += [Channel(carriage.values[:, 0], carriage.known, (number[i],)) for i in group]
         return out
 
     def differences(
-        self, problem: SmoothingProblem, source: str
-    ) -> list[tuple[str, Array, Bools, tuple[int, int]]]:
-        """Return the differential accelerations of each pair of cameras along their shared
-        direction.
+        self, problem: SmoothingProblem
+    ) -> Iterator[tuple[Array, Bools, tuple[int, int]]]:
+        """Yield the differential accelerations of each pair of cameras along their shared
+        direction, of marks and of bubbles.
 
         In the difference the motion of the observed points cancels.
 
-        Returns (name, values (n,), known (n,), indices of both cameras).
+        Yields (values (n,), known (n,), indices of both cameras).
         """
-        seen = {camera: a for camera, kind, a in self.cameras if kind == source}
-        out = []
-        for first in seen:
-            for second in (c for c in seen if c > first):
-                shared = shared_rows(problem, first, second)
-                both = np.concatenate([seen[first].values, seen[second].values], 1)
-                names = [problem.cameras[c].name for c in (first, second)]
-                out.append(
-                    (
-                        f"{source}, cameras {names[0]} and {names[1]} against each other",
-                        both @ shared,
-                        seen[first].known & seen[second].known,
-                        (first, second),
-                    )
-                )
-        return out
+        for (first, kind, one), (second, other, two) in combinations(self.cameras, 2):
+            if kind == other:
+                both = np.concatenate([one.values, two.values], 1)
+                values = both @ shared_rows(problem, first, second)
+                yield values, one.known & two.known, (first, second)
 
 
 def shared_rows(problem: SmoothingProblem, first: int, second: int) -> Array:

@@ -159,12 +159,11 @@ def _fits_exchanged(
         if c in axes
         for k, d in enumerate(directions(problem.cameras[c]))
     ]
-    for source in ("marks", "bubbles"):
-        for _, differences, there, pair in images.differences(problem, source):
-            if set(pair) == set(axes):
-                weights = np.split(shared_rows(problem, *pair), 2)
-                rows = (w @ directions(problem.cameras[c]) for c, w in zip(pair, weights))
-                seen.append((differences, there, dict(zip(pair, rows))))
+    for differences, there, pair in images.differences(problem):
+        if set(pair) == set(axes):
+            weights = np.split(shared_rows(problem, *pair), 2)
+            rows = (w @ directions(problem.cameras[c]) for c, w in zip(pair, weights))
+            seen.append((differences, there, dict(zip(pair, rows))))
     fits = []
     for values, there, along in seen:
         fit = Regression.of(values, there & known, readings)

@@ -74,7 +74,7 @@ def aligned(
     seen = seen + 0.02 * rng.normal(size=seen.shape)
     images = of_positions(GRID, GRID.t_s, seen)
     felt = of_readings(GRID, t + offset_s, reading)
-    channels = [Channel("xyz"[k], images.values[:, k], images.known, (0,)) for k in range(2)]
+    channels = [Channel(images.values[:, k], images.known, (0,)) for k in range(2)]
     found = align(GRID, channels, [felt], 0.006)
     assert found is not None
     return found
@@ -112,7 +112,7 @@ def test_a_single_frequency_is_ambiguous_by_whole_periods() -> None:
     seen = -np.sin(60 * GRID.t_s)[:, None] / 3600 * 500 + 0.02 * rng.normal(size=(1000, 1))
     images = of_positions(GRID, GRID.t_s, seen)
     reading = 500 * np.sin(60 * t)[:, None] * np.ones(3) + 5 * rng.normal(size=(len(t), 3))
-    channel = Channel("x", images.values[:, 0], images.known, (0,))
+    channel = Channel(images.values[:, 0], images.known, (0,))
     found = align(GRID, [channel], [of_readings(GRID, t, reading)], 0.006)
     assert found is not None and not found.unique
 
@@ -184,7 +184,7 @@ def test_two_sensors_of_one_real_box() -> None:
     grid = replace(GRID, start_s=one[0, 0], count=int(np.ptp(one[:, 0]) / 0.002), knots=10)
     first = of_readings(grid, one[:, 0], GRAVITY * one[:, 1:])
     second = of_readings(grid, two[:, 0] + 4.0, GRAVITY * two[:, 1:])
-    channels = [Channel("xyz"[k], first.values[:, k], first.known, (0,)) for k in range(3)]
+    channels = [Channel(first.values[:, k], first.known, (0,)) for k in range(3)]
     found = align(first.grid, channels, [second], 0.006)
     assert found is not None and found.unique
     assert abs(found.offset_s - 4.0 - 1.2e-3) < 0.3e-3 + 2 * found.sd_s

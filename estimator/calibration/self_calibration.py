@@ -167,7 +167,7 @@ def _solved(
         *known,
         *misfit,
         *checks.loose_offsets(problem, start),
-        *checks.exchanged_cameras(final, solution.state),
+        *checks.scales_beside_nominal(final, solution.state),
         *mirror_ambiguity.far_rotations(solution.state, final, nominal),
         *checks.parallel_axes(solution.state),
         *checks.weak_parameters(final, own),

@@ -215,6 +215,15 @@ class Code(Enum):
         20.0,
         "degrees: the error that a stated rotation may have to decide between mirror images",
     )
+    SCALE_FAR = Kind(
+        _USABLE,
+        "the scale of {cameras} is {found:.4g} px/mm, but rig.toml says {stated:.4g}: one of its "
+        "lengths may have another unit",
+        "Check pitch_mm, scale_distance_mm and scale_px_per_mm in rig.toml: all lengths in space "
+        "are in the target's unit",
+        2.0,
+        "ratio: an inch is 2.54 cm and a cm 10 mm, and a stated scale is within 20 %",
+    )
     EXCHANGED = Kind(
         _USABLE,
         "{cameras} seem to be exchanged: their scales are {first:.3f} and {second:.3f} px/mm, "

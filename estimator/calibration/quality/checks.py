@@ -172,11 +172,12 @@ def loose_offsets(problem: Problem, state: State) -> list[Finding]:
     return [Code.OFFSET.found(cameras=problem.cameras[c].name) for c in cameras]
 
 
-def exchanged_cameras(problem: Problem, state: State) -> list[Finding]:
-    """Return a finding for each two cameras whose folders of images were probably exchanged.
+def scales_beside_nominal(problem: Problem, state: State) -> list[Finding]:
+    """Return findings of scales that contradict rig.toml: exchanged cameras, or a wrong unit.
 
-    The estimated scale of each is near the nominal scale of the other. If the nominal scales are
-    alike, nothing can be concluded, and there is none.
+    The estimated scale of each of two exchanged cameras is near the nominal scale of the other; of
+    nominal scales that are alike nothing can be concluded. Without such cameras, those are named
+    whose scale is so far from the nominal one that a unit may be wrong.
     """
     estimated = np.log(state.intrinsics[:, INDEX["scale_px_per_mm"]])
     nominal = np.log([camera["scale_px_per_mm"] for camera in problem.cameras])
@@ -189,7 +190,13 @@ def exchanged_cameras(problem: Problem, state: State) -> list[Finding]:
             numbers = dict(zip(("first", "second", "first_stated", "second_stated"), scales))
             names = [problem.cameras[c].name for c in (a, b)]
             findings.append(Code.EXCHANGED.found(cameras=names, **numbers))
-    return findings
+    if findings:
+        return findings
+    return [
+        Code.SCALE_FAR.found(cameras=camera.name, found=np.exp(scale), stated=np.exp(stated))
+        for camera, scale, stated in zip(problem.cameras, estimated, nominal)
+        if abs(scale - stated) > np.log(Code.SCALE_FAR.limit)
+    ]
 
 
 def _mirrored(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[Finding]:

@@ -168,3 +168,16 @@ def test_exchanged_cameras_are_seen_where_their_nominal_scales_differ(
     calibration = made.calibrate("radial")
     assert ("EXCHANGED" in codes(calibration)) == swapped
     assert "folders of the cameras were exchanged" in str(calibration.twin)
+
+
+@pytest.mark.parametrize(("stated", "far"), [(1.2, []), (10.0, ["SCALE_FAR"] * 2)])
+def test_a_target_in_another_unit_contradicts_the_stated_scales(
+    stated: float, far: list[str], paper: Any
+) -> None:
+    """Images fit a target in cm as well; only the nominal scales are left to contradict it."""
+    cameras = [
+        camera.with_parameters(scale_px_per_mm=stated * camera["scale_px_per_mm"])
+        for camera in paper.cameras
+    ]
+    calibration = replace(paper, cameras=cameras).calibrate("radial")
+    assert [code for code in codes(calibration) if code == "SCALE_FAR"] == far

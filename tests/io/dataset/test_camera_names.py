@@ -10,11 +10,10 @@ from rig_text import changed, error_of
 
 from telerig.errors import InputError
 from telerig.io.dataset.new_dataset import NewCamera, new_dataset
-from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes, nominal_toml
+from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes
 from telerig.io.rig_file.camera_names import camera_name_faults
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.io.tables.smoothing import SHAKE
-from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
 PAIRS = [
@@ -33,10 +32,6 @@ def imported(names: tuple[str, ...]) -> None:
     cameras_from_pinholes(files, names)
 
 
-def nominal(names: tuple[str, ...]) -> None:
-    nominal_toml([Camera.create(name, (512, 512), 10.0) for name in names])
-
-
 @pytest.mark.parametrize("names", PAIRS)
 def test_names_that_rig_toml_refuses_are_refused_where_they_are_first_given(
     names: tuple[str, str], tmp_path: Path
@@ -47,7 +42,6 @@ def test_names_that_rig_toml_refuses_are_refused_where_they_are_first_given(
     assert fault.what in error_of(text)
     for give in (
         imported,
-        nominal,
         lambda names: new_dataset(tmp_path / "new", [NewCamera(n) for n in names]),
     ):
         with pytest.raises(InputError) as caught:

@@ -113,9 +113,9 @@ _LEAST_LEARNED_S = 0.2
 """Shortest time of a bubble for which shake is learned. In less time a slow shake shows no period,
 and learning would find no shake.
 """
-_SIZED_FRAMES, _SIZING_PASSES, _ARM_PASSES = 600, 3, 8
-"""Frames in the middle of a run that set the RMS of guessed modes, and passes over them; passes
-over a run with an arm that has no sensor, each of which halves what its motion's size is off."""
+_SIZED_FRAMES, _SIZING_PASSES, _BAND_PASSES = 600, 3, 8
+"""Frames in the middle of a run that set the RMS of guessed modes, and passes over them; the most
+passes that set broad bands where no marks show them, each of which halves what is off."""
 
 
 @showing_progress
@@ -703,7 +703,10 @@ def _adapted_solution(
     first, unfelt = model, not given and any(b.camera == ARMS for b in model.broad_bands)
     if unfelt:
         model = replace(model, accelerometer_delay_sigma_s=0.0)
-    for _ in range(_SIZING_PASSES if guessed else _ARM_PASSES if unfelt else 1):
+    passes = _SIZING_PASSES if guessed else 1
+    if model.broad_bands and not len(problem.references):
+        passes = _BAND_PASSES
+    for _ in range(passes):
         bare = None if last is None else replace(last, covariances=None, draws=None)
         last = solve(part, model, options, progress, start=bare)
         better = None if given else adapted(last, first)

@@ -44,7 +44,7 @@ _SHORT_TRACKS, _SHORT_SAMPLES = 100, 16
 _HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
 _CLEAR = 0.2
-_SHAKE_HZ = (4.0, 60.0)
+_SHAKE_HZ = (1.0, 60.0)
 STRONG_MM_S2 = 5000.0
 """Shake whose accelerations are larger gets a steeper tail; see docs/decisions/010."""
 DEFAULT_FLOOR = 0.12
@@ -226,7 +226,26 @@ def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> Carr
     if not problem.accelerometers and _dense(stage, encoder_sigma_mm):
         return CarriageModel()
     rms = acceleration_rms(stage, encoder_sigma_mm)
-    return CarriageModel("force", acceleration_rms_mm_s2=max(rms, 100.0))
+    unread = min(
+        (unread_mm_s2(a, stage, problem.axis) for a in problem.accelerometers), default=0.0
+    )
+    return CarriageModel("force", acceleration_rms_mm_s2=max(rms, unread, 100.0))
+
+
+def unread_mm_s2(sensor: Accelerometer, stage: Stage, axis: Array) -> float:
+    """Return the RMS acceleration along the travel that a sensor feels between encoder readings.
+
+    An encoder that is read at 20 Hz hides what a servo does at 15 Hz. What all sensors feel of it
+    may be the carriage's.
+    """
+    step = float(np.median(np.diff(stage.t_s))) if len(stage.t_s) > 1 else 0.0
+    along = sensor.reading_mm_s2 @ (sensor.axes @ axis)
+    samples = round(step / max(float(np.median(np.diff(sensor.t_s))), 1e-9))
+    if samples < 2 or len(along) < samples:
+        return 0.0
+    slow = np.convolve(along, np.ones(samples) / samples, "valid")
+    first = samples // 2
+    return float(np.std(along[first : first + len(slow)] - slow))
 
 
 def _dense(stage: Stage, sigma_mm: float) -> bool:
@@ -300,7 +319,13 @@ def adapted(solution: Solution, start: ShakeModel | None = None) -> ShakeModel |
         fresh = rescaled(better, factor, _dominant_hz(solution))
         graph = solution.graph
         offsets = graph.offsets(solution.state.shake)
-        floor = fitted_floor(graph.problem.t_s, offsets, fresh.broad_bands)
+        floor = fitted_floor(
+            graph.problem.t_s,
+            offsets,
+            fresh.broad_bands,
+            model.broad_bands,
+            _felt_noise(graph.problem),
+        )
         moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
         if max(np.max(np.abs(np.log(factor))), moved) > _RESCALE_BEYOND:
             bands = (b if floor is None else replace(b, floor=floor) for b in fresh.broad_bands)
@@ -369,16 +394,36 @@ def _size_of_offsets(solution: Solution) -> Array:
     return factor
 
 
-def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) -> float | None:
+def _felt_noise(problem: SmoothingProblem) -> float:
+    """Return the density of the accelerometers' noise, (mm/s^2)^2 / Hz; 0 where marks show the
+    offsets, slow ones too."""
+    if len(problem.references):
+        return 0.0
+    sensors = (a for a in problem.accelerometers if len(a.t_s) > 1)
+    densities = [2 * float(np.median(np.diff(a.t_s))) * a.sigma_mm_s2**2 for a in sensors]
+    return float(np.median(densities or [0.0]))
+
+
+def fitted_floor(
+    t_s: Array,
+    offsets_mm: Array,
+    bands: tuple[BroadBand, ...],
+    before: tuple[BroadBand, ...] = (),
+    felt_noise: float = 0.0,
+) -> float | None:
     """Return the low-frequency floor of the broad bands by Whittle's likelihood of the offsets.
 
     The floor is the density below the band relative to the density in it. It decides how well the
     slow motion of a bubble is known. The likelihood (Whittle, Arkiv foer Matematik 2, 1953) covers
     the frequencies below 0.4 of the band; the prior is a factor of two about `DEFAULT_FLOOR`.
+    Accelerometers show slow offsets o with a noise n that grows as f^-4, so that the estimate is
+    G (o + n) with the gain G of Wiener's filter for the prior with which it was made.
 
     t_s : (F,).
     offsets_mm : (F, C, 3) estimated offsets of the cameras, 0 along unseen axes.
     bands : one for each camera.
+    before : those with which the offsets were estimated.
+    felt_noise : density of the accelerations' noise, (mm/s^2)^2 / Hz; 0 where offsets are seen.
 
     Returns None for a short run, and if a band is common to the cameras or steep.
     """
@@ -397,12 +442,18 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
         broad_band(1.0, low_hz=low_hz, high_hz=high_hz, floor=floor).density(frequency[low])
         for floor in _FLOORS.tolist()
     ]
-    for band in bands:
+    noise = felt_noise / (2 * np.pi * frequency[low]) ** 4
+    for band, prior in zip(bands, before or bands):
+        made = broad_band(
+            1.0, low_hz=prior.low_hz, high_hz=prior.high_hz, floor=prior.floor
+        ).density(frequency[low])
         for axis in range(3):
             series = np.interp(even, t, offsets_mm[:, band.camera, axis])
             if series.std() < _UNSEEN_MM:
                 continue
-            density = band.rms_mm[axis] ** 2 * np.array(unit)
+            gain = prior.rms_mm[axis] ** 2 * made
+            gain = gain / (gain + noise)
+            density = gain**2 * (band.rms_mm[axis] ** 2 * np.array(unit) + noise)
             seen = _periodogram(series, step)[low]
             score -= _INDEPENDENT * np.sum(np.log(density) + seen / density, axis=-1)
     return float(_FLOORS[np.argmax(score)])

@@ -21,11 +21,13 @@ from telerig.estimator.smoothing.learning.default_priors import (
     fitted_floor,
     fitted_variance,
     rescaled,
+    unread_mm_s2,
     zigzag,
 )
 from telerig.estimator.smoothing.problem.problem import (
     ARMS,
     CARRIAGE,
+    Accelerometer,
     BroadBand,
     ShakeModel,
     SmoothingProblem,
@@ -110,6 +112,50 @@ def test_the_floor_of_strong_shake_is_not_taken_from_what_the_prior_has_shrunk()
     strong = tuple(replace(b, tail=3) for b in _bands())
     assert fitted_floor(*_offsets(0.1, 4.0, 0), _bands()) is not None
     assert fitted_floor(*_offsets(0.1, 4.0, 0), strong) is None
+
+
+def _as_accelerometers_show(
+    t: np.ndarray, offsets: np.ndarray, noise: float, floor: float, seed: int
+) -> np.ndarray:
+    """The offsets by Wiener's filter from accelerations with a noise of this density."""
+    rng, step = np.random.default_rng(seed), float(t[1] - t[0])
+    frequency = np.maximum(np.fft.rfftfreq(len(t), step), 1e-3)
+    hidden = noise / (2 * np.pi * frequency) ** 4
+    of = broad_band(RMS_MM, floor=floor, **BAND).density(frequency)
+    drawn = rng.normal(size=(len(frequency), 2, 3, 2)) @ np.array([1.0, 1j])
+    scale = np.sqrt(hidden * len(t) / (4 * step))[:, None, None]
+    gain = (of / (of + hidden))[:, None, None]
+    seen = np.fft.irfft(gain * (np.fft.rfft(offsets, axis=0) + scale * drawn), len(t), axis=0)
+    seen[..., 2] = 0.0
+    return seen
+
+
+@pytest.mark.parametrize(("floor", "noise"), [(0.12, 5.0), (0.3, 30.0)])
+def test_the_floor_is_found_from_accelerometers_which_do_not_show_slow_offsets(floor, noise):
+    """Their noise is as large as the offsets at some 3 Hz; the band's low end is at 4.8 Hz."""
+    made, ratios = _bands(), []
+    for seed in range(8):
+        t, offsets = _offsets(floor, 4.0, seed)
+        seen = _as_accelerometers_show(t, offsets, noise, DEFAULT_FLOOR, 100 + seed)
+        found = [fitted_floor(t, seen, made), fitted_floor(t, seen, made, made, noise)]
+        ratios.append(np.log(np.array(found, float) / floor))
+    naive, mine = np.exp(np.mean(ratios, axis=0))
+    assert mine == pytest.approx(1.0, rel=0.45)
+    assert naive < 0.8 * mine
+
+
+def test_a_carriage_may_move_as_sensors_feel_it_between_the_readings_of_a_slow_encoder():
+    """A servo at 15 Hz, which an encoder read at 20 Hz shows at 5 Hz."""
+    t, w = np.arange(0, 10, 5e-4), 2 * np.pi * 15
+    felt = np.zeros((len(t), 3))
+    felt[:, 1] = -0.07 * w**2 * np.sin(w * t)
+    axis, found = np.array([0.0, -1.0, 0.0]), []
+    for every in (100, 4):  # read at 20 and at 500 Hz
+        read = Stage(t[::every], 280 * t[::every] - 0.07 * np.sin(w * t[::every]))
+        sensor = Accelerometer("arm", 0, t, felt, np.eye(3), 7.0)
+        found.append(unread_mm_s2(sensor, read, axis))
+    assert 0.6 < found[0] / np.std(felt[:, 1]) < 1.1
+    assert found[1] < 0.05 * found[0]
 
 
 def test_a_size_is_that_of_the_data_where_they_show_it_and_the_default_where_not():

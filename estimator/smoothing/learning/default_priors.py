@@ -226,9 +226,8 @@ def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> Carr
     if not problem.accelerometers and _dense(stage, encoder_sigma_mm):
         return CarriageModel()
     rms = acceleration_rms(stage, encoder_sigma_mm)
-    unread = min(
-        (unread_mm_s2(a, stage, problem.axis) for a in problem.accelerometers), default=0.0
-    )
+    whole = (a for a in problem.accelerometers if not a.unused_axes)
+    unread = min((unread_mm_s2(a, stage, problem.axis) for a in whole), default=0.0)
     return CarriageModel("force", acceleration_rms_mm_s2=max(rms, unread, 100.0))
 
 
@@ -237,6 +236,8 @@ def unread_mm_s2(sensor: Accelerometer, stage: Stage, axis: Array) -> float:
 
     An encoder that is read at 20 Hz hides what a servo does at 15 Hz. What all sensors feel of it
     may be the carriage's.
+
+    axis : (3,) direction of travel in the rig frame.
     """
     step = float(np.median(np.diff(stage.t_s))) if len(stage.t_s) > 1 else 0.0
     along = sensor.reading_mm_s2 @ (sensor.axes @ axis)

@@ -83,7 +83,7 @@ def _row(
     if shape is not None:
         row["shape_hz"], row["s_shape_hz"] = shape.frequency_hz, shape.s_frequency_hz
         row["shape_amplitude"], row["s_shape_amplitude"] = shape.major, shape.s_major
-    return row | _numbers(row, mine, liquid)
+    return row | _numbers(row, mine, liquid, lasting.scale)
 
 
 def _mean(values: pd.Series[Any]) -> float:
@@ -165,15 +165,27 @@ def _shape_oscillation(
     return found
 
 
-def _numbers(row: dict[str, Any], mine: pd.DataFrame, liquid: Liquid | None) -> dict[str, float]:
-    """Dimensionless numbers of the means, and the mean drag coefficient."""
+def _numbers(
+    row: dict[str, Any], mine: pd.DataFrame, liquid: Liquid | None, scale: float
+) -> dict[str, float]:
+    """Dimensionless numbers of the means, and the mean drag coefficient.
+
+    scale : relative standard deviation of lengths, an error that size and speed have in common.
+    """
     d, slip = row["d_eq_mm"], row["slip_mm_s"] or float("nan")
     size, speed = row["sd_eq_mm"] / d, row["s_slip_mm_s"] / slip
+    common = min(scale**2, size * speed)
+
+    def relative(d_power: int, slip_power: int, *others: float) -> float:
+        squares = (d_power * size) ** 2 + (slip_power * speed) ** 2
+        squares += 2 * d_power * slip_power * common + sum(o**2 for o in others)
+        return float(np.sqrt(squares))
+
     out = {}
     if "zigzag_hz" in row:
         out["strouhal"] = row["zigzag_hz"] * d / slip
-        relative = (row["s_zigzag_hz"] / row["zigzag_hz"], size, speed)
-        out["s_strouhal"] = out["strouhal"] * float(np.linalg.norm(relative))
+        swing = row["s_zigzag_hz"] / row["zigzag_hz"]
+        out["s_strouhal"] = out["strouhal"] * relative(1, -1, swing)
     if liquid is None:
         return out
     metres, metres_s = 1e-3 * d, 1e-3 * slip
@@ -183,11 +195,11 @@ def _numbers(row: dict[str, Any], mine: pd.DataFrame, liquid: Liquid | None) -> 
         ("eotvos", liquid.eotvos(metres), (2, 0)),
     ):
         out[name] = float(value)
-        out[f"s_{name}"] = float(value) * float(np.hypot(powers[0] * size, powers[1] * speed))
+        out[f"s_{name}"] = float(value) * relative(*powers)
     out["drag"] = _mean(mine["drag"])
     # The mean of the acceleration is a difference of two velocities over the lifetime.
     ends = mine["s_slip_mm_s"].to_numpy(float)[[0, -1]]
     inertia = float(np.hypot(*ends)) / (row["lifetime_s"] or float("nan"))
     inertia *= _mean(mine["added_mass"]) * 1e-3 / liquid.gravity
-    out["s_drag"] = abs(out["drag"]) * float(np.linalg.norm((size, 2 * speed, inertia)))
+    out["s_drag"] = abs(out["drag"]) * relative(1, -2, inertia)
     return out

@@ -96,10 +96,12 @@ def apply_homography(homography: Array, points: ArrayLike) -> Array:
 def epipolar_products(first: Array, second: Array) -> Array:
     """Return the products (..., 9) of (u, v, 1) and (u', v', 1), in which x'^T F x is linear.
 
-    first, second : (..., 2) pixels of the same points in two cameras.
+    first, second : (..., 2) pixels of the same points in two cameras; NaN where a camera did not
+        see one, and so are all products then.
     """
-    one, two = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (first, second))
-    return np.asarray((one[..., :, None] * two[..., None, :]).reshape(*one.shape[:-1], 9))
+    seen = np.where(np.isfinite(first + second).all(-1, keepdims=True), 1.0, np.nan)
+    one, two = (np.concatenate([p, np.ones_like(seen)], -1) for p in (first, second))
+    return np.asarray(seen * (one[..., :, None] * two[..., None, :]).reshape(*one.shape[:-1], 9))
 
 
 def fit_affine(source: ArrayLike, target: ArrayLike) -> Array:

@@ -70,6 +70,21 @@ def test_only_images_of_one_moment_have_one_epipolar_geometry(
     assert checks.epipolar_misfits(right, (0, 1), by).min() > 10 * UNPAIRED
 
 
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_dots_that_one_camera_did_not_see_make_right_pairs_no_wrong_ones(
+    share: float, paper: Any
+) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        table = paper.dots[rng.random(len(paper.dots)) > share]
+        problem = problem_from_dots(table, paper.cameras, paper.target)
+        assert checks.epipolar_misfits(problem, (0, 1), 0).max() < 1e-7
+        checks.refuse_wrong_pairs(problem)
+        shifted = problem_from_dots(offset(table, "right", 0, 1), paper.cameras, paper.target)
+        with pytest.raises(CalibrationError, match="do not belong to the views"):
+            checks.refuse_wrong_pairs(shifted)
+
+
 @pytest.mark.parametrize("camera", ["left", "middle", "right"])
 @pytest.mark.parametrize("by", [1, -2])
 def test_wrong_images_of_one_of_three_cameras_are_named(camera: str, by: int, scene: Any) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
@@ -28,6 +28,7 @@ from telerig.estimator.calibration.thresholds import (
     CLEAR_MISFIT,
     COPY_CHANCE,
     FAR_BETTER,
+    FAR_BETTER_OF_TWO,
     LEAST_DOTS,
     LEAST_VIEWS,
     PARALLEL_DEG,
@@ -375,25 +376,31 @@ def _better_pairing(
 
     farthest : largest offset that is tried.
     """
-    offsets = [s * n for n in range(1, farthest + 1) for s in (1, -1)]
-    own, *shifted = (epipolar_misfits(problem, pair, s) for s in (0, *offsets))
-    least, best = np.min(shifted, axis=0), np.argmin(shifted, axis=0)
-    far = np.isfinite(own) & (own > UNPAIRED) & (least < FAR_BETTER * own)
-    if not far.any():
+    own, _ = epipolar_misfits(problem, pair, 0)
+    suspect = np.isfinite(own) & (own > UNPAIRED)
+    if not suspect.any():
         return (0, 0) if np.isfinite(own).any() else None
+    offsets = [s * n for n in range(1, farthest + 1) for s in (1, -1)]
+    shifted, views = np.swapaxes([epipolar_misfits(problem, pair, s) for s in offsets], 0, 1)
+    least = np.where(suspect, own, 0.0) * np.where(views < WINDOW, FAR_BETTER_OF_TWO, FAR_BETTER)
+    far = (shifted < least).any(0)
+    if not far.any():
+        return 0, 0
+    best = np.where(shifted < least, shifted, np.inf).argmin(0)
     chosen = int(np.bincount(best[far]).argmax())
     return int(np.flatnonzero(far & (best == chosen))[0]), offsets[chosen]
 
 
-def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Array:
+def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> tuple[Array, Array]:
     """Return how far the dots of every `WINDOW` consecutive views are from one epipolar geometry.
 
     It is that of dots which both cameras saw at the same time (`epipolar_products`).
 
     pair : indices of the cameras. offset : by how many views the second one's images are later.
-    Returns the mean squares (W,) of x'^T F x with the F of unit norm that makes them least, in
-    units of half the image; infinite where fewer than two views show enough dots to both cameras,
-    or all together less than twice as many as F has elements.
+    Returns the mean squares (W,) of x'^T F x, of all dots but the worst tenth, with the F of unit
+    norm that makes them least, in units of half the image; infinite where fewer than two views show
+    enough dots to both cameras, or all together less than twice as many as F has elements. And the
+    numbers (W,) of such views.
     """
     count = len(problem.views)
     pixels = np.full((2, count, len(problem.dot_ids), 2), np.nan)
@@ -402,12 +409,31 @@ def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> Ar
         mine = (problem.camera == c) & (view >= 0) & (view < count)
         own[view[mine], problem.dot[mine]] = problem.uv_px[mine] / half - 1
     products = epipolar_products(*pixels)
-    both = np.isfinite(products[..., 0]).sum(1)
-    products = np.where((both >= LEAST_DOTS)[:, None, None], np.nan_to_num(products), 0.0)
-    moments = products.mT @ products
-    first = np.arange(count - WINDOW + 1)
+    both = np.asarray(np.isfinite(products[..., 0]))
+    both = both & (both.sum(1) >= LEAST_DOTS)[:, None]
+    first = np.arange(max(count - WINDOW + 1, 0))
     windows = first[:, None] + np.arange(WINDOW)
-    many = both[windows].sum(1)
-    least = np.linalg.eigvalsh(moments[windows].sum(1))[:, 0]
-    shown = ((both[windows] >= LEAST_DOTS).sum(1) > 1) & (many >= 2 * products.shape[-1])
-    return np.where(shown, np.maximum(least, 0) / np.maximum(many, 1), np.inf)
+    views, seen = both.any(1)[windows].sum(1), both[windows].reshape(len(first), -1)
+    shown = (views > 1) & (seen.sum(1) >= 2 * products.shape[-1])
+    rows = np.nan_to_num(products)[windows[shown]].reshape(-1, seen.shape[1], products.shape[-1])
+    out = np.full(len(first), np.inf)
+    out[shown] = _trimmed_misfits(rows, seen[shown])
+    return out, views
+
+
+def _trimmed_misfits(rows: Array, seen: Bools, rounds: int = 4) -> Array:
+    """Return the least mean squares (W,) of rows (W, n, m) times a unit vector (m,).
+
+    They are of the 90 % of the rows seen (W, n) that fit best, so that a few dots which are not
+    where they should be do not hide the others: found in turns (Rousseeuw and Van Driessen,
+    Technometrics 41:212, 1999).
+    """
+    kept, count = seen, np.ceil(0.9 * seen.sum(1)).astype(int)
+    for turn in range(rounds + 1):
+        chosen = rows * kept[..., None]
+        values, vectors = np.linalg.eigh(chosen.mT @ chosen)
+        if turn < rounds:
+            squares = np.where(seen, (rows @ vectors[..., :1])[..., 0] ** 2, np.inf)
+            limit = np.take_along_axis(np.sort(squares, 1), count[:, None] - 1, 1)
+            kept = squares <= limit
+    return np.asarray(np.maximum(values[:, 0], 0) / np.maximum(kept.sum(1), 1))

@@ -66,8 +66,22 @@ def test_only_images_of_one_moment_have_one_epipolar_geometry(
         with pytest.raises(CalibrationError, match="do not belong to the views"):
             checks.refuse_wrong_pairs(shifted)
     right = problem_from_dots(paper.dots, paper.cameras, paper.target)
-    assert checks.epipolar_misfits(right, (0, 1), 0).max() < 1e-7
-    assert checks.epipolar_misfits(right, (0, 1), by).min() > 10 * UNPAIRED
+    assert checks.epipolar_misfits(right, (0, 1), 0)[0].max() < 1e-7
+    assert checks.epipolar_misfits(right, (0, 1), by)[0].min() > 5 * UNPAIRED
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05])
+def test_bad_dots_make_right_pairs_no_wrong_ones(share: float, scene: Any) -> None:
+    """Where two views are left at an end, those of other moments may fit well by chance."""
+    for seed in range(10):
+        made = scene("paper", seed)
+        for draw in range(15):
+            rng = np.random.default_rng([seed, draw])
+            bad = (rng.random(len(made.dots)) < share)[:, None]
+            error = 100 * bad * rng.standard_normal((len(bad), 2))
+            u, v = made.dots["u_px"] + error[:, 0], made.dots["v_px"] + error[:, 1]
+            dots = made.dots.assign(u_px=u, v_px=v)
+            checks.refuse_wrong_pairs(problem_from_dots(dots, made.cameras, made.target))
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
@@ -78,7 +92,7 @@ def test_dots_that_one_camera_did_not_see_make_right_pairs_no_wrong_ones(
     for _ in range(20):
         table = paper.dots[rng.random(len(paper.dots)) > share]
         problem = problem_from_dots(table, paper.cameras, paper.target)
-        assert checks.epipolar_misfits(problem, (0, 1), 0).max() < 1e-7
+        assert checks.epipolar_misfits(problem, (0, 1), 0)[0].max() < 1e-7
         checks.refuse_wrong_pairs(problem)
         shifted = problem_from_dots(offset(table, "right", 0, 1), paper.cameras, paper.target)
         with pytest.raises(CalibrationError, match="do not belong to the views"):

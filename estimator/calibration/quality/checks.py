@@ -413,9 +413,10 @@ def epipolar_misfits(problem: Problem, pair: tuple[int, int], offset: int) -> tu
     both = both & (both.sum(1) >= LEAST_DOTS)[:, None]
     first = np.arange(max(count - WINDOW + 1, 0))
     windows = first[:, None] + np.arange(WINDOW)
-    views, seen = both.any(1)[windows].sum(1), both[windows].reshape(len(first), -1)
+    views, each = both.any(1)[windows].sum(1), WINDOW * both.shape[1]
+    seen = both[windows].reshape(-1, each)
     shown = (views > 1) & (seen.sum(1) >= 2 * products.shape[-1])
-    rows = np.nan_to_num(products)[windows[shown]].reshape(-1, seen.shape[1], products.shape[-1])
+    rows = np.nan_to_num(products)[windows[shown]].reshape(-1, each, products.shape[-1])
     out = np.full(len(first), np.inf)
     out[shown] = _trimmed_misfits(rows, seen[shown])
     return out, views

@@ -293,17 +293,19 @@ def best_start(
 ) -> tuple[Problem, State]:
     """Return a start for the calibration: of several closed-form states the one that fits best.
 
-    Each is improved by a few iterations before the costs are compared. The problem is returned,
-    too, because which side of a two-sided plate carries the dots is decided by the same costs.
+    Each is improved by a few iterations before the costs are compared, without dots that are far
+    from all others of their image. The problem is returned, too, because which side of a two-sided
+    plate carries the dots is decided by the same costs.
 
     dots_mm : (N, 3) positions of the target's dots. nominal : nominal rotation vectors in degrees
     by the camera's index; they decide between states that fit equally well (see
     `mirror_ambiguity.consistent_start`).
     """
+    near = known_target.without_wrong_dots(problem, dots_mm)
     if len(problem.cameras) == 1:
-        return problem, known_target.stereo_states(problem, dots_mm)[0]
+        return problem, known_target.stereo_states(near, dots_mm)[0]
     options = []
-    for side in known_target.plate_sides(problem):
+    for side in known_target.plate_sides(near):
         starts = known_target.stereo_states(side, dots_mm)
         if np.any(side.plate_shift):  # refraction distinguishes mirrored solutions
             starts += [mirror_ambiguity.mirrored_state(start) for start in starts]
@@ -311,7 +313,8 @@ def best_start(
         options.append((min(fit.cost for fit in fits), side, fits))
     _, side, fits = min(options, key=lambda option: option[0])
     states, costs = [fit.state for fit in fits], [fit.cost for fit in fits]
-    return side, mirror_ambiguity.consistent_start(states, costs, side, nominal or {})
+    start = mirror_ambiguity.consistent_start(states, costs, side, nominal or {})
+    return replace(side, weight=problem.weight), start
 
 
 def _rough_fit(problem: Problem, start: State) -> Solution:

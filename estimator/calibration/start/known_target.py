@@ -11,9 +11,10 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state, on_a_line
 from telerig.estimator.calibration.thresholds import LEAST_DOTS, STRONG_PERSPECTIVE
@@ -25,6 +26,8 @@ from telerig.rig.pose import nearest_rotation
 
 NEAR_PARALLEL = float(np.sin(np.radians(Code.NEAR_PARALLEL.limit)))
 """Sine of the angle between two optical axes below which they are nearly parallel."""
+_FOR_HOMOGRAPHY = 8
+"""Dots of an image from which a homography is fitted to them: it needs four."""
 _FLIP = np.array([1.0, 1.0, -1.0])
 _MIRROR = np.outer(_FLIP, _FLIP)
 
@@ -61,6 +64,45 @@ def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageM
     return out
 
 
+def without_wrong_dots(problem: Problem, dots_mm: Array) -> Problem:
+    """Return the problem with weight 0 for dots that are far from where most of their image are.
+
+    A start is a least-squares fit, which a few wrong dots turn or decide. Those are left out that
+    are ten times as far from the homography of their image as half of the dots, and 0.1 % of the
+    dots' spread, whatever the lens.
+
+    dots_mm : (N, 3) positions of the target's dots.
+    """
+    weight = problem.weight.copy()
+    for v in range(len(problem.views)):
+        for c in range(len(problem.cameras)):
+            rows = np.flatnonzero((problem.view == v) & (problem.camera == c) & problem.kept)
+            seen, uv = dots_mm[problem.dot[rows], :2], problem.uv_px[rows]
+            near = _near_one_homography(seen, uv)
+            if len(seen) >= _FOR_HOMOGRAPHY and not on_a_line(seen[near]):
+                weight[rows[~near]] = 0.0
+    return replace(problem, weight=weight)
+
+
+def _near_one_homography(xy_mm: Array, uv_px: Array) -> Bools:
+    """Return which dots (N,) are near the homography that half of them fit best.
+
+    By the least median of squares (Rousseeuw, JASA 79:871, 1984), and a fit to what is near it.
+    """
+    near = np.ones(len(xy_mm), bool)
+    if len(xy_mm) < _FOR_HOMOGRAPHY:
+        return near
+    homography, _ = cv2.findHomography(xy_mm, uv_px, cv2.LMEDS)
+    spread = np.sqrt(((uv_px - uv_px.mean(0)) ** 2).sum(1).mean())
+    for _ in range(2):
+        if homography is None:
+            break
+        away = np.linalg.norm(uv_px - apply_homography(homography, xy_mm), axis=1)
+        near = np.asarray(away <= max(10 * np.median(away), 1e-3 * spread))
+        homography = fit_homography(xy_mm[near], uv_px[near])
+    return near
+
+
 def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
     """Return an affine map, or the homography where that has less than half the squared misfit."""
     middle = xy_mm.mean(0)
@@ -69,7 +111,7 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
     affine: Array = np.asarray(np.linalg.lstsq(design, uv_px, rcond=None)[0], np.float64)
     misfit = ((uv_px - design @ affine) ** 2).sum()
     bend = np.zeros(2)
-    if len(xy_mm) >= 8:
+    if len(xy_mm) >= _FOR_HOMOGRAPHY:
         homography = fit_homography(design[:, :2], uv_px)
         better = ((uv_px - apply_homography(homography, design[:, :2])) ** 2).sum()
         if better < 0.5 * misfit:

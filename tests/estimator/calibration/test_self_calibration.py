@@ -11,6 +11,8 @@ import pytest
 from finding_codes import codes, only
 
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.self_calibration import best_start
+from telerig.estimator.calibration.solver.problem import problem_from_dots
 from telerig.io.results.findings import Code
 from telerig.io.simulation.presets import preset
 from telerig.rig.camera import Camera
@@ -221,6 +223,24 @@ def test_the_plate_of_a_two_sided_target_decides(scene: Any) -> None:
     assert made.space_rms_um(alone) < 1.5
     with pytest.raises(CalibrationError, match="refraction in the two-sided plate"):
         made.calibrate("radial", nominal_rotvec_deg=(0, -150, 0))
+
+
+@pytest.mark.parametrize("seed", [3, 5, 6, 9, 109])
+def test_a_few_wrong_dots_do_not_decide_which_side_of_the_plate_carries_them(
+    seed: int, scene: Any
+) -> None:
+    """They cost more than the wrong side does, which leaves 0.1-0.3 px in all others."""
+    made = scene("two_sided", seed)
+    rng = np.random.default_rng(seed)
+    bad = (rng.random(len(made.dots)) < 0.03)[:, None]
+    u, v = (made.dots[["u_px", "v_px"]] + 60 * bad * rng.standard_normal((len(bad), 2))).T.values
+    exact, spoilt = (
+        problem_from_dots(dots, made.cameras, made.target)
+        for dots in (made.dots, made.dots.assign(u_px=u, v_px=v))
+    )
+    right, found = (best_start(p, p.nominal_mm)[0] for p in (exact, spoilt))
+    np.testing.assert_array_equal(found.plate_shift, right.plate_shift)
+    assert np.all(found.weight == 1)
 
 
 def test_strong_perspective_decides_and_contradicts(scene: Any) -> None:

@@ -183,7 +183,7 @@ def _reason(distance: float, lost_view: bool, limit: float) -> str:
 
 
 def misfits(fit: Fit, statistics: Mapping[str, Any]) -> list[Finding]:
-    """Return findings on how far the model describes the images as a whole, and each view."""
+    """Return findings on how far the model describes the images as a whole, and each image."""
     found = []
     scatter = {name: statistics[name] for name in ("scatter_px", "image_noise_px")}
     floor, chi2 = statistics["noise_floor_px"], statistics["chi2_dof"]
@@ -197,13 +197,18 @@ def misfits(fit: Fit, statistics: Mapping[str, Any]) -> list[Finding]:
     if abs(chi2 - 1) > max(Code.CHI_SQUARE.limit, spread):
         found.append(Code.CHI_SQUARE.found(chi2_dof=chi2))
     problem = fit.robust.problem
-    measured = np.bincount(problem.view, minlength=len(problem.views)).tolist()
-    kept = np.bincount(problem.view[problem.kept], minlength=len(problem.views)).tolist()
-    return found + [
-        Code.ODD_VIEW.found(views=name, kept=k, dots=n)
-        for name, k, n in zip(problem.views, kept, measured)
-        if k < Code.ODD_VIEW.limit * n
-    ]
+    measured, kept = np.zeros((2, len(problem.views), len(problem.cameras)))
+    np.add.at(measured, (problem.view, problem.camera), 1)
+    np.add.at(kept, (problem.view, problem.camera), problem.kept)
+    odd = kept < Code.ODD_VIEW.limit * measured
+    for view in np.flatnonzero(odd.any(1)):
+        cameras, numbers = np.flatnonzero(odd[view]), (kept[view], measured[view])
+        few, dots = (float(n[cameras].sum()) for n in numbers)
+        names = [problem.cameras[c].name for c in cameras]
+        found.append(
+            Code.ODD_VIEW.found(views=problem.views[view], cameras=names, kept=few, dots=dots)
+        )
+    return found
 
 
 def _statistics(fit: Fit, joint: JointCovariance, residuals: pd.DataFrame) -> dict[str, Any]:

@@ -101,11 +101,11 @@ class Code(Enum):
     )
     ODD_VIEW = Kind(
         _USABLE,
-        "{views}: only {kept:.0f} of its {dots:.0f} dots agree with the other views",
+        "{views}, {cameras}: only {kept:.0f} of its {dots:.0f} dots agree with the other views",
         "Check whether its dots are numbered wrongly, or whether the target moved between the "
         "cameras' images",
         0.5,
-        "share of its dots: most of the view disagrees",
+        "share of an image's dots: most of them disagree",
     )
     PATTERN = Kind(
         _USABLE,

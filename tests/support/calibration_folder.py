@@ -74,7 +74,12 @@ def _content(cameras: tuple[Camera, ...], views: dict[str, Pose]) -> dict[str, A
         "name": "tank <2>",
         "gauge": "the gauge in words",
         "findings": [
-            {"code": "ODD_VIEW", "views": ["<odd> &"], "numbers": {"kept": 6, "dots": 15}},
+            {
+                "code": "ODD_VIEW",
+                "views": ["<odd> &"],
+                "cameras": ["left"],
+                "numbers": {"kept": 6, "dots": 15},
+            },
             {"code": "NOTE", "text": "a note"},
         ],
         "verdict": {"status": "USABLE, with warnings"},

@@ -89,8 +89,10 @@ def test_a_hopeless_view_is_left_out_and_named(seed: int, cameras: list[str], pa
     assert paper.space_rms_um(calibration) < 1.0
     assert calibration.statistics["noise_floor_px"] == 0
     assert not np.any(made.weights(calibration)[bad] > 0.5)
+    named = only(calibration, Code.ODD_VIEW)
+    assert named.views == ("view04",)
+    assert set(cameras) <= set(named.cameras)
     if len(cameras) == 2:
-        assert only(calibration, Code.ODD_VIEW).views == ("view04",)
         reasons = calibration.residuals.loc[calibration.residuals["view"] == "view04", "reason"]
         assert (reasons != "").all()
 

@@ -63,7 +63,7 @@ def test_page_is_whole_small_and_loads_nothing(report: Path) -> None:
 
 def test_page_says_verdict_parameters_and_everything_else(report: Path) -> None:
     text = Page(report).text
-    odd = text.index("View '<odd> &': only 6 of its 15 dots agree")
+    odd = text.index("View '<odd> &', camera 'left': only 6 of its 15 dots agree")
     assert text.index("USABLE, with warnings") < odd < text.index("Cameras", 500)
     for name in PARAMETERS:
         assert (name in text) != name.startswith("wall_")  # no wall, no word of it

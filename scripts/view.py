@@ -21,7 +21,7 @@ def view(
     ],
     web: Annotated[
         bool,
-        typer.Option("--web", help="Serve it for a browser on this computer, until Ctrl-C."),
+        typer.Option("--web", help="Serve it for a browser on this computer alone, until Ctrl-C."),
     ] = False,
     save: Annotated[
         Path | None, typer.Option(help="Write an .rrd file, which `rerun FILE` opens.")

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
-from telerig.errors import TelerigError
+from telerig.errors import InputError, TelerigError
 from telerig.io.dataset.run import RunData, RunSource, recordings
 from telerig.io.images.read import list_images, read_image
 from telerig.io.recording.clock import unwrap
@@ -39,6 +39,7 @@ from telerig.io.view.names import (
     of_image,
     run_layout,
 )
+from telerig.io.view.open import open_window, serve
 from telerig.io.view.run import (
     log_bodies,
     log_outlines,
@@ -46,7 +47,7 @@ from telerig.io.view.run import (
     log_sensors,
     log_track_series,
 )
-from telerig.io.view.show import load_for_view, log_results, served
+from telerig.io.view.show import load_for_view, log_results
 from telerig.io.view.stream import log_image, log_series, log_spectrum
 from telerig.rig.camera import Camera
 from telerig.spectra import LEAST_FRAMES, Spectrum, motion_spectrum, segment, welch_density
@@ -64,10 +65,13 @@ def main() -> None:
     begun, content = pickle.load(sys.stdin.buffer)
     assert begun == "begin"
     stream = rr.RecordingStream(f"telerig {content['name']}")
-    if content["web"]:
-        served(stream)
-    else:
-        stream.spawn(memory_limit=_MEMORY)
+    try:
+        if content["web"]:
+            serve(stream)
+        else:
+            open_window(stream, _MEMORY)
+    except InputError as error:
+        sys.exit(" ".join(str(error).split()))  # `telerig.live` shows the last line
     show(stream, sys.stdin.buffer)
 
 

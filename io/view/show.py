@@ -20,6 +20,7 @@ from telerig.io.results.folders.smoothing import read_smoothing_results
 from telerig.io.results.folders.tracking import TrackResults, read_track_results
 from telerig.io.view.calibration import log_calibration
 from telerig.io.view.names import calibration_layout, need_rerun, run_layout
+from telerig.io.view.open import open_window, serve
 from telerig.io.view.run import log_run, log_sensors
 
 MOST_IMAGES = 4_000
@@ -44,13 +45,15 @@ def view(
 
     folder : results of `telerig calibrate`, `track` or `smooth`.
     save : an .rrd file to write instead of opening a window.
-    web : serve it for a browser on 127.0.0.1 instead.
+    web : serve it for a browser instead, while the returned recording exists. Window and server
+        listen on 127.0.0.1 alone.
     frames : (first, end) whose images are shown; None for all, of a run with more than 4,000 images
         every k-th.
     recording : the run's folder; None looks in the dataset, and shows no images where there is
         none.
 
-    Raises InputError for a folder that holds no such results, and without rerun.
+    Raises InputError for a folder that holds no such results, without rerun, and if the viewer
+    cannot be started.
     """
     rr = need_rerun()
     place = Path(folder)
@@ -64,18 +67,13 @@ def view(
         return stream
     in_notebook = _in_notebook()
     if web:
-        served(stream)
+        serve(stream)
     elif not in_notebook:
-        stream.spawn()
+        open_window(stream)
     log_results(stream, place, frames, recording)
     if in_notebook and not web:
         stream.notebook_show()
     return stream
-
-
-def served(stream: Any) -> None:
-    """Serve a recording for a browser on this computer, at `telerig.live.ADDRESS`."""
-    need_rerun().serve_web_viewer(open_browser=False, connect_to=stream.serve_grpc())
 
 
 def _in_notebook() -> bool:

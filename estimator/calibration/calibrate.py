@@ -90,6 +90,7 @@ def calibrate(
     *,
     model: Model = AUTO,
     medium: str = "air",
+    dots_free: str = "3d",
     outlier_sd: float = OUTLIER_SD,
     progress: Progress | bool = False,
 ) -> Calibration:
@@ -99,6 +100,8 @@ def calibrate(
         kappa+radial, ...), or one for each camera: {"left": "brown"}, "left=brown,right=auto".
     medium : "air" or "water", in which the target is. If `rig.toml` has `[walls]` (refractive
         windows), the runs are in water in both cases.
+    dots_free : how far the target's dots may move from their nominal positions: "3d" (in all
+        directions), "plane" (only in the target's plane) or "nominal" (not at all).
     outlier_sd : a dot that is further from the model than this is left out, in standard deviations.
     progress : True to show a progress bar; or a function that is called with the name of the step,
         the number done and the total, 0 if it is not known.
@@ -109,7 +112,7 @@ def calibrate(
     """
     need_kind(dataset, "rig", "telerig.calibrate", "give what telerig.load_dataset returns")
     run = run_calibration(
-        dataset, model=model, medium=medium, outlier_sd=outlier_sd,
+        dataset, model=model, medium=medium, dots_free=dots_free, outlier_sd=outlier_sd,
         stage=None if isinstance(progress, bool) else progress,
     )  # fmt: skip
     return run.calibration
@@ -128,9 +131,7 @@ def run_calibration(
 ) -> CalibrationRun:
     """Calibrate like `calibrate`, with further options, and return the detected dots as well.
 
-    dataset, model, medium, outlier_sd : as for `calibrate`.
-    dots_free : how far the target's dots may move from their nominal positions; "3d" lets them
-        move in all three directions. `DOTS_FREE` lists the allowed values.
+    dataset, model, medium, dots_free, outlier_sd : as for `calibrate`.
     stage : function that is called with the name of the step, the number done and the
         total; None for none.
     pictures : whether to draw the detections over each image, as `write_results` needs.

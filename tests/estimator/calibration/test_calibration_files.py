@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
+import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import (
     Calibration,
@@ -19,6 +21,8 @@ from telerig.estimator.calibration.result.calibration import (
     load_calibration,
 )
 from telerig.io.results.findings import Code
+from telerig.io.simulation.presets import run_preset
+from telerig.scripts.main import app
 
 pytestmark = pytest.mark.usefixtures("without_advice")
 
@@ -259,3 +263,18 @@ def test_two_views_and_a_chosen_model_can_be_saved(scene: Any, tmp_path: Path) -
     text = (tmp_path / "few" / "calibration.json").read_text()
     assert "NaN" not in text
     assert load_calibration(tmp_path / "few").statistics["views"] == 2
+
+
+def test_dots_free_is_the_option_of_the_command(tmp_path: Path) -> None:
+    config = run_preset("swarm", frames=2, bubbles=2)
+    data = telerig.simulate(
+        config, rng=np.random.default_rng(1), out=tmp_path / "tank", images=False
+    )
+    words = ["calibrate", str(data.path), "--model", "none", "--dots", "plane"]
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "of_command")])
+    assert done.exit_code in (0, 1), done.output
+    by_command = load_calibration(tmp_path / "of_command")
+    called = telerig.calibrate(data, model="none", dots_free="plane")
+    np.testing.assert_allclose(called.target_points_mm, by_command.target_points_mm, atol=1e-9)
+    free = telerig.calibrate(data, model="none")
+    assert np.abs(free.target_points_mm - called.target_points_mm).max() > 1e-4

@@ -16,6 +16,11 @@ DOCS = ROOT / "docs"
 GENERATED = "_generated"
 TAKEN_IN = ("CONVENTIONS.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
+CODE = re.compile(
+    r"(^```.*?^```\s*?$|!?\[(?:[^\[\]`]|`[^`\n]+`)*\]\([^()\s]+\)|`[^`\n]+`)",
+    flags=re.DOTALL | re.MULTILINE,
+)
+"""Code, and links as a whole: the text of a link may be code."""
 
 
 def taken_in() -> dict[str, Path]:
@@ -54,7 +59,7 @@ def with_links(text: str, docname: str) -> str:
         link = Path(os.path.relpath(path, start)).as_posix()
         return f"{mark}[{words}]({link}{'#' + anchor if anchor else ''})"
 
-    pieces = re.split(r"(^```.*?^```\s*?$|`[^`\n]+`(?!\]))", text, flags=re.DOTALL | re.MULTILINE)
+    pieces = CODE.split(text)
     return "".join(p if p.startswith("`") else LINK.sub(turned, p) for p in pieces)
 
 

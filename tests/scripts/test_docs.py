@@ -243,3 +243,14 @@ def test_one_command_makes_all_pictures(tmp_path: Path) -> None:
     if "not installed" in done.stdout:
         may |= {f"viewer-{name}.png" for name in ("calibration", "join", "run")}
     assert missing == may
+
+
+def test_links_whose_text_is_code_are_turned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    from project_pages import with_links
+
+    text = "See [`dots.md`](../../benchmarks/results/dots.md): `x`."
+    turned = with_links(text, "decisions/005-dots")
+    assert turned.endswith("benchmarks/results/dots.md): `x`.") and turned != text
+    code = "`[a](../../benchmarks/results/dots.md)` and `x`"
+    assert with_links(code, "decisions/005-dots") == code

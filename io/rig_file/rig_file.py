@@ -49,6 +49,7 @@ _GRAZING = np.cos(np.deg2rad(85.0))
 _HOMES = {
     key: f"{key} belongs under [{table}]"
     for table, kind in (
+        ("stage", StageDescription),
         ("accelerometers.<name>", AccelerometerDescription),
         ("walls.<camera>", WallDescription),
         ("fluid", FluidDescription),
@@ -56,6 +57,7 @@ _HOMES = {
         ("cameras.<name>", CameraDescription),
     )
     for key in field_types(kind)
+    if (table, key) not in (("stage", "axis"), ("stage", "up"))  # axis_<camera> in the file
 } | {
     key: f"{key} belongs at the top of the file, above the first [table]"
     for key in ("schema", "name")

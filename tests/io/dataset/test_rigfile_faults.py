@@ -16,6 +16,8 @@ BAD = [
     ("[stage]", "[stagge]", "stagge", "unknown table", "did you mean stage?"),
     ("schema = 1\n", "schema = 1\nnam = 1\n", "nam", "unknown key", "did you mean name?"),
     ("kind = ", "rows = 3\nkind = ", "[references] rows", "unknown key", "belongs under [target]"),
+    ("kind = ", "position_sigma_mm = 0.01\nkind = ", "[references] position_sigma_mm",
+     "unknown key", "belongs under [stage]"),
     ("[cameras.left]\n", '[cameras.left]\nname = "x"\n', "[cameras.left] name", "unknown key",
      "top of the file"),
     ("dot_diameter_mm = 2.4\n", "", "[target] dot_diameter_mm", "is missing", "a positive number"),

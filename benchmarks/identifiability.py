@@ -2,10 +2,9 @@
 
 Usage: python benchmarks/identifiability.py [--seeds 3] [--only S1,S5] [--information
     one,five,carriage,arms,references] [--models auto,default,true] [--seed 0] [--out FILE.md]
-    [--csv FILE.csv] [--read FILE.csv ...] [--before FILE.csv ...]
+    [--csv FILE.csv] [--read FILE.csv ...]
 auto and default: nothing is told to the smoother; true: the hyper-parameters that the runs are made
-with. Every seed counts. Runs as in shake_scenarios.py; middle 80 %. --before: tables of --csv of
-the same runs by another version, whose verdicts are put beside.
+with. Every seed counts. Runs as in shake_scenarios.py; middle 80 %.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ def outcomes(name: str, information: str, model: str, seed: int) -> Iterator[Out
 
 
 COLUMNS = (
-    "case", "information", "model", "axes", "before", "verdicts", "q", "eta", "NEES",
+    "case", "information", "model", "axes", "verdicts", "q", "eta", "NEES",
     "error / sd µm", "error / shake", "left of the shake", "CPU s",
 )  # fmt: skip
 
@@ -115,13 +114,12 @@ def said(rows: pd.DataFrame) -> str:
     return "; ".join(f"{n} {word}" for word, n in words.value_counts().items())
 
 
-def report(table: pd.DataFrame, before: pd.DataFrame) -> Iterator[str]:
+def report(table: pd.DataFrame) -> Iterator[str]:
     yield "| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS) + "\n"
-    earlier = grouped(before)
     for key, rows in grouped(table).items():
         error, stated, shake = (rms(rows[name]) for name in ("error", "stated", "shake"))
         cells = [
-            *map(str, key), said(earlier[key]) if key in earlier else "", said(rows),
+            *map(str, key), said(rows),
             f"{rows['q'].min():.2f}-{rows['q'].max():.2f}", _range(rows["eta"]),
             f"{rows['nees'].mean():.2f}", f"{error:.0f} / {stated:.0f}", f"{error / shake:.2f}",
             f"{rms(rows['left']) / shake:.2f}", f"{rows['seconds'].mean():.0f}",
@@ -159,7 +157,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--csv", type=Path, help="a row for each axis of each run")
     parser.add_argument("--read", type=Path, nargs="+", help="tables of --csv instead of runs")
-    parser.add_argument("--before", type=Path, nargs="+", help="tables of --csv by another version")
     options = parser.parse_args()
     found: list[Outcome] = []
     if not options.read:
@@ -173,7 +170,6 @@ def main() -> None:
                 pd.DataFrame(map(asdict, found)).to_csv(options.csv, index=False)
     table = pd.concat([pd.read_csv(f) for f in options.read]) if options.read else None
     table = pd.DataFrame(map(asdict, found)) if table is None else table
-    before = pd.concat([pd.read_csv(f) for f in options.before]) if options.before else table[:0]
     text = f"""# Verdicts, and whether they are true
 
 Printed by `benchmarks/identifiability.py`: {table["seed"].nunique()} seeds from
@@ -181,7 +177,7 @@ Printed by `benchmarks/identifiability.py`: {table["seed"].nunique()} seeds from
 positions along the axis. Left of the shake: RMS error of the estimated offsets of the cameras over
 the RMS of the true ones; error / shake: that of the positions, the pixels' noise included.
 
-{"".join(report(table, before))}
+{"".join(report(table))}
 Against what must be (one bubble UNRESOLVED and sensors RESOLVED in S1-S6; of a RESOLVED axis a
 NEES, mean over the seeds, up to {LARGEST_NEES:g} and at most {LARGEST_SHARE:g} of the shake left,
 unless it is below the noise):

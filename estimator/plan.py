@@ -2,7 +2,7 @@
 
 The covariances of a smoothing depend on what is measured when and how well, not on the readings. So
 the smoothing graph of the planned run, with the shake's true spectrum as its prior, gives the exact
-posterior. Where marks or an accelerometer on each arm measure the shake, it is 0.90-1.21 times the
+posterior. Where marks or an accelerometer on each arm measure the shake, it is 0.80-1.16 times the
 error of runs that are smoothed without knowing the spectrum (docs/decisions/038).
 """
 
@@ -122,8 +122,9 @@ def centre_sigma_px(diameter_px: float) -> float:
     """Return the standard deviation in px of the centre of a bubble's outline.
 
     It consists of two parts. One is the Cramer-Rao bound for a disc with a blur of 1 px in white
-    noise of 1 % of the contrast. The other is 1 % of the radius, because the centre of an outline
-    wanders when the body oscillates (docs/decisions/007).
+    noise of 1 % of the contrast. The other is an assumed 1 % of the radius, because the centre of
+    an outline wanders when the body oscillates: 1.6 sigma_3 R in docs/decisions/006, for a sigma_3
+    of 0.6 %.
     """
     radius, blur = diameter_px / 2, np.hypot(_BLUR_PX, np.sqrt(1 / 12))
     noise = _IMAGE_NOISE * np.sqrt(2 * blur / (np.sqrt(np.pi) * radius))

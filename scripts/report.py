@@ -33,10 +33,10 @@ def report(
 ) -> None:
     """Make the reports of a folder again, from nothing but its files.
 
-    A folder of results (calibration.json, tracking.json or batch.json) gives its report.html, a
-    dataset gives those of its calibration and all its runs. With --film each run also gets
-    film/path.mp4, its path in space turned once about the vertical, and film/views.mp4, the images
-    of all cameras with the detected bubbles.
+    A folder of results (calibration.json, tracking.json, validation.json or batch.json) gives its
+    report.html, a dataset gives those of its calibration and all its runs. With --film each run
+    also gets film/path.mp4, its path in space turned once about the vertical, and film/views.mp4,
+    the images of all cameras with the detected bubbles.
 
     Exit code 0: written. 2: the input cannot be used. 130: interrupted.
     """

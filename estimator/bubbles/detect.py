@@ -79,7 +79,7 @@ _LEFT_SHARE = 0.15
 """Share of a region's box that may be left over by the bubbles that its rims show."""
 
 _RIMS_PAY = 0.15
-"""Share of an image of a run that bubbles cover, beyond which rims are looked for, too: in sparser
+"""Share of an image that bubbles cover, beyond which rims are looked for, too: in sparser
 ones they give more wrong points than right ones (docs/decisions/035-crowds.md)."""
 
 COVERED_LIMIT, COVERED_LIMIT_EVERYWHERE = 0.1, 0.2

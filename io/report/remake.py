@@ -48,7 +48,8 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
         found = [r for r in found if not _is_imported(r)]
     if not found:
         raise InputError(
-            "holds no results: no calibration.json, tracking.json or batch.json", where=str(place),
+            "holds no results: no calibration.json, tracking.json, validation.json or batch.json",
+            where=str(place),
             todo="run `telerig calibrate`, `telerig track` or `telerig batch` first",
         )  # fmt: skip
     return tuple(sorted(found, key=lambda r: list(_KINDS.values()).index(r.kind)))

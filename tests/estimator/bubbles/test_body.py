@@ -156,7 +156,7 @@ def test_an_outline_without_harmonics_leaves_the_others_theirs() -> None:
 
 @pytest.mark.parametrize("order", range(4))
 def test_rims_that_reach_farther_do_not_make_spheres_larger(order: int) -> None:
-    """The outlines' size is 0.08-0.14 % above the volume's (docs/decisions/037)."""
+    """The outlines' size is 0.08-0.14 % above the volume's; the body's is not."""
     outcome = case((3, order), "own", 1.0, count=48)
     off = np.log(outcome.bodies.d_eq_mm / outcome.diameter_mm)
     assert abs(off.mean()) < 5e-4

@@ -143,12 +143,15 @@ def measured_shake(solution: Solution) -> tuple[Measured, Measured, Measured]:
     """
     graph, problem = solution.graph, solution.graph.problem
     t_s, marks = problem.t_s, problem.references.of(solution.weights[1] > 0.5)
-    count = np.bincount(graph.frame_of_row, minlength=len(t_s))
+    there = np.bincount(graph.frame_of_row, minlength=len(t_s)) > 0
+    kept = problem.observations.of(solution.weights[0] > 0.5)
+    frame, _ = np.unique(np.stack([kept.frame, kept.item]), axis=1)  # once for all cameras
+    bubbles = np.bincount(frame, minlength=len(t_s))
 
-    def mostly(there: Bools) -> bool:
-        return bool(np.count_nonzero(there & (count > 0)) > _MOSTLY * np.count_nonzero(count))
+    def mostly(shown: Bools) -> bool:
+        return bool(np.count_nonzero(shown & there) > _MOSTLY * np.count_nonzero(there))
 
-    several, seen, felt = mostly(count >= FEWEST_BUBBLES), list[Array](), list[Array]()
+    several, seen, felt = mostly(bubbles >= FEWEST_BUBBLES), list[Array](), list[Array]()
     for camera, directions in enumerate(graph.shake.seen):
         if mostly(np.isin(np.arange(len(t_s)), marks.frame[marks.camera == camera])):
             seen.extend(directions)

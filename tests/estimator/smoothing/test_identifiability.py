@@ -212,6 +212,8 @@ def test_what_measures_the_shake_along_which_axis() -> None:
         bubbles=(*several.bubbles[:2], replace(third, last=15, guess_mm=third.guess_mm[:16])),
         observations=seen.of((seen.item < 2) | (seen.frame <= 15)),
     )
+    last = seen.frame == seen.frame.max()
+    gaps = replace(several, observations=seen.of((seen.frame % 3 == seen.item) | last))
 
     def sensor(camera: int, *unused: int) -> Accelerometer:
         still = np.zeros((len(alone.t_s), 3))
@@ -222,6 +224,7 @@ def test_what_measures_the_shake_along_which_axis() -> None:
         (pair, (0, 0, 0)),
         (several, (2, 2, 2)),
         (seldom, (0, 0, 0)),
+        (gaps, (0, 0, 0)),
         (replace(marked, references=marked.references.of(marked.references.camera == 0)),
          (2, 2, 0)),
         (replace(marked, references=marked.references.of(marked.references.frame < 19)),

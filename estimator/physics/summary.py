@@ -179,7 +179,7 @@ def _numbers(
     def relative(d_power: int, slip_power: int, *others: float) -> float:
         squares = (d_power * size) ** 2 + (slip_power * speed) ** 2
         squares += 2 * d_power * slip_power * common + sum(o**2 for o in others)
-        return float(np.sqrt(squares))
+        return float(np.sqrt(max(squares, 0.0)))
 
     out = {}
     if "zigzag_hz" in row:

@@ -69,7 +69,8 @@ def without_wrong_dots(problem: Problem, dots_mm: Array) -> Problem:
 
     A start is a least-squares fit, which a few wrong dots turn or decide. Those are left out that
     are ten times as far from the homography of their image as half of the dots, and 0.1 % of the
-    dots' spread, whatever the lens.
+    dots' spread; strong distortion costs some sound ones, of the start alone. If they are more than
+    a third of their image, nothing is left out: the others may be rows that fit by themselves.
 
     dots_mm : (N, 3) positions of the target's dots.
     """
@@ -79,7 +80,8 @@ def without_wrong_dots(problem: Problem, dots_mm: Array) -> Problem:
             rows = np.flatnonzero((problem.view == v) & (problem.camera == c) & problem.kept)
             seen, uv = dots_mm[problem.dot[rows], :2], problem.uv_px[rows]
             near = _near_one_homography(seen, uv)
-            if len(seen) >= _FOR_HOMOGRAPHY and not on_a_line(seen[near]):
+            few = len(seen) < _FOR_HOMOGRAPHY or 3 * np.sum(near) < 2 * len(near)
+            if not few and not on_a_line(seen[near]):
                 weight[rows[~near]] = 0.0
     return replace(problem, weight=weight)
 

@@ -145,8 +145,8 @@ def measured_shake(solution: Solution) -> tuple[Measured, Measured, Measured]:
     t_s, marks = problem.t_s, problem.references.of(solution.weights[1] > 0.5)
     there = np.bincount(graph.frame_of_row, minlength=len(t_s)) > 0
     kept = problem.observations.of(solution.weights[0] > 0.5)
-    frame, _ = np.unique(np.stack([kept.frame, kept.item]), axis=1)  # once for all cameras
-    bubbles = np.bincount(frame, minlength=len(t_s))
+    once = np.unique(kept.item * len(t_s) + kept.frame)  # for all cameras
+    bubbles = np.bincount(once % len(t_s), minlength=len(t_s))
 
     def mostly(shown: Bools) -> bool:
         return bool(np.count_nonzero(shown & there) > _MOSTLY * np.count_nonzero(there))

@@ -67,7 +67,8 @@ def test_only_images_of_one_moment_have_one_epipolar_geometry(
             checks.refuse_wrong_pairs(shifted)
     right = problem_from_dots(paper.dots, paper.cameras, paper.target)
     assert checks.epipolar_misfits(right, (0, 1), 0)[0].max() < 1e-7
-    assert checks.epipolar_misfits(right, (0, 1), by)[0].min() > 5 * UNPAIRED
+    wrong = checks.epipolar_misfits(right, (0, 1), by)[0]
+    assert wrong.min() > 5 * UNPAIRED, "of the nine tenths that fit best"
 
 
 @pytest.mark.parametrize("share", [0.01, 0.05])

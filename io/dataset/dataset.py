@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import pandas as pd
 
 from telerig.errors import InputError, nearest, suggestion
-from telerig.io.dataset.tables import choose_source, read_dots_csv
+from telerig.io.dataset.tables import DEFAULT_SIGMA_PX, assumed_noise, choose_source, read_dots_csv
 from telerig.io.files.names import absent, check_name
 from telerig.io.images.read import EXTENSIONS, Image, by_stem, list_images, natural, read_image
 from telerig.io.results.record import read_object
@@ -191,6 +191,7 @@ def load_dataset(
     elif chosen == "dots":
         table = read_dots_csv(folder / "calibration" / "dots.csv", rig)
         views = tuple(View(name) for name in sorted(set(table["view"]), key=natural))
+        notes += assumed_noise(table, "dots.csv", DEFAULT_SIGMA_PX)
     else:
         notes.append("no calibration views were read")
     return Dataset(folder, rig, views, runs, chosen, notes, table)

@@ -17,6 +17,9 @@ import pandas as pd
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError, suggestion
 from telerig.io.dataset.tables import (
+    DETECTION_SIGMA_PX,
+    REFERENCE_SIGMA_PX,
+    assumed_noise,
     check_frame_count,
     choose_source,
     read_accelerometer_csv,
@@ -210,6 +213,13 @@ def load_run(
     lost = notes if skip_unreadable else None
     stage = _table(folder / "stage.csv", read_stage_csv, lost)
     sensors = list(rig.accelerometers) if rig else None
+    marks = _table(
+        folder / "references.csv",
+        lambda file: _of(names, read_references_csv(file, every, sizes, len(t_s))),
+        lost,
+    )
+    if marks is not None:
+        notes += assumed_noise(marks, "references.csv", REFERENCE_SIGMA_PX)
     run = RunData(
         name=folder.name,
         path=folder,
@@ -224,11 +234,7 @@ def load_run(
         accelerometers=_table(
             folder / "accelerometer.csv", lambda file: read_accelerometer_csv(file, sensors), lost
         ),
-        references=_table(
-            folder / "references.csv",
-            lambda file: _of(names, read_references_csv(file, every, sizes, len(t_s))),
-            lost,
-        ),
+        references=marks,
         detections=detections,
         notes=notes,
         skip_unreadable=skip_unreadable,
@@ -386,6 +392,7 @@ def _detections(
         )
     absent = [name for name in names if name not in seen]
     notes += [f"detections.csv has nothing of camera {name}" for name in absent]
+    notes += assumed_noise(table, path.name, DETECTION_SIGMA_PX)
     return table, seen
 
 

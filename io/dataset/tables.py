@@ -17,6 +17,7 @@ import pandas as pd
 from telerig.arrays import Bools, Ints
 from telerig.errors import InputError, suggestion
 from telerig.io.files.csv_table import Column, read_part, read_table, rows_of
+from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.toml import read_toml
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
@@ -222,6 +223,16 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
     )
     table["suu_px2"], table["suv_px2"], table["svv_px2"] = sigma**2, 0.0 * sigma, sigma**2
     return known
+
+
+def assumed_noise(table: pd.DataFrame | FrameTable, name: str, sigma_px: float) -> list[str]:
+    """Return the note that a table's noise is assumed; no note where its file states the noise."""
+    if isinstance(table, FrameTable):
+        known = "sigma_px" in table.columns or set(PIXEL_COVARIANCE) <= set(table.columns)
+    else:
+        known = table.attrs["sigma_known"]
+    text = f"{name} states no sigma_px: its centres count as good to {sigma_px:g} px (1 sd)"
+    return [] if known else [text]
 
 
 Sizes = Mapping[str, tuple[int, int]]

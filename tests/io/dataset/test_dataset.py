@@ -108,7 +108,9 @@ def test_views_of_dots(folder: Path) -> None:
     taken = dataset.dots()
     taken.loc[:, "u_px"] = 0.0
     assert dataset.dots()["u_px"].tolist() == [1.0] * 3, "a copy each time"
-    assert dataset.notes == []
+    assert dataset.notes == [
+        "dots.csv states no sigma_px: its centres count as good to 0.02 px (1 sd)"
+    ]
     assert "no image of view v2" in error_of(lambda: dataset.image(dataset.views[0], "left"))
 
 

@@ -123,8 +123,11 @@ def test_references(full_run: Path) -> None:
     head = "frame,camera,mark,u_px,v_px\n"
     file = full_run / "references.csv"
     file.write_text(head + "0,left,a,3,4\n0,right,a,5,6\n5,left,b,7,8\n")
-    table = load_run(full_run).references
+    run = load_run(full_run)
+    table = run.references
     assert table is not None and table["mark"].tolist() == ["a", "a", "b"]
+    said = "references.csv states no sigma_px: its centres count as good to 0.1 px (1 sd)"
+    assert said in run.notes
     assert table["svv_px2"].tolist() == pytest.approx([0.01] * 3)
     file.write_text(head + "0,left,a,3,4\n0,left,a,5,6\n")
     error_of(full_run, "references.csv row 3, column mark", "'a' stands twice in frame 0")

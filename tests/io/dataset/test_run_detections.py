@@ -33,7 +33,7 @@ def test_detections(run_folder: Path) -> None:
     np.testing.assert_allclose(table["suv_px2"], 0.0)
     assert table["contrast"].tolist() == [0.8, 0.7, 0.5] and table["word"].tolist() == list("xyz")
     assert np.isnan(table["a_px"][1]) and table["b_px"][0] == 4
-    assert table.attrs["sigma_known"] is True
+    assert table.attrs["sigma_known"] is True and run.notes == []
     with pytest.raises(InputError, match="it has no images"):
         run.image("left", 0)
 
@@ -46,6 +46,8 @@ def test_least_detections(run_folder: Path) -> None:
     assert run.detections["svv_px2"].tolist() == [0.25]
     assert run.detections.attrs["sigma_known"] is False
     assert "detections.csv has nothing of camera right" in run.notes
+    said = "detections.csv states no sigma_px: its centres count as good to 0.5 px (1 sd)"
+    assert said in run.notes
 
 
 def test_full_covariance(run_folder: Path) -> None:

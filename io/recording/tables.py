@@ -263,7 +263,8 @@ def frame_times(records: list[DeviceRecord]) -> FrameTimes:
     """Return the times of all frames that the devices reported; the first frame is 0.
 
     If a counter skips a frame and its line was undamaged at that time, the cameras of this counter
-    miss the frame. If the line was damaged, only the time of the frame is interpolated.
+    miss the frame; frames before its first line and after its last one are skipped, too. If the
+    line was damaged, only the time of the frame is interpolated.
     """
     records = [r for r in records if len(r.t_s)]
     if not records:
@@ -283,12 +284,14 @@ def frame_times(records: list[DeviceRecord]) -> FrameTimes:
         t_s[number] = record.t_s
     for record, number in zip(records, numbers):
         # Frames that the line skipped while its bytes were undamaged.
-        skipped = [*range(int(number[0])), *range(int(number[-1]) + 1, count)]
+        skipped: list[int] = []
         damaged_s = np.array([*record.malformed_s, *(t for away in record.away_s for t in away)])
-        for i in np.flatnonzero(np.diff(number) > 1):
-            begin, end = record.t_s[i] - 1e-3, record.t_s[i + 1] + 0.1
+        seen = np.concatenate([[-1], number, [count]])
+        seen_s = np.concatenate([[-np.inf], record.t_s, [np.inf]])
+        for i in np.flatnonzero(np.diff(seen) > 1):
+            begin, end = seen_s[i] - 1e-3, seen_s[i + 1] + 0.1
             if not np.any((damaged_s >= begin) & (damaged_s <= end)):
-                skipped += range(int(number[i]) + 1, int(number[i + 1]))
+                skipped += range(int(seen[i]) + 1, int(seen[i + 1]))
         for frame in skipped:
             missing[frame] += record.device.cameras
     unreported = np.isnan(t_s)

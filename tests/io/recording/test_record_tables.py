@@ -267,6 +267,22 @@ def test_a_damaged_counter_line_is_no_missing_frame(tmp_path: Path) -> None:
     assert np.allclose(table["t_s"], np.arange(100) / 100, atol=1e-6)
 
 
+@pytest.mark.parametrize("found", [False, True], ids=["lost for good", "found at the end"])
+def test_frames_after_a_counter_was_unplugged_are_not_missing(tmp_path: Path, found: bool) -> None:
+    """The camera goes on without it: as after an unplug in the middle, the images say."""
+    left = DeviceDescription("l", "frames", "x", cameras=("left",))
+    right = DeviceDescription("r", "frames", "y", cameras=("right",))
+    lines = [(10**7 * k, f"{10_000 * k},{k}\n".encode()) for k in range(100)]
+    entries = [Entry(RECEIVED, 0, time_ns, line) for time_ns, line in lines]
+    entries += [Entry(RECEIVED, 1, time_ns + 1000, line) for time_ns, line in lines[:60]]
+    entries.append(Entry(LOST, 1, 10**7 * 60, b"gone"))
+    entries += [Entry(FOUND, 1, 10**7 * 99, b"")] if found else []
+    done = write_tables(written(tmp_path / "recording.raw", entries, left, right))
+    table = read_frames_csv(tmp_path / "frames.csv", ["left", "right"])
+    assert len(table) == 100 and "missing" not in table
+    assert done.summary["frames"] == {"count": 100, "missing": 0, "interpolated": []}
+
+
 @pytest.mark.parametrize(
     ("counter", "expected"),
     [

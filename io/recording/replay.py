@@ -259,7 +259,8 @@ def _times(line: _Line, arrived_s: Array, t: Array | None, slot: Ints, start_ns:
     if line.sent_ns:
         t_s, half = _between(arrived_s, _seconds(np.array(line.sent_ns), start_ns))
         reason = "which question it answers is not known"
-        return _Timed(t_s, "middle of question and answer", reason, half_width_s=half)
+        how = "middle of question and answer"
+        return _Timed(t_s - device.latency_s, how, reason, half_width_s=half)
     return _arrival_times(line, arrived_s, None, slot, start_ns)
 
 

@@ -208,7 +208,9 @@ def test_gaps_that_nothing_explains(tmp_path: Path) -> None:
 
 
 def test_polled_readings_are_timed_between_question_and_answer(tmp_path: Path) -> None:
-    device = DeviceDescription("z", "encoder", "x", protocol="zaber", counts_per_mm=10.0)
+    device = DeviceDescription(
+        "z", "encoder", "x", protocol="zaber", counts_per_mm=10.0, latency_s=0.0005
+    )
     entries = []
     for k in range(50):
         asked = 20_000_000 * k
@@ -220,7 +222,7 @@ def test_polled_readings_are_timed_between_question_and_answer(tmp_path: Path) -
     table = pd.read_csv(tmp_path / "stage.csv")
     told = done.summary["devices"]["z"]
     expected = [k for k in range(50) if k not in (20, 21)]
-    assert np.allclose(table["t_s"], 0.02 * np.array(expected) + 0.002)
+    assert np.allclose(table["t_s"], 0.02 * np.array(expected) + 0.002 - device.latency_s)
     assert np.allclose(table["position_mm"], np.array(expected) / 10)
     assert np.isclose(told["half_question_to_answer_ms"], 2.0)
     assert told["left_out"] == {

@@ -128,14 +128,17 @@ def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockReco
     return ClockRecord(t_s, segment, fits, wraps, len(host_s) - len(kept))
 
 
-def stamp_rate(host_s: Array, device_s: Array) -> float | None:
+def stamp_rate(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> float | None:
     """Return how many seconds of a device's time stamps pass in one second of the host's time.
 
-    It is the rate of the majority of readings, so that wraps, restarts, lost readings and wrong
-    stamps do not matter. Returns None if there are too few readings.
+    It is the rate of the majority of readings, so that restarts, lost readings and wrong stamps do
+    not matter. Returns None if there are too few readings, or if the stamps wrap so often that they
+    seem to go back.
 
-    host_s, device_s : (readings,) times of arrival and stamps.
+    host_s, device_s : (readings,) times of arrival and stamps. wrap_s : as for `host_times`; wraps
+    are undone without the host's times, which would hide a wrong unit.
     """
+    device_s = unwrap(np.zeros(len(device_s)), device_s, wrap_s)
     lag = 1
     while 2 * lag + _RATE_READINGS <= len(host_s):
         apart = host_s[lag:] - host_s[:-lag]
@@ -152,7 +155,7 @@ def check_unit(host_s: Array, stamps: Array, device: DeviceDescription) -> None:
 
     host_s, stamps : (readings,) times of arrival in s, and the stamps as they were sent.
     """
-    rate = stamp_rate(host_s, stamps * device.time_unit_s)
+    rate = stamp_rate(host_s, stamps * device.time_unit_s, device.wrap_s)
     if rate is None or 1 - _WRONG_UNIT < rate < 1 / (1 - _WRONG_UNIT):
         return
     power = 10.0 ** round(np.log10(rate))

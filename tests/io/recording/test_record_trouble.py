@@ -139,6 +139,24 @@ def test_stamps_in_another_unit_name_the_line_that_is_right(tmp_path: Path, unit
     assert not again.errors and again.summary["devices"]["arm"]["readings"] > 7000
 
 
+@pytest.mark.parametrize("rate_hz", [400, 500, 800, 3000])
+def test_a_timer_of_16_bits_is_in_the_stated_unit(tmp_path: Path, rate_hz: int) -> None:
+    """It wraps every 65 ms, less than the time over which the rate of stamps is measured."""
+    short = replace(ENCODER, time_bits=16)
+    sent = [
+        Entry(RECEIVED, 0, round(1e9 * t), f"{round(1e6 * t) % 2**16},{k}\n".encode())
+        for k, t in enumerate(np.arange(3 * rate_hz) / rate_hz)
+    ]
+    assert of_device(write_tables(log_of(tmp_path / "r.raw", [short], sent)), "encoder") == (
+        len(sent), None,
+    )  # fmt: skip
+    slow = replace(short, time_unit_s=1e-3)
+    readings, error = of_device(
+        write_tables(tmp_path / "r.raw", None, {"encoder": slow}), "encoder"
+    )
+    assert readings == 0 and error is not None and "time_unit_s = 1e-06" in error
+
+
 def test_the_rate_of_stamps_does_not_mind_pauses_wraps_and_bursts() -> None:
     rng = np.random.default_rng(0)
     t = np.cumsum(np.where(rng.random(3000) < 0.05, 1.0, 1e-3))

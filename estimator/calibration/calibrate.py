@@ -10,7 +10,7 @@ from telerig.errors import CalibrationError, InputError, need_kind
 from telerig.estimator.calibration.solver.problem import DOTS_FREE, checked_outlier_sd
 from telerig.estimator.calibration.thresholds import OUTLIER_SD
 from telerig.io.results.findings import Code, Finding
-from telerig.io.tables.table import EDGE_COVARIANCE, PIXEL_COVARIANCE
+from telerig.io.tables.table import EDGE_COVARIANCE, PIXEL, PIXEL_COVARIANCE
 from telerig.progress import Progress, showing_progress
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import AUTO, Model, checked_model, models_by_camera
@@ -248,11 +248,14 @@ def _with_findings(calibration: Calibration, more: Sequence[Finding]) -> Calibra
 
 
 def _with_measured(calibration: Calibration, table: pd.DataFrame) -> Calibration:
-    """Put the covariance and chi-square of the image fit beside the dots."""
-    columns = [*PIXEL_COVARIANCE, *EDGE_COVARIANCE, "chi2_dof"]
-    measured = table.reindex(columns=["view", "camera", "dot", *columns]).copy()
+    """Put the covariance and chi-square of the image fit beside the dots.
+
+    A dot is found again by its pixel, because that of a symmetric target may have got a new number.
+    """
+    same, columns = ["view", "camera", *PIXEL], [*PIXEL_COVARIANCE, *EDGE_COVARIANCE, "chi2_dof"]
+    measured = table.reindex(columns=[*same, *columns]).copy()
     measured["view"] = measured["view"].astype(str)
-    dots = calibration.dots.merge(measured, on=["view", "camera", "dot"], how="left")
+    dots = calibration.dots.merge(measured.drop_duplicates(same), on=same, how="left")
     dots["chi2_dof"] = dots["chi2_dof"].astype(float)
     tables = {"dots.csv": dots, "residuals.csv": calibration.residuals}
     return replace(calibration, tables=tables)

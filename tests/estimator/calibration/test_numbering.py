@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from finding_codes import codes
 from turned_images import settled, turned
 
+import telerig
 from telerig.errors import CalibrationError
 from telerig.rig.target import Target
 
@@ -120,3 +123,20 @@ def test_symmetric_marks_on_an_unbounded_grid_are_refused(marks: Any, scene: Any
     made = replace(made, target=replace(made.target, marks=marks))
     with pytest.raises(CalibrationError, match="look the same after a turn"):
         made.calibrate("radial")
+
+
+def test_dots_keep_their_own_covariances(tmp_path: Path) -> None:
+    """In dots.csv of the results, where the dots of turned images have got new numbers."""
+    rng = np.random.default_rng(3)
+    data = telerig.simulate("symmetric", rng=rng, out=tmp_path / "set", images=False)
+    file, labels = data.path / "calibration" / "dots.csv", data.target.turns()
+    given = pd.read_csv(file, dtype={"view": str}).drop(columns=["row", "column"], errors="ignore")
+    given["sigma_px"] = rng.uniform(0.01, 0.02, len(given))
+    mine = (given["camera"] == "right") & (given["view"] == given["view"].iloc[0])
+    given.loc[mine, "dot"] = labels[1][given.loc[mine, "dot"]]
+    given.to_csv(file, index=False)
+    found = telerig.calibrate(telerig.load_dataset(data.path), model="radial").dots
+    keys = ["view", "camera", "u_px", "v_px"]
+    both = found.merge(given, on=keys, suffixes=("", "_given"))
+    assert (both["dot"] != both["dot_given"]).any() and len(both) == len(found) == len(given)
+    np.testing.assert_allclose(np.sqrt(both["suu_px2"]), both["sigma_px"], rtol=1e-9)

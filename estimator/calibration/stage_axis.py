@@ -26,6 +26,7 @@ from telerig.estimator.calibration.solver.problem import (
     problem_from_dots,
 )
 from telerig.estimator.calibration.solver.system import System, retracted
+from telerig.estimator.calibration.start.symmetric_target import numbered_as_calibrated
 from telerig.estimator.calibration.thresholds import LEAST_TRAVEL_MM
 from telerig.factors.calibration import State, whitened_error
 from telerig.factors.robust_loss import next_limit, travel_weights
@@ -222,6 +223,8 @@ def _stops(
     names = [c.name for c in calibration.cameras]
     _check_names(table, "view", list(readings), "has no position")
     _check_names(table, "camera", names, "is not in the calibration")
+    if target.bounded and target.symmetry_order() > 1:
+        table = _numbered_alike(calibration, target, table)
     known = table["dot"].isin(calibration.dot_ids).to_numpy()
     unknown = int((~known).sum())
     findings = [Code.UNKNOWN_DOTS.found(count=unknown)] if unknown else []
@@ -241,6 +244,21 @@ def _stops(
     index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
     place = calibration.target_points_mm[[index[int(d)] for d in problem.dot_ids]]
     return Stops(problem, replace(nominal_state(problem), dots_mm=place), reading), findings
+
+
+def _numbered_alike(calibration: Calibration, target: Target, table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of a target without marks with the numbers of the calibration's dots."""
+    names = [c.name for c in calibration.cameras]
+    ids, uv_px = table["dot"].to_numpy(np.int64), table[["u_px", "v_px"]].to_numpy(float)
+    sound = target.known_id(ids) & np.isfinite(uv_px).all(1)
+    _, view = np.unique(table["view"].astype(str), return_inverse=True)
+    camera = np.array([names.index(name) for name in table["camera"].astype(str)], np.int64)
+    places = dict(zip(calibration.dot_ids.tolist(), calibration.target_points_mm))
+    dot = ids.copy()
+    dot[sound] = numbered_as_calibrated(
+        view[sound], camera[sound], ids[sound], uv_px[sound], calibration.cameras, target, places
+    )
+    return table.assign(dot=dot)
 
 
 def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, float]:

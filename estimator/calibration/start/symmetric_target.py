@@ -2,16 +2,19 @@
 
 Within a view, the numberings of two cameras must agree with one inter-camera rotation. Between
 views, only the print errors of the dots differ after a turn, and they must be alike in all views.
+Where cameras and dots are calibrated, these decide.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations, product
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
-from telerig.errors import CalibrationError
+from telerig.arrays import Array, Bools, Ints
+from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.problem import HELD_MM, Problem, known_scale
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve
 from telerig.estimator.calibration.start import known_target
@@ -20,7 +23,10 @@ from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.estimator.calibration.thresholds import TURN_TIE_DEG
 from telerig.factors.calibration import State, whitened_residuals
 from telerig.io.results.findings import Code, Finding
-from telerig.rig.pose import rotation_from_rotvec
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.target import Target
+from telerig.rig.triangulation import midpoint
 
 
 def number_consistently(
@@ -247,3 +253,105 @@ def _contrast(turned: Array, choice: Ints) -> float:
         costs = np.sort(np.nansum(squares, (1, 2)))
         worst = min(worst, np.sqrt(max(0.0, costs[1] - costs[0])))
     return float(worst)
+
+
+_CLEARLY, _ROUNDING_MM = 1.5, 1e-6
+"""Other turns than the given ones are taken if the dots then fit so many times as well, and better
+by more than rounding."""
+
+
+def numbered_as_calibrated(
+    view: Ints,
+    camera: Ints,
+    ids: Ints,
+    uv_px: Array,
+    cameras: Sequence[Camera],
+    target: Target,
+    places_mm: dict[int, Array],
+) -> Ints:
+    """Return the ids (M,) of dots of a symmetric target at rest, numbered as in a calibration.
+
+    Of one camera all images are turned alike; of all turns of the cameras those are taken with
+    which the triangulated dots have the shape that the calibration found.
+
+    view, camera, ids, uv_px : (M,), (M, 2) of the measured dots. cameras : calibrated.
+    places_mm : (3,) of each dot in the target's frame, by its id.
+    """
+    labels = np.array(target.turns())
+    order, seen = len(labels), np.unique(camera).tolist()
+    turn = _turns_alike(view, camera, ids, uv_px, labels, target)
+    turned = labels[(turn + np.arange(order)[:, None]) % order, ids]
+    every = list(product(range(order), repeat=len(seen)))
+    misfit_mm = np.zeros(len(every))
+    for one, other in combinations(range(len(seen)), 2):
+        images = [(cameras[seen[k]], camera == seen[k]) for k in (one, other)]
+        of_turns = {
+            turns: _shape_misfit_mm(view, uv_px, images, turned[list(turns)], places_mm)
+            for turns in product(range(order), repeat=2)
+        }
+        misfit_mm += [of_turns[choice[one], choice[other]] for choice in every]
+    best = int(np.argmin(misfit_mm))
+    if misfit_mm[0] < _CLEARLY * misfit_mm[best] + _ROUNDING_MM:
+        best = 0
+    out = ids.copy()
+    for c, k in zip(seen, every[best]):
+        out[camera == c] = turned[k, camera == c]
+    return out
+
+
+def _turns_alike(
+    view: Ints, camera: Ints, ids: Ints, uv_px: Array, labels: Ints, target: Target
+) -> Ints:
+    """Return turns (M,) with which all images of a camera show the target turned alike."""
+    out = np.zeros(len(ids), np.int64)
+    for c in np.unique(camera):
+        first = None
+        for v in np.unique(view[camera == c]):
+            mine = (camera == c) & (view == v)
+            maps = []
+            for label in labels:
+                plane = target.nominal_mm(label[ids[mine]])[:, :2]
+                map_, *_ = np.linalg.lstsq(
+                    plane - plane.mean(0), uv_px[mine] - uv_px[mine].mean(0), rcond=None
+                )
+                maps.append(map_)
+            first = maps[0] if first is None else first
+            out[mine] = np.argmin(np.linalg.norm(np.array(maps) - first, axis=(1, 2)))
+    return out
+
+
+def _shape_misfit_mm(
+    view: Ints,
+    uv_px: Array,
+    images: Sequence[tuple[Camera, Bools]],
+    ids: Ints,
+    places_mm: dict[int, Array],
+) -> float:
+    """Return the median distance of dots that two cameras see from the calibrated shape.
+
+    It is 0 if they see none together, or look in the same direction.
+
+    images : for each of the cameras, which of the M dots are its own. ids : (2, M) for each.
+    """
+    rows = [
+        {(int(view[i]), int(own[i])): i for i in np.flatnonzero(mine)}
+        for (_, mine), own in zip(images, ids)
+    ]
+    both = [key for key in rows[0] if key in rows[1] and key[1] in places_mm]
+    if not both:
+        return 0.0
+    rays = [
+        camera.unproject(uv_px[[row[key] for key in both]])
+        for (camera, _), row in zip(images, rows)
+    ]
+    try:
+        points, _ = midpoint(*rays[0], *rays[1])
+    except GeometryError:
+        return 0.0
+    of_view, dots = np.array(both).T
+    places, off = np.array([places_mm[dot] for dot in dots.tolist()]), np.zeros(len(both))
+    for v in np.unique(of_view):
+        mine = of_view == v
+        moved = Pose.aligning(places[mine], points[mine]).apply(places[mine])
+        off[mine] = np.linalg.norm(points[mine] - moved, axis=-1)
+    return float(np.median(off))

@@ -53,6 +53,7 @@ def views(
     sigma_px: float = SIGMA_PX,
     reading_sigma_mm: float = 0.001,
     wander_mm: float = 0.0,
+    places: Any = PLACES,
 ) -> tuple[pd.DataFrame, dict[str, float]]:
     """Dots at each stop: travel = reading / (1 + scale), errors of the carriage added."""
     parts, positions = [], {}
@@ -61,7 +62,7 @@ def views(
         wander = wander_mm * rng.standard_normal(3)
         place = travel * AXIS + wander - AXIS * (AXIS @ wander)
         positions[f"v{v}"] = stop + reading_sigma_mm * rng.standard_normal()
-        points = TARGET.apply(PLACES) - place
+        points = TARGET.apply(places) - place
         for camera in calibration.cameras:
             uv = camera.project(points) + sigma_px * rng.standard_normal((len(points), 2))
             parts.append(
@@ -88,6 +89,26 @@ def test_exact_without_noise(lens: dict[str, float]) -> None:
     np.testing.assert_allclose(found.rig_from_target.rotation, TARGET.rotation, atol=1e-9)
     np.testing.assert_allclose(found.rig_from_target.translation_mm, [1, -2, 3], atol=1e-8)
     np.testing.assert_allclose(found.basis.T @ np.c_[found.basis, AXIS], np.eye(2, 3), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "turned", ["right", "left right", "left right of v3", "right of v0", "nothing"]
+)
+def test_a_target_without_marks_has_the_numbers_of_the_calibration(turned: str) -> None:
+    """Every image of it is numbered after either of two turns."""
+    rng = np.random.default_rng(6)
+    printed = PLACES + [0.02, 0.02, 0.0] * rng.standard_normal(PLACES.shape)
+    calibration = replace(CALIBRATION, target_points_mm=printed)
+    table, positions = views(rng, places=printed)
+    right = stage_axis_of(calibration, POINTS, table, positions)
+    assert abs(right.scale - 0.01) < 4 * right.scale_sd < 2e-4
+    cameras, _, view = turned.partition(" of ")
+    mine = table["camera"].isin(cameras.split()) & (table["view"].eq(view) | (view == ""))
+    table.loc[mine, "dot"] = 14 - table.loc[mine, "dot"]
+    found = stage_axis_of(calibration, POINTS, table, positions)
+    assert found.scale == pytest.approx(right.scale, abs=1e-9)
+    np.testing.assert_allclose(found.joint_covariance, right.joint_covariance, rtol=1e-6)
+    assert "STAGE_OUTLIERS" not in codes(found)
 
 
 @pytest.mark.parametrize("draws", [16, pytest.param(100, marks=pytest.mark.slow)])

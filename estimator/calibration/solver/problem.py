@@ -24,6 +24,7 @@ from telerig.estimator.calibration.thresholds import (
     OUTLIER_SD,
 )
 from telerig.factors.calibration import Observations, State, pixels
+from telerig.io.images.read import natural
 from telerig.io.tables.table import EDGE_COVARIANCE, covariance_of_image
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX, LENS_PARAMETERS, parameters_of
@@ -279,7 +280,7 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
     names = [c.name for c in cameras]
     _check(dots, names, target)
     table = dots.sort_values(["view", "camera", "dot"])
-    views = tuple(sorted(table["view"].astype(str).unique(), key=_natural))
+    views = tuple(sorted(table["view"].astype(str).unique(), key=natural))
     ids = np.unique(table["dot"].to_numpy(np.int64))
     camera = _index(table["camera"], names)
     view = _index(table["view"].astype(str), views)
@@ -316,10 +317,6 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
 def _index(column: pd.Series[str], names: Sequence[str]) -> NDArray[np.int64]:
     numbers = column.map({name: i for i, name in enumerate(names)})
     return np.asarray(numbers, dtype=np.int64)
-
-
-def _natural(name: str) -> tuple[int, float, str]:
-    return (0, float(name), name) if name.isdigit() else (1, 0.0, name)
 
 
 def _check(table: pd.DataFrame, names: Sequence[str], target: Target) -> None:

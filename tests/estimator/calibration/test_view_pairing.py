@@ -71,6 +71,17 @@ def test_only_images_of_one_moment_have_one_epipolar_geometry(
     assert wrong.min() > 5 * UNPAIRED, "of the nine tenths that fit best"
 
 
+@pytest.mark.parametrize("first", [0, 4, 8])
+def test_view_10_comes_after_view_9(first: int, paper: Any) -> None:
+    """The order of the views tells from which one on an image was lost."""
+    lost = offset(paper.dots, "right", first, -1)
+    plain = lost.assign(view=[f"IMG_{int(name[4:])}" for name in lost["view"]])
+    problem = problem_from_dots(plain, paper.cameras, paper.target)
+    assert problem.views == tuple(f"IMG_{k}" for k in range(12))
+    with pytest.raises(CalibrationError, match=f"from view 'IMG_{first}' on(.|\n)*1 earlier fit"):
+        checks.refuse_wrong_pairs(problem)
+
+
 @pytest.mark.parametrize("share", [0.01, 0.05])
 def test_bad_dots_make_right_pairs_no_wrong_ones(share: float, scene: Any) -> None:
     """Where two views are left at an end, those of other moments may fit well by chance."""

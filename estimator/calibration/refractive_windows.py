@@ -25,6 +25,7 @@ from telerig.rig.triangulation import aligned_covariance, triangulate_any, worki
 from telerig.rig.windows import Wall
 
 _NOTABLE_UM = 0.1
+_STEP_MM = 10.0
 
 
 def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
@@ -125,6 +126,9 @@ def window_findings(calibration: Calibration, rig: RigDescription) -> list[Findi
     found = [code.found(cameras=[c.name for c in cameras], error_um=error)]
     for camera in cameras:
         found += _implausible(camera)
+        stated = rig.walls.get(camera.name)
+        if calibration.medium == "air" and stated is not None and stated.distance_mm is None:
+            found += _distance_needed(calibration, camera)
         found += _uncertain(calibration, camera) + _tilt_sign_ambiguous(calibration, camera)
     return found
 
@@ -145,6 +149,21 @@ def _implausible(camera: Camera) -> list[Finding]:
     if leaning > Code.WINDOW_LEANING.limit:
         found.append(Code.WINDOW_LEANING.found(cameras=camera.name, angle_deg=leaning))
     return found
+
+
+def _distance_needed(calibration: Calibration, camera: Camera) -> list[Finding]:
+    """Return the finding on what the unknown distance of a window does, of a perspective lens.
+
+    With the target in the water the distance would only change scale and kappa.
+    """
+    if camera.wall is None or camera["kappa_per_mm"] == 0:
+        return []
+    farther = replace(camera.wall, distance_mm=camera.wall.distance_mm - _STEP_MM)
+    moved = with_windows(calibration.cameras, {camera.name: farther})
+    error = model_error_um(calibration.cameras, moved)
+    if error < Code.WINDOW_DISTANCE.limit:
+        return []
+    return [Code.WINDOW_DISTANCE.found(cameras=camera.name, error_um=error)]
 
 
 def _uncertain(calibration: Calibration, camera: Camera) -> list[Finding]:

@@ -267,6 +267,15 @@ class Code(Enum):
         30.0,
         "degrees: cameras look through their windows nearly at right angles",
     )
+    WINDOW_DISTANCE = Kind(
+        _USABLE,
+        "[walls] states no distance_mm for the window of {cameras}, so it counts as standing at "
+        "the origin; as the lens is not quite telecentric, points are wrong by up to "
+        "{error_um:.1f} µm over the working volume for each 10 mm that it stands elsewhere",
+        "Write distance_mm into [walls.<camera>], or calibrate with the target in the water",
+        0.1,
+        "µm for each 10 mm: a window 100 mm away costs as much as a good calibration",
+    )
     # What was read.
     LEFT_OUT = Kind(_NOTE, "{views}, {cameras} is left out: {text}")
     TURNS_KNOWN = Kind(

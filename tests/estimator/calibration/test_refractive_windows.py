@@ -155,6 +155,34 @@ def test_the_warnings_say_how_large_the_error_would_be(tank: Path, in_air: Calib
     assert float(gone.split("up to ")[1].split(" µm")[0]) == pytest.approx(stated, rel=0.05)
 
 
+@pytest.mark.parametrize(("kappa", "distance"), [(7e-5, None), (7e-5, -60.0), (0.0, None)])
+def test_a_lens_that_is_not_telecentric_needs_the_distance_of_its_window(
+    kappa: float, distance: float | None, in_air: Calibration
+) -> None:
+    """Points look farther from the axis, or nearer to it, by kappa (1 - 1/n) times the distance."""
+    lens = [c.with_parameters(kappa_per_mm=kappa) for c in in_air.in_air().cameras]
+    described = {c.name: WallDescription(c.name, (0, 0, 1), INDICES, 10.0, distance) for c in lens}
+    windows = {name: one.wall() for name, one in described.items()}
+    dry = replace(in_air.in_air(), cameras=tuple(lens))
+    rig = SimpleNamespace(walls=described)
+    calibration = behind_windows(dry, windows)
+    found = [f for f in window_findings(calibration, rig) if f.code is Code.WINDOW_DISTANCE]
+    if kappa == 0 or distance is not None:
+        assert not found
+        return
+    assert [finding.cameras for finding in found] == [("left",), ("right",)]
+    half = 0.5 * 0.6 * 512 / 10.0  # of the working volume
+    for finding, camera in zip(found, calibration.cameras):
+        assert camera.wall is not None
+        away = kappa * (1 - 1 / INDICES[-1]) * 10.0 * half
+        both_see_y = np.hypot(1.0, 0.5)
+        assert finding.numbers["error_um"] == pytest.approx(1e3 * away * both_see_y, rel=0.02)
+    assert not [
+        f for f in window_findings(replace(calibration, medium="water"), rig)
+        if f.code is Code.WINDOW_DISTANCE
+    ]  # fmt: skip
+
+
 def test_findings_on_walls_are_right(in_air: Calibration) -> None:
     dry = replace(in_air.in_air(), free=in_air.free)
 

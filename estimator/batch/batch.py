@@ -64,6 +64,18 @@ def do_job(job: Job, stage: Progress | None = None) -> dict[str, Any]:
     return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
 
 
+def _refuse_rejected(job: Job) -> None:
+    """Raise InputError for a run whose dataset has a calibration that was rejected."""
+    from telerig.estimator.calibration.result.calibration import calibration_for
+
+    if job.calibration:
+        return
+    calibration, (file, *_) = calibration_for(Path(job.where), None)
+    if calibration.rejection:
+        todo = "correct its cause and calibrate again, or give another one (--calibration)"
+        raise InputError(calibration.rejection, where=str(file), todo=todo)
+
+
 def _draw(job: Job) -> dict[str, Any]:
     """Write the report of results that exist."""
     from telerig.io.report.remake import remake_report, results_folders
@@ -200,6 +212,7 @@ def _track(job: Job, stage: Progress | None) -> dict[str, Any]:
     assert isinstance(job.options, TrackingOptions)
     begun, run = time.perf_counter(), Path(job.where)
     check_run_name(run)
+    _refuse_rejected(job)
     summary = track_run(
         run, job.results, job.options, job.calibrations, again=job.command, report=job.report,
         stage=stage,
@@ -214,6 +227,7 @@ def _smooth(job: Job, stage: Progress | None) -> dict[str, Any]:
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
 
     assert isinstance(job.options, SmoothingOptions)
+    _refuse_rejected(job)
     found = smooth_run(
         Path(job.where), job.results, job.options, job.calibrations, again=job.command,
         tracks=Path(job.tracks or job.results), report=job.report, stage=stage,

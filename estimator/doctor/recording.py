@@ -98,6 +98,9 @@ def check_recording(
     Raises InputError for a recording that cannot be read.
     """
     checks: list[Check] = []
+    if calibration.rejection:
+        todo = "correct its cause and calibrate again before the long run"
+        checks.append(Check("calibration", "failure", calibration.rejection, todo))
     if run.source == "images":
         checks += [c for camera in run.cameras for c in _images(run, camera)]
     checks += _steps(run)

@@ -74,6 +74,7 @@ def smooth_run(
     tracked = RunFile.read_if_there(source.parent / "run.json")
     warnings = [
         *dict.fromkeys(s for file in used for s in stale(file.parent, [file.name])),
+        *filter(None, [calibration.rejection]),
         *window_warnings(run.rig, calibration),
         *([] if options.refine_rig else _moved(followed)),
     ]

@@ -233,6 +233,7 @@ class TrackingStream:
             * " The calibration's share, common to all points, is in calibration_sx_mm, "
             "calibration_sy_mm and calibration_sz_mm.",
             "warnings": [
+                *filter(None, [self.calibration.rejection]),
                 *_window_warnings(run, self.calibration),
                 *self._crowded(),
                 *self._not_backlit(),

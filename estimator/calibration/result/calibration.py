@@ -136,6 +136,14 @@ class Calibration(ShortText):
         return {"status": str(found.status), "reasons": list(found.reasons)}
 
     @property
+    def rejection(self) -> str:
+        """Return the sentence that warns of a calibration that was rejected; "" for any other."""
+        if self.verdict.get("status") != "REJECTED":
+            return ""
+        reason = first_of([str(reason) for reason in self.verdict["reasons"]])
+        return f"the calibration is REJECTED, so no number that follows from it is right: {reason}"
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Return the sentences on what was found and is no objection."""
         from telerig.io.results.findings import notes_of

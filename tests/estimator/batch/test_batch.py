@@ -12,10 +12,12 @@ import pytest
 from batch_dataset import make_dataset, outcome_here
 from typer.testing import CliRunner
 
+import telerig
 from telerig.command_options import CalibrationOptions
 from telerig.estimator.batch import batch as work
 from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
 from telerig.estimator.batch.jobs import Job, jobs_of, share_of
+from telerig.io.results.findings import Code
 from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import replaced_results
 from telerig.io.tables.smoothing import BATCH_BUBBLES
@@ -216,6 +218,24 @@ def test_run_does_everything_for_one_dataset(datasets, monkeypatch, status, line
     done = CliRunner().invoke(app, words)
     assert done.exit_code == code, done.output
     assert [line for line in done.output.splitlines() if line.startswith(("cal", "tr"))] == lines
+
+
+def test_a_rejected_calibration_of_before_is_not_used_unseen(tank_copy):
+    """The command that calibrated has ended; its verdict stands in calibration.json alone."""
+    folder, run = tank_copy / "results" / "calibration", tank_copy / "runs" / "rise"
+    good = telerig.load_calibration(folder)
+    assert not good.rejection
+    replace(good, findings=(Code.FEW_KEPT.found(share=0.5),)).save(folder)
+    warning = "the calibration is REJECTED, so no number that follows from it is right: only 50%"
+    for kind in ("track", "smooth"):
+        words = ["run", str(tank_copy), "--only", kind, "--no-report", "--quiet"]
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 1 and f"{kind}: 1 failed" in done.output, done.output
+        assert warning in done.output and "--calibration" in done.output
+    wanted = CliRunner().invoke(app, ["track", str(run), "--no-report", "--quiet"])
+    assert wanted.exit_code == 0 and f"warning: {warning}" in wanted.output, wanted.output
+    smoothed = CliRunner().invoke(app, ["smooth", str(run), "--no-report", "--quiet"])
+    assert smoothed.exit_code == 0 and warning in smoothed.output, smoothed.output
 
 
 @pytest.mark.parametrize(

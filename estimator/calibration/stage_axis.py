@@ -26,6 +26,7 @@ from telerig.estimator.calibration.solver.problem import (
     problem_from_dots,
 )
 from telerig.estimator.calibration.solver.system import System, retracted
+from telerig.estimator.calibration.start.known_target import plate_sides
 from telerig.estimator.calibration.start.symmetric_target import numbered_as_calibrated
 from telerig.estimator.calibration.thresholds import LEAST_TRAVEL_MM
 from telerig.factors.calibration import State, whitened_error
@@ -198,11 +199,8 @@ def stage_axis_of(
     fewer than two positions, less than 1 mm between them, or a single camera.
     """
     stops, findings = _stops(calibration, target, table, positions_mm)
-    travel = start(stops)
-    eccentric = eccentricity_px(stops.problem, stops.state(travel))
-    stops = replace(stops, problem=replace(stops.problem, eccentricity_px=eccentric))
     sigma = (position_sigma_mm, wander_sigma_mm)
-    travel, weights, system = fit(stops, travel, sigma)
+    stops, travel, weights, system = _on_best_side(stops, sigma)
     observed = _observed_sigma(travel, weights, system, sigma)
     if observed != sigma:
         findings += _scatters(sigma, observed)
@@ -210,6 +208,28 @@ def stage_axis_of(
         travel, weights, system = fit(stops, travel, sigma)
     findings += _suspects(stops, weights, system)
     return _result(calibration, stops, travel, weights, system, sigma, findings)
+
+
+def _on_best_side(
+    stops: Stops, sigma_mm: tuple[float, float]
+) -> tuple[Stops, Travel, Weights, StageEquations]:
+    """Return the fit, of a two-sided plate that with the side of the dots that fits better.
+
+    sigma_mm : as for `fit`.
+    """
+    found, errors = [], []
+    for problem in plate_sides(stops.problem):
+        side = replace(stops, problem=problem)
+        try:
+            travel = start(side)
+            eccentric = eccentricity_px(problem, side.state(travel))
+            side = replace(side, problem=replace(problem, eccentricity_px=eccentric))
+            found.append((side, *fit(side, travel, sigma_mm)))
+        except CalibrationError as error:
+            errors.append(error)
+    if not found:
+        raise errors[0]
+    return min(found, key=lambda one: np.minimum(one[-1].dot_score, _SUSPECT**2).sum())
 
 
 def _stops(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from finding_codes import codes
 from typer.testing import CliRunner
 
 import telerig
@@ -15,6 +17,8 @@ from telerig.errors import InputError
 from telerig.estimator.smoothing.smooth import problem_of
 from telerig.io.dataset.run import load_run
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
+from telerig.io.simulation.presets import preset, run_preset
+from telerig.io.simulation.simulate import simulate
 from telerig.scripts.main import app
 
 pytestmark = pytest.mark.usefixtures("without_advice", "undrawn")
@@ -70,6 +74,20 @@ def test_a_garbled_stage_is_refused(data: Path, tmp_path: Path) -> None:
     (tmp_path / "calibration.json").write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(InputError, match=r"has a fault at .stage\.axis.: has shape"):
         telerig.load_calibration(tmp_path)
+
+
+def test_a_plate_that_cameras_see_from_both_sides(tmp_path: Path) -> None:
+    """One camera sees the dots through 2 mm of glass, a third of which they look nearer."""
+    two, run = preset("two_sided"), run_preset("rise", frames=6)
+    seen = replace(run.calibration, target=two.target, angle_deg=150.0, tilt_deg=two.tilt_deg)
+    stage = replace(run.stage, axis_views=7, encoder_scale=0.01)
+    config = replace(run, stage=stage, calibration=seen)
+    data = simulate(config, rng=np.random.default_rng(9), out=tmp_path / "set", images=False)
+    found = telerig.calibrate(data, model="radial")
+    sd = found.stage["encoder_scale_sd"]
+    assert abs(found.stage["encoder_scale"] - 0.01) < 4 * sd < 4e-4
+    assert np.sqrt(np.diag(found.stage["axis_covariance_rad2"])).max() < 1e-4
+    assert found.stage["chi2_dof"] < 1.5 and "STAGE_OUTLIERS" not in codes(found)
 
 
 def test_no_stage_options_for_a_calibration_alone(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from telerig.estimator.calibration.solver.robust_least_squares import (
 from telerig.estimator.calibration.solver.system import Solution, System
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
 from telerig.estimator.calibration.thresholds import SURE_SD, UNEXPLAINED
-from telerig.factors.calibration import State
+from telerig.factors.calibration import State, pixels
 from telerig.io.results.findings import Code, Finding
 from telerig.rig.lens_parameters import GROUPS, INDEX, groups_of, joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
@@ -328,11 +328,11 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
     """Return residuals in space and predicted uncertainty of points (µm), less rigid motion."""
     if len(problem.cameras) < 2:
         return {}
-    pixels, truth = _seen_in_space(problem, state)
+    seen, truth = _seen_in_space(problem, state)
     if len(truth) == 0:
         return {}
     cameras, sigma = calibration.cameras, calibration.statistics["scatter_px"]
-    found = triangulate_any(cameras, list(pixels), sigma)
+    found = triangulate_any(cameras, list(seen), sigma)
     some = found.points_mm[:: max(1, len(truth) // 200)]
     shared = aligned_covariance(cameras, calibration.free, calibration.covariance, some)
     measurement = np.trace(found.covariance_mm2, axis1=-2, axis2=-1).mean() / 3
@@ -348,17 +348,23 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
 
 
 def _seen_in_space(problem: Problem, state: State) -> tuple[Array, Array]:
-    """Return pixels (C, K, 2), NaN if unseen, and points (K, 3) of dots that two cameras see."""
+    """Return pixels (C, K, 2), NaN if unseen, and points (K, 3) of dots that two cameras see.
+
+    The pixels of dots that are seen through the plate of the target are those without it.
+    """
     key = problem.view * len(problem.dot_ids) + problem.dot
     kept = problem.kept
     found, row = np.unique(key[kept], return_inverse=True)
-    pixels = np.full((len(problem.cameras), len(found), 2), np.nan)
-    pixels[problem.camera[kept], row] = problem.observations().uv_px
-    several = np.isfinite(pixels[..., 0]).sum(0) > 1
+    observed = problem.observations()
+    bare = replace(observed, plate_shift=np.zeros_like(observed.plate_shift))
+    by_plate = pixels(state, observed, problem.rho_mm) - pixels(state, bare, problem.rho_mm)
+    seen = np.full((len(problem.cameras), len(found), 2), np.nan)
+    seen[problem.camera[kept], row] = observed.uv_px - by_plate
+    several = np.isfinite(seen[..., 0]).sum(0) > 1
     view, dot = np.divmod(found[several], len(problem.dot_ids))
     poses = state.rig_from_target[view]
     points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[dot]) + poses[:, :3, 3]
-    return pixels[:, several], points
+    return seen[:, several], points
 
 
 def _mirror(fit: Fit, nominal_rotvec_deg: Nominal) -> dict[str, Any]:

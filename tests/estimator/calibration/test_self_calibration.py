@@ -47,6 +47,7 @@ def test_presets(preset: str, model: str, chosen: set[str], limit_um: float, sce
     assert 0.8 < calibration.statistics["chi2_dof"] < 1.2
     assert calibration.statistics["share_kept"] > 0.99
     assert made.space_rms_um(calibration) < limit_um
+    assert calibration.statistics["space_rms_um"] < 1.5 * calibration.statistics["space_sd_um"]
     assert calibration.twin["decided_by"] == "nominal rotation"
 
 

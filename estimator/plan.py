@@ -8,8 +8,10 @@ error of runs that are smoothed without knowing the spectrum (docs/decisions/038
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -49,14 +51,22 @@ from telerig.io.results.calibration_words import NO_COVARIANCE
 from telerig.io.results.smoothing import AxisVerdict, Verdict, vertical_axis, worst_of
 from telerig.io.results.verdict_words import number_words
 from telerig.io.rig_file.description import RigDescription
-from telerig.io.simulation.calibration.scene import hand_held_views, true_cameras, true_target
+from telerig.io.simulation.calibration.scene import (
+    TrueTarget,
+    hand_held_views,
+    true_cameras,
+    true_target,
+)
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.io.tables.smoothing import AXES
 from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
 from telerig.rig.units import MICRO_G_M_S2
 from telerig.short_text import counted, share
 
+_TILTS_OF_MANY_DEG = (8.0, 65.0)
+"""Tilts of a plate that three cameras or more see."""
 _SAMPLE_HZ = 2000.0
 _DAMPING = 0.03
 _COMMON, _ARM_RATIO = 0.75, 1.6
@@ -144,7 +154,7 @@ def expected_calibration(
 
     Raises InputError if the target does not fit into the views.
     """
-    turns = [np.asarray(turn, float) for turn in rig.rotvec_from_first_deg.values()]
+    turns = {name: np.radians(turn) for name, turn in rig.rotvec_from_first_deg.items()}
     cameras = tuple(
         CameraConfig(c.name, c.image_size_px, c.scale_px_per_mm, c.scale_px_per_mm)
         for c in rig.cameras.values()
@@ -153,24 +163,53 @@ def expected_calibration(
     reach = 0.2 * field_mm
     config = SimulationConfig(
         rig.name, cameras, rig.target, views=views,
-        angle_deg=float(np.linalg.norm(turns[0])) if turns else 90.0,
         mount_rotvec_deg=(0.0, 0.0, 0.0), axis_gap_mm=0.0, shift_mm=(reach,) * 3,
         visible_fraction=0.5, marks_visible=False, print_factor=0.0,
     )  # fmt: skip
     rng = np.random.default_rng(seed)
-    true, target = true_cameras(config), true_target(config, rng)
+    target = true_target(config, rng)
+    true = {
+        name: replace(camera, camera_from_rig=Pose.from_rotvec(turns[name]))
+        if name in turns
+        else camera
+        for name, camera in true_cameras(config).items()
+    }
+    if len(cameras) > 2:
+        wide = replace(config, tilt_deg=_TILTS_OF_MANY_DEG)
+        config = replace(wide, seen_by=_seen_together(wide, true, target))
     dots = exact_dots(config, true, target, hand_held_views(config, true, target, rng))
     dots = dots[dots["inside"] == 1].reset_index(drop=True)
     dots[["suu_px2", "svv_px2"]], dots["suv_px2"] = sigma_px**2, 0.0
     noise = sigma_px * rng.standard_normal((len(dots), 2))
     dots[["u_px", "v_px"]] = dots[["u_px", "v_px"]].to_numpy() + noise
-    nominal = rig.rotvec_from_first_deg
     first = true[rig.first].camera_from_rig
     return self_calibrate(
         dots, [replace(camera, camera_from_rig=first) for camera in true.values()], rig.target,
-        name=rig.name, model="radial",
-        nominal_rotvec_deg=nominal if len(nominal) > 1 else next(iter(nominal.values()), None),
+        name=rig.name, model="radial", nominal_rotvec_deg=rig.rotvec_from_first_deg,
     )  # fmt: skip
+
+
+def _seen_together(
+    config: SimulationConfig, cameras: Mapping[str, Camera], target: TrueTarget
+) -> tuple[tuple[str, ...], ...]:
+    """Return the groups of cameras that can see one view of the target, the largest first.
+
+    Raises InputError if no two cameras can.
+    """
+    found = []
+    for count in range(len(cameras), 1, -1):
+        for group in combinations(cameras, count):
+            one = replace(config, views=1, seen_by=(group,))
+            with suppress(InputError):
+                hand_held_views(one, cameras, target, np.random.default_rng(0))
+                found.append(group)
+    if not found:
+        raise InputError(
+            "no two cameras can see one side of the target together", where="rig.toml [stereo]",
+            todo="correct the cameras' nominal rotations, choose a smaller target, or give the "
+            "rig's calibration (--calibration)",
+        )  # fmt: skip
+    return tuple(found)
 
 
 def calibration_of(

@@ -105,6 +105,33 @@ def test_the_expected_calibration_is_the_usual_one(tank: Path) -> None:
     assert expected.sd(name) == pytest.approx(real.sd(name), rel=0.25)
 
 
+@pytest.mark.parametrize(
+    "turns", [{"right": (90.0, 0.0, 0.0)}, {"middle": (0.0, 60.0, 0.0), "right": (0.0, 110.0, 0.0)}]
+)
+def test_the_expected_calibration_has_the_cameras_where_rig_toml_says(
+    turns: dict[str, tuple[float, float, float]], rig: RigDescription
+) -> None:
+    """A camera that looks from above, or three, of which not all see every view."""
+    left = rig.cameras["left"]
+    cameras = {name: replace(left, name=name) for name in ("left", *turns)}
+    found = expected_calibration(replace(rig, cameras=cameras, rotvec_from_first_deg=turns))
+    assert found.verdict["status"] == "GOOD", found.verdict
+    for name, turn in turns.items():
+        rotvec_deg = np.degrees(found.camera(name).camera_from_rig.rotvec_rad)
+        np.testing.assert_allclose(rotvec_deg, turn, atol=0.05)
+        assert 0 < found.sd(f"{name}.tx_mm") < 0.05
+
+
+def test_a_target_that_is_too_large_for_every_pair_of_cameras(rig: RigDescription) -> None:
+    turns = {"middle": (0.0, 60.0, 0.0), "right": (0.0, 110.0, 0.0)}
+    cameras = {name: replace(rig.cameras["left"], name=name) for name in ("left", *turns)}
+    large = replace(rig.target, pitch_mm=(60.0, 60.0))
+    described = replace(rig, cameras=cameras, rotvec_from_first_deg=turns, target=large)
+    with pytest.raises(InputError, match="no two cameras can see one side") as caught:
+        expected_calibration(described)
+    assert "smaller target" in str(caught.value) and "tilt_deg" not in str(caught.value)
+
+
 def test_variants_add_only_what_is_missing(rig: RigDescription) -> None:
     assert "an accelerometer on each arm" in variants(rig, S2)
     assert list(variants(rig, replace(S2, arms=True)))[:2] == ["as planned", "4 marks in each view"]

@@ -31,10 +31,9 @@ from telerig.estimator.calibration.start.symmetric_target import numbered_as_cal
 from telerig.estimator.calibration.thresholds import LEAST_TRAVEL_MM
 from telerig.factors.calibration import State, whitened_error
 from telerig.factors.robust_loss import next_limit, travel_weights
-from telerig.io.dataset.dataset import Dataset, View, files_by_view
+from telerig.io.dataset.dataset import Dataset, image_views
 from telerig.io.dataset.tables import read_dots_csv
 from telerig.io.files.csv_table import read_table
-from telerig.io.images.read import natural
 from telerig.io.results.findings import Code, Finding
 from telerig.io.tables.calibration import POSITIONS
 from telerig.rig.pose import Pose, across
@@ -137,7 +136,7 @@ def _measured(dataset: Dataset, folder: Path, read: list[Finding]) -> pd.DataFra
     Findings about what is not used are appended to ``read``.
     """
     table, notes = folder / "dots.csv", list[str]()
-    views = _image_views(dataset, folder, notes)
+    views = image_views(folder, dataset.rig, notes, tables=("dots.csv", _POSITIONS))
     read += [Code.NOTE.found(text=note) for note in notes]
     if table.is_file() == bool(views):
         what = "both images and dots.csv" if views else "neither images nor dots.csv"
@@ -156,15 +155,6 @@ def _measured(dataset: Dataset, folder: Path, read: list[Finding]) -> pd.DataFra
         for finding in found.findings
     ]
     return found.dots
-
-
-def _image_views(dataset: Dataset, folder: Path, notes: list[str]) -> tuple[View, ...]:
-    paths: dict[str, dict[str, Path]] = {}
-    for camera in dataset.rig.cameras:
-        if (folder / camera).is_dir():
-            for view, file in files_by_view(folder / camera, notes).items():
-                paths.setdefault(view, {})[camera] = file
-    return tuple(View(name, paths[name]) for name in sorted(paths, key=natural))
 
 
 def _far_axis(axis: Array, stated: tuple[float, float, float]) -> list[Finding]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
@@ -187,7 +187,7 @@ def load_dataset(
     views: tuple[View, ...] = ()
     table = None
     if chosen == "images":
-        views = _image_views(folder / "calibration", rig, notes)
+        views = image_views(folder / "calibration", rig, notes)
     elif chosen == "dots":
         table = read_dots_csv(folder / "calibration" / "dots.csv", rig)
         views = tuple(View(name) for name in sorted(set(table["view"]), key=natural))
@@ -255,15 +255,21 @@ def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> NoView
     return NoViewsError(what, where=str(folder), todo=todo)
 
 
-def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tuple[View, ...]:
-    """Return the views with images in calibration/<camera>/; append to ``notes``."""
+def image_views(
+    folder: Path, rig: RigDescription, notes: list[str], tables: Container[str] = ("dots.csv",)
+) -> tuple[View, ...]:
+    """Return the views with images in ``folder``/<camera>/; append to ``notes``.
+
+    tables : names of the files that may lie beside the cameras' folders.
+    Raises InputError for the folder of another camera, and for two files of one view.
+    """
     by_view: dict[str, dict[str, Path]] = {}
-    for entry in _entries(calibration):
+    for entry in _entries(folder):
         if not entry.is_dir():
-            if entry.name != "dots.csv":
+            if entry.name not in tables:
                 notes.append(
-                    f"calibration/{entry.name} is not used, because it is in no camera's folder "
-                    "calibration/<camera>/"
+                    f"{folder.name}/{entry.name} is not used, because it is in no camera's folder "
+                    f"{folder.name}/<camera>/"
                 )
         elif entry.name not in rig.cameras:
             raise InputError(
@@ -272,16 +278,16 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
                 todo=suggestion(entry.name, list(rig.cameras)),
             )
         else:
-            for stem, file in files_by_view(entry, notes).items():
+            for stem, file in _files_by_view(entry, notes).items():
                 by_view.setdefault(stem, {})[entry.name] = file
-    _check_case(by_view, calibration)
+    _check_case(by_view, folder)
     return tuple(
         View(name, {c: by_view[name][c] for c in rig.cameras if c in by_view[name]})
         for name in sorted(by_view, key=natural)
     )
 
 
-def files_by_view(folder: Path, notes: list[str]) -> dict[str, Path]:
+def _files_by_view(folder: Path, notes: list[str]) -> dict[str, Path]:
     """Return a camera's image files by view name (without extension); append to ``notes``.
 
     Raises InputError for two files of one view.

@@ -114,6 +114,20 @@ def test_images(folder: Path) -> None:
         stage_axis_from(dataset, known)
 
 
+def test_a_folder_of_no_camera_is_refused(folder: Path) -> None:
+    """As in calibration/: the images in it would be missing without a word."""
+    dataset = telerig.load_dataset(folder)
+    dots(dataset).to_csv(folder / "stage_axis" / "dots.csv", index=False)
+    (folder / "stage_axis" / "rigth").mkdir()
+    (folder / "stage_axis" / "readme.txt").write_text("of Monday", encoding="utf-8")
+    with pytest.raises(InputError, match=r"no camera 'rigth'(.|\n)*right"):
+        stage_axis_from(dataset, calibration(dataset))
+    (folder / "stage_axis" / "rigth").rmdir()
+    found = stage_axis_from(dataset, calibration(dataset))
+    (note,) = (f.text for f in found.findings if f.code is Code.NOTE)
+    assert note.startswith("stage_axis/readme.txt is not used")
+
+
 def test_a_stage_that_runs_the_other_way(folder: Path) -> None:
     rig = read_rig_toml(folder / "rig.toml")
     stage = StageDescription((0, 1, 0), (0, -1, 0), 0.001)

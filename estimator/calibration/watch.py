@@ -36,6 +36,9 @@ from telerig.short_text import number
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
 
+_SETTLE_S = 0.2
+"""At the end an image counts as completely written if it does not change for so long."""
+
 Tell = Callable[[str], None]
 Stamp = tuple[int, int]
 
@@ -156,6 +159,10 @@ class WatchedFolder:
         )
         return tuple(v for v in views if v.image_paths)
 
+    def unfinished(self) -> list[Path]:
+        """Return the images that were there at the last poll, and not completely written."""
+        return sorted(self._stamps.keys() - self._found.keys())
+
     def images(self) -> list[ImageDots]:
         """Return the detected dots of each image, in the order of the views and cameras."""
         if self.dataset is None:
@@ -254,6 +261,11 @@ def watch(
                 break
     if stop.is_set():
         tell("stopped; calibrating with the images that have arrived")
+        folder.poll()
+        time.sleep(_SETTLE_S)
+        folder.poll()
+        for path in folder.unfinished():
+            tell(f"{path} is still being written and is not used")
     detected = folder.detected()
     assert folder.dataset is not None
     run = run_calibration(folder.dataset, detected=detected, **options)

@@ -232,6 +232,24 @@ def test_a_view_that_one_camera_lacks_is_named_once(paper_images: Path, empty: P
     assert "same name" in said[0]
 
 
+def test_the_last_images_before_the_end_are_used(paper_images: Path, empty: Path) -> None:
+    """Ctrl-C follows the last image at once; one that is empty is being written."""
+    names = views(paper_images)
+    for name in names[:3]:
+        arrive(paper_images, empty, name)
+    with watching(empty, interval_s=0.5) as it:
+        it.wait_for("3 complete views")
+        arrive(paper_images, empty, names[3])
+        (empty / "calibration" / "left" / names[4]).touch()
+        it.stop.set()
+        it.thread.join(PATIENCE_S)
+    dataset, run = it.result
+    used = [name.split(".")[0] for name in names[:4]]
+    assert [view.name for view in dataset.views] == used
+    assert list(run.calibration.target_poses) == used
+    assert it.said(f"{names[4]} is still being written and is not used")
+
+
 def test_stopped_too_early_says_what_is_missing(paper_images: Path, empty: Path) -> None:
     with watching(empty) as it:
         it.wait_for("0 complete")

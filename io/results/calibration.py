@@ -348,6 +348,15 @@ class ComparisonFile(Record):
 _UNCERTAINTY = ("points_mm", "calibration_mm2", "measurement_mm2", "sigma_px")
 
 
+def covariance_file(calibration: Path) -> Path:
+    """Return where the covariance of all parameters lies beside a calibration.json.
+
+    It is covariance.npz, and NAME.covariance.npz beside a NAME.json, of which there may be several.
+    """
+    own = calibration.name == "calibration.json"
+    return calibration.with_name("covariance.npz" if own else f"{calibration.stem}.covariance.npz")
+
+
 def read_joint_covariance(file: Path) -> tuple[tuple[str, ...], Array]:
     """Read covariance.npz, the covariance of all estimated parameters of a calibration.
 

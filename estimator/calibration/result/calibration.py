@@ -581,15 +581,16 @@ class Calibration(ShortText):
     def save(self, path: str | Path) -> None:
         """Write `calibration.json`, `covariance.npz`, `dots.csv` and `residuals.csv` into a folder.
 
-        If the path ends in ``.json``, only this file and `covariance.npz` are written. What is not
-        known is not written; an old `covariance.npz` is then deleted. All files appear together.
+        If the path ends in ``.json``, only this file and `covariance.npz` are written, which beside
+        a NAME.json other than calibration.json is called NAME.covariance.npz. What is not known is
+        not written; an old file of the covariance is then deleted. All files appear together.
         """
         from telerig.io.results.manifest import replaced_results
 
         place = Path(path)
         if place.suffix == ".json":
             self.record().write(place)
-            self._write_covariance(place.parent)
+            self._write_covariance(place)
             return
         again = "Calibration.save"
         with replaced_results(place, "calibrate", again=again, inputs={}) as staged:
@@ -600,34 +601,36 @@ class Calibration(ShortText):
         from telerig.io.results.folders.calibration import CalibrationResults
 
         self.record().write(folder / "calibration.json")
-        self._write_covariance(folder)
+        self._write_covariance(folder / "calibration.json")
         for name in ("dots.csv", "residuals.csv"):
             tables = self.tables
             if tables.has(name) if isinstance(tables, CalibrationResults) else name in tables:
                 write_table(self._table(name), folder / name)
 
-    def _write_covariance(self, folder: Path) -> None:
-        from telerig.io.results.calibration import write_joint_covariance
+    def _write_covariance(self, place: Path) -> None:
+        """Write the covariance of all parameters beside its file, or delete an old one."""
+        from telerig.io.results.calibration import covariance_file, write_joint_covariance
 
+        file = covariance_file(place)
         if self.joint_names:
-            with atomic_path(folder / "covariance.npz") as temporary:
+            with atomic_path(file) as temporary:
                 write_joint_covariance(temporary, self.joint_names, self.joint_covariance)
         else:
-            (folder / "covariance.npz").unlink(missing_ok=True)
+            file.unlink(missing_ok=True)
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read a calibration from a folder or its `calibration.json`, with `covariance.npz` beside it.
+    """Read a calibration from a folder or its `calibration.json`, with the covariance beside it.
 
     Raises InputError if a file is missing, was not written by telerig, has a newer schema, or if
     the two files belong to different calibrations.
     """
-    from telerig.io.results.calibration import CalibrationFile
+    from telerig.io.results.calibration import CalibrationFile, covariance_file
     from telerig.io.results.folders.calibration import CalibrationResults
     from telerig.io.results.manifest import reading
 
     found = CalibrationResults.at(Path(path))
-    with reading(found.folder, (found.name, "covariance.npz")):
+    with reading(found.folder, (found.name, covariance_file(found.path).name)):
         record, (names, joint) = found.file, found.joint
     if record.covariance is None:
         todo = CalibrationFile.AGAIN

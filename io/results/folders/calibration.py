@@ -18,6 +18,7 @@ from telerig.io.files.names import absent
 from telerig.io.results.calibration import (
     CalibrationFile,
     ComparisonFile,
+    covariance_file,
     read_joint_covariance,
     read_uncertainty,
 )
@@ -114,16 +115,22 @@ class CalibrationResults:
 
     @cached_property
     def joint(self) -> tuple[tuple[str, ...], Array]:
-        """Names and covariance (P, P) of all P parameters, from covariance.npz; empty without it.
+        """Names and covariance (P, P) of all P parameters, from `covariance_file`; empty without
+        it.
 
-        It has to contain the covariance of the rig that calibration.json states.
+        It has to contain the covariance of the rig that calibration.json states. A calibration of
+        another name that has no file of its own takes a covariance.npz that does.
         """
-        place = self.folder / "covariance.npz"
+        place = covariance_file(self.path)
+        own = place.is_file() or self.name == CalibrationResults.name
+        place = place if own else self.folder / "covariance.npz"
         names, joint = read_joint_covariance(place)
         rig = None if self.file.covariance is None else self.file.covariance.matrix
         if names and rig is not None:
             block = joint[: len(rig), : len(rig)]
             if block.shape != rig.shape or not np.allclose(block, rig, rtol=1e-9, atol=0):
+                if not own:
+                    return (), np.zeros((0, 0))
                 raise InputError(
                     "this covariance belongs to another calibration than the calibration.json "
                     "beside it",
@@ -145,15 +152,17 @@ class CalibrationResults:
         return np.array([joint[np.ix_(of, of)] for of in index])
 
     def has(self, name: str) -> bool:
-        """Return whether the folder has a file."""
-        return (self.folder / name).is_file()
+        """Return whether the folder has a table of this calibration, which is calibration.json."""
+        return self.name == CalibrationResults.name and (self.folder / name).is_file()
 
     def table(self, name: str) -> pd.DataFrame:
         """Return "dots.csv" or "residuals.csv" as it stands. Raises InputError if it is not there,
         or if calibration.json has been replaced since it was read."""
         place = self.folder / name
-        if not place.is_file():
-            raise InputError("does not exist", where=str(place), todo=CalibrationFile.AGAIN)
+        if not self.has(name):
+            alone = self.name != CalibrationResults.name
+            what = f"is not of {self.name}, which was saved alone" if alone else "does not exist"
+            raise InputError(what, where=str(place), todo=CalibrationFile.AGAIN)
         with reading(self.folder, (self.name, name)):
             if CalibrationFile.read(self.path).statistics != self.statistics:
                 raise InputError(

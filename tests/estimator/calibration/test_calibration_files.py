@@ -82,8 +82,32 @@ def test_round_trip(calibration: Calibration, saved: Path) -> None:
 def test_a_second_save_of_the_loaded_is_the_same_file(saved: Path, tmp_path: Path) -> None:
     load_calibration(saved).save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_text() == (saved / "calibration.json").read_text()
-    assert (tmp_path / "covariance.npz").is_file()
+    assert (tmp_path / "again.covariance.npz").is_file()
     assert not (tmp_path / "dots.csv").exists()
+
+
+def test_calibrations_of_several_days_in_one_folder(calibration: Calibration, saved: Path) -> None:
+    """None takes covariance or dots of another."""
+    tuesday = replace(
+        calibration, covariance=2 * calibration.covariance,
+        joint_covariance=2 * calibration.joint_covariance,
+        tables={"dots.csv": calibration.dots.iloc[:9], "residuals.csv": calibration.residuals},
+    )  # fmt: skip
+    calibration.save(saved / "monday.json")
+    tuesday.save(saved / "tuesday.json")
+    tuesday.save(saved)
+    for name, right in (("monday", calibration), ("tuesday", tuesday), ("calibration", tuesday)):
+        found = load_calibration(saved / f"{name}.json")
+        np.testing.assert_array_equal(found.joint_covariance, right.joint_covariance)
+        if name == "calibration":
+            assert len(found.dots) == 9
+            continue
+        with pytest.raises(InputError, match=f"is not of {name}.json, which was saved alone"):
+            _ = found.dots
+    (saved / "copied.json").write_bytes((saved / "monday.json").read_bytes())
+    assert load_calibration(saved / "copied.json").joint_names == ()
+    (saved / "copied.json").write_bytes((saved / "tuesday.json").read_bytes())
+    assert load_calibration(saved / "copied.json").joint_names == tuesday.joint_names
 
 
 def test_the_file_says_what_others_rely_on(calibration: Calibration, saved: Path) -> None:

@@ -281,7 +281,11 @@ def _smoothed(
     tracks: Tracks, calibration: Calibration, run: RunData, progress: Progress | bool
 ) -> tuple[Smoothing | None, RunData, list[Check]]:
     """Smooth the recording, if need be without the sensors that are refused; also return it so."""
-    said = check_sensors(run)
+    try:
+        said = check_sensors(run)
+    except TelerigError as error:
+        words = f"{error.where}: {error.what}" if error.where else error.what
+        return None, run, [Check("sensors", "failure", words, error.todo)]
     checks = [_of_sensor(finding) for finding in said]
     smoothing = None
     for _ in range(1 + _MOST_REFUSED):

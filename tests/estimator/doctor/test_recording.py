@@ -137,6 +137,20 @@ def failed(found: Recording) -> list[str]:
     return [check.what for check in found.checks if check.status == "failure"]
 
 
+def test_a_sensor_that_cannot_be_read_costs_no_other_check(
+    trial: tuple[RunData, telerig.Calibration],
+) -> None:
+    """It stopped after its first sample."""
+    run, calibration = trial
+    assert run.accelerometers is not None
+    once = run.accelerometers.groupby("sensor").head(1).reset_index(drop=True)
+    found = check_recording(replace(run, accelerometers=once), calibration)
+    assert failed(found) == ["sensors"]
+    (check,) = [check for check in found.checks if check.what == "sensors"]
+    assert "has 1 sample" in check.words and "leave the sensor out" in check.todo
+    assert {"times of the frames", "motion"} <= {check.what for check in found.checks}
+
+
 @pytest.mark.slow
 def test_a_sound_recording_passes_and_expects_its_verdict(
     trial: tuple[RunData, telerig.Calibration],

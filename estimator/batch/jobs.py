@@ -153,8 +153,8 @@ def jobs_of(
     strict : whether a dataset that cannot be used raises InputError; otherwise it becomes a
         calibration job that fails.
 
-    Raises InputError for folders that do not exist or are named twice, for unknown runs, and for
-    options of jobs that are not done.
+    Raises InputError for folders that do not exist or are named twice, for unknown runs, for
+    options of jobs that are not done, and if there is no job.
     """
     kinds, only = kinds_and_runs(only)
     if tracks is not None and "track" in kinds:
@@ -191,6 +191,12 @@ def jobs_of(
                 raise
             jobs.append(Job("calibrate", str(place), options["calibrate"], **shared))
     _check_only(jobs, only)
+    if not jobs:
+        raise InputError(
+            "there is nothing to do: no dataset has a run, and none is to be calibrated",
+            where=", ".join(map(str, places)),
+            todo="put recordings into runs/NAME, or change --only or --calibration",
+        )
     return jobs if tracks is None else _with_tracks(jobs, tracks)
 
 

@@ -249,6 +249,18 @@ def test_run_refuses_before_work_begins(datasets, words):
     assert not (datasets[0] / "results").exists()
 
 
+@pytest.mark.parametrize("command", ["run", "batch"])
+def test_where_there_is_nothing_to_do_it_is_said(tmp_path, command):
+    """The folder of the runs has another name."""
+    data = make_dataset(tmp_path / "data", 5)
+    (data / "runs").rename(data / "run")
+    out = ["--out", str(tmp_path / "out")] if command == "batch" else []
+    result = CliRunner().invoke(app, [command, str(data), "--only", "track", *out])
+    assert result.exit_code == 2, result.output
+    assert "nothing to do: no dataset has a run" in result.output and "runs/NAME" in result.output
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_named_calibration_does_not_mix_with_the_calibration(tmp_path):
     data = make_dataset(tmp_path / "data", 5)
     (data / "runs" / "rise").rename(data / "runs" / "calibration")

@@ -218,6 +218,11 @@ def _left_over(data: Dataset) -> Iterator[Check]:
 def _views(data: Dataset) -> Iterator[Check]:
     """Check the number of views, and that they have images of both cameras."""
     done = (data.results / "calibration" / "calibration.json").is_file()
+    if not data.views and (data.path / "calibration" / "dots.csv").is_file():
+        words = "both images and dots.csv, of which `telerig calibrate` has to be told which to use"
+        todo = "give --from images or --from dots, or move one of the two away"
+        yield Check("views", "note" if done else "warning", words, todo)
+        return
     if not data.views:
         words = "no views of the target, but a calibration" if done else "no views of the target"
         todo = "" if done else "put images into calibration/<camera>/<view>.tif"

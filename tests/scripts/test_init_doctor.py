@@ -248,6 +248,15 @@ def test_an_empty_dataset_is_told_what_to_put_where(tmp_path):
     assert "runs/<name>" in _of(checks, "runs", "note")
 
 
+def test_views_in_two_forms_are_not_called_missing(data):
+    for camera in ("left", "right"):
+        (data / "calibration" / camera).mkdir()
+        picture = data / "calibration" / camera / "view00.png"
+        cv2.imwrite(str(picture), np.zeros((512, 512), np.uint8))
+    views = _of(list(check_dataset(data)), "views", "warning")
+    assert "both images and dots.csv" in views and "--from dots" in views
+
+
 def test_what_a_killed_command_left_is_named(tmp_path):
     new_dataset(tmp_path / "tank")
     assert not [c for c in check_dataset(tmp_path / "tank") if c.what == "left over"]

@@ -23,6 +23,7 @@ from telerig.estimator.bubbles.flat_field import (
     checked_image,
     normalised,
     nothing_to_see,
+    rounding_share,
 )
 from telerig.estimator.bubbles.lighting import NOT_BACKLIT, on_bright_spots, share_of_hearts
 from telerig.estimator.bubbles.outline.blobs import (
@@ -187,7 +188,9 @@ def find_bubbles(
         outside = np.minimum(background * np.float32(gain), image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
     ratio, clipped = normalised(image, background, gain)
-    found = _found(ratio, clipped, field, min_diameter_px, min_contrast, shadows)
+    found = _found(
+        ratio, clipped, rounding_share(image), field, min_diameter_px, min_contrast, shadows
+    )
     if shadows:
         found = _without_bright_spots(found, image, field)
     merged = (
@@ -202,12 +205,15 @@ def find_bubbles(
 def _found(
     ratio: Float32,
     clipped: bool,
+    rounding: float,
     field: Bools | None,
     min_diameter_px: float,
     min_contrast: float,
     shadows: bool,
 ) -> Bubbles:
     noise = noise_shares(ratio, field)
+    silent = float(noise[0]) < rounding
+    noise = np.full(2, rounding) if silent else noise
     sigma = float(noise[0])
     blobs, rejected = find_blobs(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
@@ -219,7 +225,13 @@ def _found(
     rejected += slender
     clusters: list[Array] = []
     fitted = partial(fit_outlines, ratio, noise=noise, shadows=shadows)
-    parts, outlines = _undivided(blobs, parts, fitted(_start(parts, blobs)), fitted)
+    first = fitted(_start(parts, blobs))
+    if silent and np.isfinite(first.chi2_dof).any():
+        # a screen that is white, or smoothed by a lossy compression, does not tell the rims' noise
+        noise = noise * np.sqrt(max(1.0, float(np.nanmedian(first.chi2_dof))))
+        sigma, fitted = float(noise[0]), partial(fitted, noise=noise)
+        first = fitted(_start(parts, blobs))
+    parts, outlines = _undivided(blobs, parts, first, fitted)
     start = _start(parts, blobs)
     odd, bent = implausible_outlines(outlines)
     again = _divided(blobs, parts, outlines, odd, fitted, ratio.shape, min_diameter_px)

@@ -124,6 +124,16 @@ def brightness(image: NDArray[Any], background: NDArray[Any], field: Bools | Non
     return float(np.median(ratio[ratio >= _LIT_SHARE * np.quantile(ratio, _BRIGHTEST)]))
 
 
+def rounding_share(image: NDArray[Any]) -> float:
+    """Return the noise that whole grey levels make, as a share of the lit screen's level.
+
+    It is 0 for an image of floating-point numbers.
+    """
+    some = image[::_EVERY_PX, ::_EVERY_PX]
+    level = float(np.quantile(some, _BRIGHTEST)) if image.dtype.kind in "ui" else 0.0
+    return 12**-0.5 / level if level > 0 else 0.0
+
+
 def _divisible(image: NDArray[Any]) -> NDArray[Any]:
     """Return the image in a type that OpenCV divides without a copy, or in single precision."""
     return image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32, copy=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from bubble_outline_renderer import Drawn, centre_bound_px, draw
@@ -242,6 +243,21 @@ def test_clipped_screen_is_flagged() -> None:
     image = np.minimum(digitised(clean, noise=0.01, white=290.0), 255).astype(np.uint8)
     table = detect_bubbles(image)
     assert list(table["flags"]) == ["saturated"]
+
+
+@pytest.mark.parametrize("kind", ["white", "whiter", "compressed"])
+def test_a_screen_without_noise_does_not_tell_that_of_the_rims(kind: str) -> None:
+    truth = (50.3, 49.8, 15.0, 13.0, 0.3)
+    clean = draw([Drawn(truth)], (100, 110), blur_px=1.0)
+    level = {"white": 265.0, "whiter": 300.0, "compressed": 200.0}[kind]
+    image = np.minimum(digitised(clean, noise=0.004, white=level), 255).astype(np.uint8)
+    if kind == "compressed":
+        code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 75])[1]
+        image = cv2.imdecode(code, cv2.IMREAD_GRAYSCALE)
+    row = detect_bubbles(image).iloc[0]
+    sd = np.sqrt([row["suu_px2"], row["svv_px2"]])
+    assert np.all(sd < 0.015)
+    assert np.all(np.abs([row["u_px"] - truth[0], row["v_px"] - truth[1]]) < 3.0 * sd)
 
 
 @pytest.mark.parametrize(

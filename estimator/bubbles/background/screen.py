@@ -18,6 +18,8 @@ _LIT = 0.93
 """Share of the level from which on a pixel shows the screen."""
 _OUTSIDE, _LEAST_LEVEL = 0.3, 0.2
 """Level outside of a field, so that it is closed; least level within it; shares of the median."""
+_WITHIN = 0.999
+"""Share of a pixel of the smaller image that lies in a field of which it shows the screen."""
 _TRIMMED_SD, _DEGREE = 2.5, 2
 _ENOUGH_PIXELS = 30
 _EDGE_SHARE = 1 / 3
@@ -35,18 +37,21 @@ def screen_level(image: NDArray[Any], field: Bools | None = None) -> Float32:
     """
     rows, columns = image.shape
     seen, least = image.astype(np.float32, copy=False), np.float32(0.0)
+    small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))
+    within = np.ones(small_size[::-1], bool)
     if field is not None:
         middle = float(np.median(image[field]))
         seen = np.where(field, seen, np.float32(_OUTSIDE * middle))
         least = np.float32(_LEAST_LEVEL * middle)
-    small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))
+        share = cv2.resize(field.astype(np.float32), small_size, interpolation=cv2.INTER_AREA)
+        within = share > _WITHIN
     small = cv2.resize(seen, small_size, interpolation=cv2.INTER_AREA)
     reach = max(3, min(small_size) // _CLOSED_SHARE | 1)
     kernel = np.ones((reach, reach), np.uint8)
     level = cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REFLECT)
     width = (2 * (reach // 3) + 1,) * 2
     for _ in range(_PASSES):
-        lit = (small > _LIT * level).astype(np.float32)
+        lit = ((small > _LIT * level) & within).astype(np.float32)
         lit = cv2.erode(lit, np.ones((3, 3), np.uint8))
         weight = cv2.GaussianBlur(lit, width, 0) + 1e-3 * cv2.GaussianBlur(lit, (0, 0), reach)
         total = cv2.GaussianBlur(lit * small, width, 0)

@@ -62,6 +62,17 @@ def test_a_bubble_across_the_edge_of_the_region_is_flagged() -> None:
     assert all("border" in words for words in flags.values())
 
 
+def test_what_lies_outside_a_region_is_no_screen_of_the_bubbles_at_its_edge() -> None:
+    truth = np.array([(100.3, 100.1, 20.0), (249.8, 150.2, 30.0)])
+    clean = draw([Drawn((u, v, r, r, 0.0)) for u, v, r in truth], (300, 400), blur_px=1.2)
+    noise = np.random.default_rng(0).normal(0.0, 0.005, clean.shape)
+    image = np.clip(200.0 * (clean + noise), 0, 255).astype(np.uint8)
+    corners = ((50, 50), (299, 50), (299, 199), (50, 199))
+    found = find_bubbles(image, field=region_field(image.shape, corners, "region")).accepted
+    off = found[["u_px", "v_px"]].to_numpy()[:, None] - truth[:, :2]
+    assert len(found) == 2 and np.linalg.norm(off, axis=2).min(axis=1).max() < 0.03
+
+
 def test_regions_and_masks_that_do_not_fit_are_refused() -> None:
     for corners, words in (
         ([[0, 0], [1, 1]], "is no polygon"),

@@ -21,8 +21,8 @@ from telerig.io.machine.parallel import isolated
 from telerig.rig.pose import rotation_from_rotvec
 
 _MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "camera_matrix{}", "mtx{}")
-_DISTORTION = ("D{}", "distCoeffs{}", "dist_coeffs_{}", "distortion_coefficients_{}", "dist{}",
-               "distortion_coefficients{}")  # fmt: skip
+_DISTORTION = ("D{}", "distCoeffs{}", "dist_coeffs_{}", "dist_coeffs{}", "dist{}",
+               "distortion_coefficients_{}", "distortion_coefficients{}")  # fmt: skip
 _ROTATION = ("R", "rotation_matrix", "rotation", "R12")
 _TRANSLATION = ("T", "translation_vector", "translation", "T12", "t")
 
@@ -38,7 +38,8 @@ def read_opencv_cameras(
 
     paths : one file with everything, or several: intrinsics and extrinsics, or one file for each
         camera (in their order) and one with R and T.
-    image_size_px : (width, height) in px; None where a file has image_width and image_height.
+    image_size_px : (width, height) in px; None where a file has image_width and image_height; a
+        file of one camera states that of its own.
     unit_mm : the length in mm that was given to OpenCV as 1 (1000 for metres).
 
     Raises InputError when something is missing, and for distortion beyond k1 k2 p1 p2 k3 s1..s4.
@@ -53,17 +54,26 @@ def read_opencv_cameras(
     joint = {name: value for content in contents for name, value in content.items()}
     where = ", ".join(str(file) for file in files)
     single = [c for c in contents if "camera_matrix" in c]
-    if len(single) == 2:
-        matrices = [c["camera_matrix"] for c in single]
-        distortions = [c.get("distortion_coefficients", np.zeros(5)) for c in single]
-    else:
-        matrices = [_one(joint, _MATRIX, i, where) for i in (1, 2)]
-        distortions = [_one(joint, _DISTORTION, i, where, np.zeros(5)) for i in (1, 2)]
+    alone = len(single) == 2
+    of_each = single if alone else [joint, joint]
+    matrices: list[Array] = []
+    distortions: list[Array] = []
+    notes: list[str] = []
+    for i, content in enumerate(of_each, 1):
+        matrices.append(content["camera_matrix"] if alone else _one(joint, _MATRIX, i, where))
+        known = ["distortion_coefficients"] if alone else [name.format(i) for name in _DISTORTION]
+        found = [content[name] for name in known if name in content]
+        distortions.append(found[0] if found else np.zeros(5))
+        if not found:
+            notes.append(
+                f"camera {i}: there is no {' or '.join(known)}, so it has no distortion; the names "
+                f"found are: {', '.join(content)}"
+            )
     rotation = _one(joint, _ROTATION, 0, where)
     if rotation.size == 3:
         rotation = rotation_from_rotvec(rotation.reshape(3))
     shift = _one(joint, _TRANSLATION, 0, where).reshape(-1) * unit_mm
-    size = image_size_px or _size(joint, where)
+    sizes = [image_size_px or _size(joint | content, where) for content in of_each]
     if rotation.shape != (3, 3) or shift.shape != (3,) or any(m.shape != (3, 3) for m in matrices):
         raise InputError(
             "R, T or a camera matrix does not have its size",
@@ -71,12 +81,12 @@ def read_opencv_cameras(
             todo="give R as (3, 3) or a rotation vector, T with 3 numbers, matrices (3, 3)",
         )
     pinholes = [
-        Pinhole(f"{where} camera {i + 1}", size, matrix, *pose, np.asarray(d, float).reshape(-1))
-        for i, (matrix, pose, d) in enumerate(
-            zip(matrices, [(np.eye(3), np.zeros(3)), (rotation, shift)], distortions)
+        Pinhole(f"{where} camera {i}", size, matrix, *pose, np.asarray(d, float).reshape(-1))
+        for i, size, matrix, pose, d in zip(
+            (1, 2), sizes, matrices, [(np.eye(3), np.zeros(3)), (rotation, shift)], distortions
         )
     ]
-    return cameras_from_pinholes(pinholes, list(names))
+    return cameras_from_pinholes(pinholes, list(names))._replace(notes=tuple(notes))
 
 
 def _content(file: Path) -> dict[str, Array]:
@@ -120,14 +130,11 @@ def _one(
     names: Sequence[str],
     number: int,
     where: str,
-    default: Array | None = None,
 ) -> Array:
     wanted = [name.format(number) for name in names]
     found = [content[name] for name in wanted if name in content]
     if found:
         return found[0]
-    if default is not None:
-        return default
     raise InputError(
         f"has no matrix with one of the names {', '.join(wanted)}",
         where=where,

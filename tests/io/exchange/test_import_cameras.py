@@ -99,6 +99,30 @@ def test_opencv_says_what_is_missing(tmp_path: Path) -> None:
         read_opencv_cameras([tmp_path / "none.yml"])
 
 
+def test_opencv_cameras_of_two_sizes_in_a_file_each(tmp_path: Path) -> None:
+    sizes = [(1280, 800), (1024, 1024)]
+    files = [
+        write(tmp_path / f"{i}.yml", camera_matrix=m, distortion_coefficients=BROWN,
+              image_width=size[0], image_height=size[1])
+        for i, (m, size) in enumerate(zip(MATRICES, sizes))
+    ]  # fmt: skip
+    files.append(write(tmp_path / "pair.yml", R=ROTATION, T=TRANSLATION))
+    cameras, _, notes = read_opencv_cameras(files)
+    assert [camera.image_size_px for camera in cameras] == sizes and notes == ()
+
+
+def test_opencv_distortion_under_other_names_is_not_left_out_in_silence(tmp_path: Path) -> None:
+    both = {"cameraMatrix1": MATRICES[0], "cameraMatrix2": MATRICES[1], "R": ROTATION,
+            "T": TRANSLATION, "image_width": 1280, "image_height": 800}  # fmt: skip
+    named = write(tmp_path / "a.yml", dist_coeffs1=BROWN, dist_coeffs2=BROWN, **both)
+    cameras, _, notes = read_opencv_cameras([named])
+    assert all(camera["k1"] for camera in cameras) and notes == ()
+    strange = write(tmp_path / "b.yml", D1=BROWN, bent2=BROWN, **both)
+    (left, right), _, (note,) = read_opencv_cameras([strange])
+    assert left["k1"] and not right["k1"]
+    assert note.startswith("camera 2: there is no D2 or") and "bent2" in note
+
+
 # ------------------------------------------------------------------------------------ OpenPTV
 
 SENSOR = Sensor((1280, 1024), (0.012, 0.0125))

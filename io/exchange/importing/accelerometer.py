@@ -32,6 +32,9 @@ from telerig.rig.units import ACCELERATION_UNITS
 from telerig.short_text import counted
 
 AXES = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
+_LOST_AT_TURN = 1 / 16
+"""Share of a counter's range that may be missing where it starts again; more may be where samples
+are missing elsewhere, too."""
 
 
 @dataclass(frozen=True)
@@ -222,11 +225,24 @@ def _times(recording: Recording, layout: Layout, name: str | None, rows: int) ->
 
 
 def _counted(recording: Recording, name: str) -> Array:
-    """Return how many samples lie before each, from a counter that starts again at a power of 2."""
+    """Return how many samples lie before each, from a counter of 8, 16 or 32 bits.
+
+    Raises InputError for one that starts again elsewhere, and for what does not count.
+    """
     values = _values(recording, name)
     steps = np.diff(values)
     turn = next((2.0**bits for bits in (8, 16, 32) if np.nanmax(values, initial=0) < 2**bits), 0.0)
-    steps = np.where((steps < 0) & (turn > 0), steps + turn, steps)
+    back = np.flatnonzero(steps < 0)
+    steps = np.where(steps < 0, steps + turn, steps)
+    far = back[steps[back] > max(_LOST_AT_TURN * turn, np.max(np.delete(steps, back), initial=1))]
+    if len(far):
+        before, after = values[far[0] : far[0] + 2].tolist()
+        raise recording.error(
+            f"the counter {name!r} goes from {before:.9g} to {after:.9g}, which is not where one "
+            "of 8, 16 or 32 bits starts again",
+            "cut the file there; or leave the counter out of --columns, if no sample is missing",
+            int(far[0]) + 1,
+        )
     if not len(values) or not ((steps == np.round(steps)) & (steps >= 1)).all():
         raise recording.error(
             f"channel {name!r} does not count the samples", "leave it out of --columns"

@@ -213,3 +213,28 @@ def test_layout_from_words_of_a_command_line() -> None:
     assert found == Layout(columns=(2, 3, "z"), scale_m_s2=(98.0, 97.5, 99.0))
     with pytest.raises(InputError, match="no number"):
         layout_from({"scale_m_s2": "much"})
+
+
+@pytest.mark.parametrize(
+    ("counter", "words"),
+    [
+        (np.arange(2500) % 1000, "from 999 to 0"),
+        (np.r_[np.arange(1800), np.arange(700)], "from 1799 to 0"),
+        (np.r_[np.arange(90), 91, 90, np.arange(92, 200)], "from 91 to 90"),
+    ],
+)
+def test_a_counter_that_starts_again_elsewhere_is_refused(
+    tmp_path: Path, counter: Array, words: str
+) -> None:
+    rows = [f"{n},0.1,0.2,9.8" for n in counter.tolist()]
+    (tmp_path / "a.csv").write_text("\n".join(["n,x,y,z", *rows]) + "\n")
+    with pytest.raises(InputError, match=words):
+        readings(tmp_path / "a.csv", columns=("n", "x", "y", "z"), rate_hz=1000.0, unit="g")
+
+
+def test_a_counter_that_turns_over_counts_missing_samples(tmp_path: Path) -> None:
+    n = np.delete(np.arange(600), [40, 41, 256, 257])
+    rows = [f"{k % 256},0.1,0.2,9.8" for k in n.tolist()]
+    (tmp_path / "a.csv").write_text("\n".join(["n,x,y,z", *rows]) + "\n")
+    t_s, _ = readings(tmp_path / "a.csv", columns=("n", "x", "y", "z"), rate_hz=100.0, unit="g")
+    np.testing.assert_allclose(t_s, n / 100.0)

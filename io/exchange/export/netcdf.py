@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.io.exchange.export.run_results import RunResults, facts, numbered, unit_of
+from telerig.io.exchange.export.run_results import (
+    RunResults,
+    column_of_that_name,
+    facts,
+    numbered,
+    unit_of,
+)
 from telerig.io.files.atomic import atomic_path
 from telerig.io.tables.run import TRACKS
 from telerig.io.tables.smoothing import TRAJECTORIES
@@ -48,7 +54,8 @@ def variables(results: RunResults) -> dict[str, Variable]:
     """Return the variables of a run, by name.
 
     Their dimensions are ``trajectory`` and ``obs`` (the rows); ``rowSize`` gives each trajectory's
-    number of rows. Variables have the names of the table's columns, except time, x, y, z.
+    number of rows. Variables have the names of the table's columns, except time, x, y, z. Raises
+    InputError for a further column of one of these names.
     """
     points = results.points
     numbers, names = numbered(points)
@@ -61,9 +68,12 @@ def variables(results: RunResults) -> dict[str, Variable]:
     counted = {"long_name": "rows of this trajectory", "sample_dimension": "obs"}
     out["rowSize"] = Variable(("trajectory",), sizes, counted)
     for column in points.columns:
-        if column != "particle":
-            values = points[column].to_numpy()
-            out[_NAMES.get(column, column)] = Variable(("obs",), values, _attributes(column))
+        if column == "particle":
+            continue
+        name = _NAMES.get(column, column)
+        if name in out:
+            raise column_of_that_name(name, results)
+        out[name] = Variable(("obs",), points[column].to_numpy(), _attributes(column))
     return out
 
 

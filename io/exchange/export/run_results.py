@@ -132,6 +132,15 @@ def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:
     return codes.astype(np.int64), [str(name) for name in names]
 
 
+def column_of_that_name(name: str, results: RunResults) -> InputError:
+    """Return the error for a column whose name the export gives to another one."""
+    return InputError(
+        f"has a column {name!r}, a name that this export gives to another one",
+        where=results.source,
+        todo="rename the column, or export to HDF5, which keeps all names",
+    )
+
+
 def facts(results: RunResults) -> dict[str, str]:
     """Return what an exported file states about its content: run, frame, source and verdict."""
     try:

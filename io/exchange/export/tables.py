@@ -11,7 +11,14 @@ import pandas as pd
 
 from telerig.errors import InputError
 from telerig.io.exchange.export.opencv import undistorted_matrix
-from telerig.io.exchange.export.run_results import RunResults, facts, identifier, numbered, unit_of
+from telerig.io.exchange.export.run_results import (
+    RunResults,
+    column_of_that_name,
+    facts,
+    identifier,
+    numbered,
+    unit_of,
+)
 from telerig.io.files.atomic import atomic_path
 from telerig.io.files.csv_table import write_table
 from telerig.io.files.hdf5 import hdf5_file
@@ -100,7 +107,8 @@ def _camera(camera: Camera) -> dict[str, Any]:
 def trackpy_table(results: RunResults) -> pd.DataFrame:
     """Return the trajectories with the columns frame, particle, x, y, z (mm), then all others.
 
-    Named particles are numbered; the column ``particle_name`` keeps their names.
+    Named particles are numbered; the column ``particle_name`` keeps their names. Raises InputError
+    for a further column of one of these names.
     """
     points = results.points
     numbers, names = numbered(points)
@@ -110,6 +118,8 @@ def trackpy_table(results: RunResults) -> pd.DataFrame:
     if names:
         table["particle_name"] = points["particle"]
     others = [c for c in points if c not in ("frame", "particle", "x_mm", "y_mm", "z_mm")]
+    for name in set(others) & set(table):
+        raise column_of_that_name(name, results)
     return table.join(points[others]).sort_values(["frame", "particle"]).reset_index(drop=True)
 
 

@@ -262,3 +262,13 @@ def test_only_formats_with_cameras_read_the_calibration(folder: Path, tmp_path: 
         assert (tmp_path / to).stat().st_size > 0
     with pytest.raises(InputError, match="cannot be read as JSON"):
         export_results(dataset, "hdf5", out=tmp_path / "hdf5")
+
+
+@pytest.mark.parametrize(("to", "ending"), [("netcdf", "nc"), ("trackpy", "csv")])
+def test_a_column_of_pixels_does_not_replace_the_position(
+    folder: Path, tmp_path: Path, to: str, ending: str
+) -> None:
+    file = folder / "trajectories.csv"
+    write_table(pd.read_csv(file, keep_default_na=False, na_values=[""]).assign(x=512.0), file)
+    with pytest.raises(InputError, match="has a column 'x'"):
+        export_results(folder, to, out=tmp_path / f"out.{ending}")

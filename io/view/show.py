@@ -111,6 +111,11 @@ def log_results(
     data = _recording_of(place, recording, tracks)
     image, count = _frames_of(data, tracks)
     every = range(count)[slice(*frames)] if frames else range(count)
+    if not every:
+        raise InputError(
+            f"has no frame from {frames[0]} on" if frames else "has no frames", where=str(place),
+            todo=f"the run has frames 0 to {count - 1}" if count else "track the run again",
+        )  # fmt: skip
     shown = every[:: -(-len(every) * len(tracks.cameras) // MOST_IMAGES) or 1]
     smoothed = ("height_less_line_mm", "shake_um", "speed_mm_s", "encoder_residual_um")
     plots = ["ray_miss_um", "step_mm", *(() if smoothing is None else smoothed)]

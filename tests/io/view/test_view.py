@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from viewed import entities, needs_rerun
 import telerig
 from telerig.errors import InputError, TelerigWarning
 from telerig.io.report.overlays import grey_levels
-from telerig.io.view.show import frames_of
+from telerig.io.view.show import frames_of, log_results
 from telerig.scripts.main import app
 
 
@@ -42,6 +43,16 @@ def test_frames_are_a_first_one_and_an_end() -> None:
     for text in ("7", "9:9", "a:b", "-1:3"):
         with pytest.raises(InputError, match="give A:B"):
             frames_of(text)
+
+
+def test_frames_beyond_the_end_of_a_run_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("rerun", "rerun.blueprint"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    folder = write_run(tmp_path / "results" / "rise")
+    with pytest.raises(InputError, match=f"frame from {FRAMES} on.*\n.*0 to {FRAMES - 1}"):
+        log_results(MagicMock(), folder, (FRAMES, FRAMES + 9))
 
 
 def test_levels_are_those_of_the_images() -> None:

@@ -52,15 +52,25 @@ def bubble_figures(results: SmoothingResults) -> list[Figure]:
 
 
 def _shape(results: SmoothingResults) -> str:
-    """Return a sentence on how well the spheroid describes the outlines."""
+    """Return sentences on how well the spheroid describes the outlines."""
+    from scipy.special import chdtri
+
     known = results.file.bodies
-    if not known.get("pairs"):
-        return "Their outlines are too few to test the spheroid."
     chi2 = median(column(results.bubble_frames, "spheroid_chi2"))
+    if chi2 is None:
+        return "Their outlines are too few to test the spheroid."
+    words = ""
+    if known.get("bodies"):
+        apart = number(200 * known.get("triaxial", 0.0), 2)
+        words = f"The two equatorial semi-axes differ by {apart} % (1 sd). "
+    free = {views: 3 * views - 4 for views in range(2, len(results.cameras) + 1)}
+    expected = ", ".join(
+        f"{number(float(chdtri(dof, 0.5)), 2)} of {views} outlines (degrees of freedom: {dof})"
+        for views, dof in free.items()
+    )
     return (
-        f"The two equatorial semi-axes differ by {number(200 * known.get('triaxial', 0.0), 2)} % "
-        "(1 sd). The fit of a spheroid to both outlines has a chi-square with 2 degrees of freedom "
-        f"of {number(chi2, 2)} (median; 1.4 if there were only noise)."
+        f"{words}The fit of a spheroid to the outlines of all cameras has a chi-square of "
+        f"{number(chi2, 2)} (median); if there were only noise: {expected}."
     )
 
 

@@ -6,6 +6,7 @@ import base64
 import re
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ from smoothed_folder import changed, read, write_folder
 
 import telerig
 from telerig.errors import InputError
+from telerig.estimator.bubbles.shape.shapes import Shapes
 from telerig.io.exchange.export.run_results import read_results
 from telerig.io.report.page.figures import Figure, drawn
 from telerig.io.report.plot.spectrum import shake_spectrum, velocity_spectrum
+from telerig.io.report.run.bubbles import bubble_figures
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.smoothing import smoothing_verdict, use_rows
 from telerig.io.results.verdict_words import uses_words, words_of_refusals
@@ -44,6 +47,11 @@ def _titles(folder: Path) -> set[str]:
     """Titles of the figures of a page that is made again."""
     page = write_track_report(folder).read_text(encoding="utf-8")
     return set(re.findall("<h3>(.*?)</h3>", page))
+
+
+def drawn_words(folder: Path, title: str) -> str:
+    """What stands below a figure of the bubbles."""
+    return next(one.caption for one in bubble_figures(read(folder)) if one.title == title)
 
 
 def _judged(folder: Path) -> Any:
@@ -200,6 +208,17 @@ def test_nothing_judged_and_nothing_optional(folder: Path) -> None:
     shown = [name for name in SMOOTHING if name not in ("look", "lab")]
     assert page.ids == [*shown, *LAST[1:]]
     assert "Not judged" in page.spaced and "nan" not in page.spaced.lower().split()
+
+
+def test_the_page_tests_the_spheroid_by_what_tracking_tells_of_shapes(folder: Path) -> None:
+    frames = pd.read_csv(folder / "trajectories.csv")[["frame", "particle", "t_s"]]
+    frames.assign(aspect=1.5, spheroid_chi2=1.9).to_csv(folder / "bubbles.csv", index=False)
+    changed(folder, bodies=asdict(Shapes(triaxial=0.02, bodies=60)))
+    words = drawn_words(folder, "Aspect ratio in time")
+    assert "differ by 4.0 % (1 sd)" in words and "chi-square of 1.9 (median)" in words
+    assert words.endswith("only noise: 1.4 of 2 outlines (degrees of freedom: 2).")
+    frames.assign(aspect=1.5).to_csv(folder / "bubbles.csv", index=False)
+    assert "too few to test" in drawn_words(folder, "Aspect ratio in time")
 
 
 def test_no_bubbles_leaves_the_shake(folder: Path) -> None:

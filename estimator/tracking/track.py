@@ -251,6 +251,8 @@ class TrackingStream:
             content["extrapolated"] = self.beyond / self.points
         if change is not None:
             content["rig_change"] = change.as_dict()
+        up = upwards(run, stage_axis(run, self.calibration))
+        content["up"] = (up / np.linalg.norm(up)).tolist()
         if self.marks is not None:
             content["references"] = self.marks.summary
         return content

@@ -6,7 +6,7 @@ Standard deviations are computed here; the files are checked as they are read.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -165,12 +165,15 @@ class SmoothingResults:
 def read_smoothing_results(folder: Path, up: Array) -> SmoothingResults | None:
     """Read a smoothed run's folder for a page, a film or the viewer; None without smoothing.json.
 
-    Raises InputError for what is missing, cannot be read or does not fit together.
+    up : (3,) unit vector in rig axes, where smoothing.json states none. Raises InputError for what
+    is missing, cannot be read or does not fit together.
     """
     if not (folder / "smoothing.json").is_file():
         return None
     results = SmoothingResults(folder, up)
     with reading(folder, SmoothingResults.FILES):
+        if results.file.up is not None:
+            results = replace(results, up=results.file.up)
         _ = results.shake, results.bubble_frames, results.bubble_summary
         _check_columns(results.trajectories, STATE, folder / "trajectories.csv")
     return results

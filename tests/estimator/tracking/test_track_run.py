@@ -101,6 +101,16 @@ def test_detections_alone_give_the_same_track(rise: Path, whole: Tracks, tmp_pat
     assert set(again.table["centre"]) == {"silhouettes"}
 
 
+@pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.6, 0.0, -0.8)])
+def test_the_summary_says_what_is_up(rise: Path, whole: Tracks, up: tuple[float, ...]) -> None:
+    run = telerig.load_run(rise / "runs" / "rise")
+    assert run.rig is not None and run.rig.stage is not None
+    rig = replace(run.rig, stage=replace(run.rig.stage, up=up))
+    detections = whole.detections.drop(columns="particle")
+    turned = replace(run, detections=detections, source="detections", rig=rig)
+    assert telerig.track(turned, truth_calibration()).summary["up"] == pytest.approx(up)
+
+
 def test_given_ids_pass_through(rise: Path, whole: Tracks) -> None:
     run = telerig.load_run(rise / "runs" / "rise")
     given = whole.detections[["frame", "camera", "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]]

@@ -221,6 +221,13 @@ def test_the_page_tests_the_spheroid_by_what_tracking_tells_of_shapes(folder: Pa
     assert "too few to test" in drawn_words(folder, "Aspect ratio in time")
 
 
+def test_up_is_what_the_smoothing_took_for_it(folder: Path) -> None:
+    assert "Rise velocity" in _titles(folder) and "Velocity in x" in _titles(folder)
+    changed(folder, up=[1.0, 0.0, 0.0])
+    assert read(folder).up.tolist() == [1.0, 0.0, 0.0]
+    assert "Velocity in y" in _titles(folder) and "Velocity in x" not in _titles(folder)
+
+
 def test_no_bubbles_leaves_the_shake(folder: Path) -> None:
     (folder / "trajectories.csv").write_text("frame,particle,t_s\n")
     changed(folder, "verdict", "axes", "words", bubbles=0)

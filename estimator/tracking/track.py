@@ -522,10 +522,11 @@ def _name(particle: Any, names: Mapping[int, str]) -> str:
 
 
 def _labelled(part: Linked, labels: Mapping[int, str]) -> Linked:
-    """Replace numbers by the given names."""
+    """Replace numbers by the given names, None where there is no track."""
 
-    def named(particle: pd.Series[Any]) -> list[str]:
-        return ["" if pd.isna(p) else _name(p, labels) for p in particle]
+    def named(particle: pd.Series[Any]) -> pd.Series[Any]:
+        names = [None if pd.isna(p) else _name(p, labels) for p in particle]
+        return pd.Series(names, particle.index, dtype=object)
 
     return Linked(
         part.tracks.assign(particle=named(part.tracks["particle"])),

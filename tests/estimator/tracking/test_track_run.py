@@ -151,6 +151,9 @@ def test_named_bubbles_are_tracked_but_not_reported_nor_smoothed(
     rise: Path, whole: Tracks, tmp_path: Path
 ) -> None:
     table = whole.detections.drop(columns="particle").assign(particle="first")
+    lonely = table[(table["frame"] == 4) & (table["camera"] == "left")]
+    lonely = lonely.assign(particle="", v_px=lonely["v_px"] + 80.0)
+    table = pd.concat([table, lonely], ignore_index=True)
     run = replace(telerig.load_run(rise / "runs" / "rise"), detections=table, source="detections")
     asked: dict[str, Any] = {"options": TrackOptions(), "record": {}}
     with pytest.raises(InputError, match=r"'first' is no whole number.*\n.*--no-report"):
@@ -159,6 +162,9 @@ def test_named_bubbles_are_tracked_but_not_reported_nor_smoothed(
     write_tracking(run, truth_calibration(), tmp_path / "out", **asked, report=False)
     tracks = telerig.load_tracks(tmp_path / "out")
     assert set(tracks.table["particle"]) == {"first"}
+    assert set(tracks.detections["particle"]) == {"first", ""}
+    (worst,) = tracks.summary["worst_frames"]
+    assert (worst["frame"], worst["why"]) == (4, "1 without partner or track")
     with pytest.raises(InputError, match="'first' is no whole number"):
         telerig.smooth(tracks, truth_calibration())
 

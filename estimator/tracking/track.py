@@ -216,7 +216,7 @@ class TrackingStream:
             "run": run.name,
             "pixel_origin": "centre",
             "frame_of_reference": "rig frame (the first camera's), mm",
-            "image_size_px": dict(run.image_sizes_px),
+            "image_size_px": {c.name: c.image_size_px for c in used},
             "cameras": {c.name: CameraRecord.of_camera(c).content() for c in used},
             "walls": wall_records(used),
             "frames": run.frame_count,
@@ -261,8 +261,9 @@ class TrackingStream:
         """Return a warning for each camera with more bubbles than the detection can separate."""
         found, frames = [], self.run.frame_count
         fields = described_fields(self.run) if self.run.detections is None else {}
+        sizes = {camera.name: camera.image_size_px for camera in self.calibration.cameras}
         for camera, (many, area) in self.covered.items():
-            width, height = self.run.image_sizes_px[camera]
+            width, height = sizes[camera]
             looked_at = fields[camera].sum() if camera in fields else width * height
             share = area / (float(looked_at) * frames)
             if is_crowded(share, many / frames, COVERED_LIMIT):

@@ -111,6 +111,17 @@ def test_the_summary_says_what_is_up(rise: Path, whole: Tracks, up: tuple[float,
     assert telerig.track(turned, truth_calibration()).summary["up"] == pytest.approx(up)
 
 
+def test_detections_without_a_rig_have_the_calibrations_image_sizes(
+    rise: Path, whole: Tracks, tmp_path: Path
+) -> None:
+    shutil.copy(rise / "runs" / "rise" / "frames.csv", tmp_path)
+    whole.detections.drop(columns="particle").to_csv(tmp_path / "detections.csv", index=False)
+    calibration = truth_calibration()
+    run = telerig.load_run(tmp_path, cameras=[c.name for c in calibration.cameras])
+    summary = telerig.track(run, calibration).summary
+    assert summary["image_size_px"] == {c.name: c.image_size_px for c in calibration.cameras}
+
+
 def test_given_ids_pass_through(rise: Path, whole: Tracks) -> None:
     run = telerig.load_run(rise / "runs" / "rise")
     given = whole.detections[["frame", "camera", "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]]

@@ -80,6 +80,9 @@ MODEL_FRAMES = 60
 LARGEST_ID = 10**15
 """Tracks are numbered below it; a larger number is the name of a bubble."""
 
+_VERTICAL = 0.98
+"""Cosine of the angle up to which bubbles rise along the travel axis, which is calibrated."""
+
 _RELIABLE = 0.99
 """Probability of a group from which shapes are learned."""
 
@@ -386,7 +389,8 @@ def tracking_stream(
             stage("pair model", 0, 0)
         sample = _sample(cameras, batches)
         model = learn_rig(sample, cameras)
-        tracker = Tracker(axis, _settings(chosen, run), first_id=first_id)
+        rise = axis if axis @ up > _VERTICAL else up
+        tracker = Tracker(axis, _settings(chosen, run), first_id=first_id, up=rise)
         linker = RowMaker(model, tracker, _shapes(sample, model, up), up)
         without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
         linking = Linking(model.pairs, linker.shapes, linker.events, without, model.misplaced)

@@ -32,18 +32,17 @@ class TrackerSettings:
     """Hold the settings of the tracker.
 
     The defaults suit bubbles of 5 mm that rise at 280 mm/s and are recorded at 100 to 1000 Hz.
-    "Along" and "across" refer to the stage's travel axis.
+    "Along" and "across" refer to the direction in which bubbles rise.
 
-    rise_mm_s : mean velocity of a new track along the axis, used if an encoder gives the stage's
+    rise_mm_s : mean velocity of a new track along it, used if an encoder gives the stage's
         motion; otherwise the mean is 0.
     birth_speed_sd_mm_s, birth_speed_sd_no_encoder_mm_s : standard deviation (sd) of a new track's
         velocity in each coordinate, with and without an encoder.
-    lateral_acceleration_mm_s2, rise_acceleration_mm_s2 : RMS acceleration across and along the
-        axis.
-    acceleration_time_s : correlation time of the acceleration along the axis (Singer's model).
-    zigzag_hz, zigzag_damping : frequency at which the velocity across the axis oscillates, and its
+    lateral_acceleration_mm_s2, rise_acceleration_mm_s2 : RMS acceleration across and along it.
+    acceleration_time_s : correlation time of the acceleration along it (Singer's model).
+    zigzag_hz, zigzag_damping : frequency at which the velocity across it oscillates, and its
         damping ratio. A small ratio means one frequency; 0.7 means any frequency up to zigzag_hz.
-    drift_sd_mm_s, drift_time_s : sd and correlation time of the slow velocity across the axis about
+    drift_sd_mm_s, drift_time_s : sd and correlation time of the slow velocity across it about
         which the velocity oscillates.
     shake_sd_mm, shake_time_s : sd and correlation time of the offset that all bubbles of a frame
         share.

@@ -112,11 +112,20 @@ def related(
     return [TrackEvent(kind, scan.frame, scan.t_s, ids, f"d_eq {before} became {after}")]
 
 
+def _unit(direction: ArrayLike, name: str) -> tuple[float, float, float]:
+    """Return a direction (3,) with unit length. Raises InputError when it is none."""
+    given = np.asarray(direction, float)
+    if given.shape != (3,) or not np.linalg.norm(given) > 0:
+        raise InputError(f"{name} = {given.tolist()}", todo="give a direction of three numbers")
+    x, y, z = (given / np.linalg.norm(given)).tolist()
+    return x, y, z
+
+
 class Tracker:
     """Follow bubbles: take the measurements of one frame after another and return track ids.
 
-    axis_rig : (3,) the stage's travel direction in the rig frame, along which bubbles also rise. It
-        need not have unit length.
+    axis_rig : (3,) the stage's travel direction in the rig frame. It need not have unit length.
+    up : (3,) direction along which bubbles rise; None for the same.
     settings : None for the defaults.
     first_id : id of the first track; it has to be larger than any id given with the measurements.
 
@@ -124,7 +133,7 @@ class Tracker:
     while a conflict or a birth in it is undecided, at most for ``window_frames`` or
     ``confirm_frames`` frames. The memory that is needed does not grow with the length of the run.
 
-    Raises InputError when axis_rig is no direction.
+    Raises InputError when axis_rig or up is no direction.
     """
 
     def __init__(
@@ -133,14 +142,10 @@ class Tracker:
         settings: TrackerSettings | None = None,
         *,
         first_id: int = 0,
+        up: ArrayLike | None = None,
     ) -> None:
-        axis = np.asarray(axis_rig, float)
-        if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
-            raise InputError(
-                f"axis_rig = {axis.tolist()}", todo="give a direction of three numbers"
-            )
-        unit = (axis / np.linalg.norm(axis)).tolist()
-        self.axis: tuple[float, float, float] = (unit[0], unit[1], unit[2])
+        self.axis = _unit(axis_rig, "axis_rig")
+        self.up = self.axis if up is None else _unit(up, "up")
         self.settings = TrackerSettings() if settings is None else settings
         self.next_id = first_id
         none = np.zeros(0, np.int64)
@@ -271,7 +276,7 @@ class Tracker:
             raise InputError(f"time {t_s} s after {self.last[1]} s", todo="times must increase")
         moved_mm, known, found_mm_s = stage.step(position_mm, t_s, dt)
         axis = np.array(self.axis)
-        step = transition(self.settings, self.axis, round(dt, 12), known)
+        step = transition(self.settings, self.up, round(dt, 12), known)
         control = np.zeros(STATES)
         control[POSITION] -= axis * moved_mm
         return step, control, axis * found_mm_s
@@ -347,7 +352,7 @@ class Tracker:
         columns, tracks = np.concatenate([free, named]), np.concatenate([new, given[named]])
         if len(columns):
             in_lab = self.stage.in_lab
-            velocity = np.array(self.axis) * (self.settings.rise_mm_s if in_lab else 0.0)
+            velocity = np.array(self.up) * (self.settings.rise_mm_s if in_lab else 0.0)
             born = States.born(scan, columns, tracks, velocity, in_lab)
             found = beside(self._confirmed(), born.points_mm, tracks)
             self._parents |= zip(tracks.tolist(), found)

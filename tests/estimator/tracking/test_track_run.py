@@ -24,6 +24,7 @@ from telerig.estimator.calibration.result.calibration import (
 from telerig.estimator.tracking import detect_run
 from telerig.estimator.tracking import track as track_module
 from telerig.estimator.tracking.linking.frames_to_rows import Linked
+from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.estimator.tracking.results_folder import WORK, _Worst, write_tracking
 from telerig.estimator.tracking.track import TrackOptions, tracking_stream
 from telerig.estimator.tracking.tracks import Tracks
@@ -109,6 +110,27 @@ def test_the_summary_says_what_is_up(rise: Path, whole: Tracks, up: tuple[float,
     detections = whole.detections.drop(columns="particle")
     turned = replace(run, detections=detections, source="detections", rig=rig)
     assert telerig.track(turned, truth_calibration()).summary["up"] == pytest.approx(up)
+
+
+def test_the_tracker_is_told_what_is_up(
+    rise: Path, whole: Tracks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = telerig.load_run(rise / "runs" / "rise")
+    assert run.rig is not None and run.rig.stage is not None and run.position_mm is not None
+    told = []
+
+    def tracker(*given: Any, up: Any, **more: Any) -> Tracker:
+        told.append((given[0].tolist(), up.tolist()))
+        return Tracker(*given, up=up, **more)
+
+    monkeypatch.setattr(track_module, "Tracker", tracker)
+    stage = replace(run.rig.stage, axis=(0.0, 1.0, 0.0), up=(0.0, -1.0, 0.0))
+    counted = replace(
+        run, detections=whole.detections.drop(columns="particle"), source="detections",
+        rig=replace(run.rig, stage=stage), position_mm=-run.position_mm,
+    )  # fmt: skip
+    assert len(telerig.track(counted, truth_calibration())) == 1
+    assert told == [([0.0, 1.0, 0.0], [0.0, -1.0, 0.0])]
 
 
 def test_detections_without_a_rig_have_the_calibrations_image_sizes(

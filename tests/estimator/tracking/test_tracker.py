@@ -186,6 +186,20 @@ def test_without_encoder_a_ramp_of_the_stage_is_followed() -> None:
     assert ids[0].tolist() == ids[-1].tolist()
 
 
+@pytest.mark.parametrize("axis", [UP, -UP, np.array([1.0, 0.0, 0.0])])
+def test_bubbles_rise_whichever_way_the_stage_counts(axis: Array) -> None:
+    t = np.arange(20) / 70
+    rng = np.random.default_rng(8)
+    base = rng.uniform(-12, 12, (12, 3))
+    moved = 250 * t[:, None] * (UP if axis @ UP else axis)
+    rises = 280 + rng.normal(0, 15, (12, 1))
+    frames = [base + UP * rises * a - m + rng.normal(0, 0.02, (12, 3)) for a, m in zip(t, moved)]
+    ids, events = run(Tracker(axis, up=UP), frames, hz=70.0, stage=moved @ axis)
+    assert kinds(events) == ["birth"] * 12 and sorted(ids[-1]) == [*range(12)]
+    assert all(set(of_one) <= {-1, of_one[-1]} for of_one in zip(*ids))
+    assert np.mean(np.array(ids) >= 0) > 0.85
+
+
 def test_readings_that_fail_for_a_while_are_bridged() -> None:
     t = np.arange(150) / 500
     stage = 300 * t + 2 * np.sin(10 * t)

@@ -29,6 +29,9 @@ correlated."""
 
 _FIRST_BIN = 2
 _LEAST_FRAMES = 16
+_GAP_STEPS = 5.0
+"""Steps longer than so many median steps are gaps, which no spectrum bridges."""
+
 _LEAST_CYCLES = 4.0
 """An oscillation with fewer cycles in a stretch cannot be distinguished from a slow wander."""
 
@@ -225,23 +228,41 @@ def _noise(log: Array) -> Noise:
 
 
 def _spectra(part: Series) -> list[_Spectrum]:
-    """Return spectra of each frame's mean ray miss, and of single bubbles' deviations from it."""
+    """Return spectra of each frame's mean ray miss, and of single bubbles' deviations from it.
+
+    Those of the mean come first, the longest of them before the others.
+    """
     left = part.residuals()
     t, index = np.unique(part.t_s, return_inverse=True)
-    if len(t) < _LEAST_FRAMES:
-        return []
     count = np.bincount(index)
     mean = np.bincount(index, left) / count
-    share = float((1 / count).mean())
-    out = [_spectrum(t, mean, 1.0, share)]
+    out = [
+        _spectrum(t[some], mean[some], 1.0, float((1 / count[some]).mean()))
+        for some in _without_gaps(t)
+    ]
     apart = left - mean[index]
     bubbles, seen = np.unique(part.bubble, return_counts=True)
-    for bubble in bubbles[np.argsort(-seen)][:_MOST_APART] if share < 1 else ():
-        mine = (part.bubble == bubble) & (count[index] > 1)
-        if mine.sum() >= _LEAST_FRAMES:
-            rest = float((1 - 1 / count[index[mine]]).mean())
-            out.append(_spectrum(part.t_s[mine], apart[mine], 0.0, rest))
+    for bubble in bubbles[np.argsort(-seen)][:_MOST_APART] if count.max() > 1 else ():
+        mine = np.flatnonzero((part.bubble == bubble) & (count[index] > 1))
+        for some in _without_gaps(part.t_s[mine]):
+            rows = mine[some]
+            rest = float((1 - 1 / count[index[rows]]).mean())
+            out.append(_spectrum(part.t_s[rows], apart[rows], 0.0, rest))
     return out
+
+
+def _without_gaps(t_s: Array) -> list[Ints]:
+    """Return the places of increasing times (N,) between which there is no gap, the longest first.
+
+    Bubbles that come one by one leave gaps that are longer than the time in which they are seen:
+    interpolated, these would have neither the noise of a pixel nor its frequencies.
+    """
+    step = np.diff(t_s)
+    if not len(step):
+        return []
+    ends = np.flatnonzero(step > _GAP_STEPS * np.median(step)) + 1
+    parts = [some for some in np.split(np.arange(len(t_s)), ends) if len(some) >= _LEAST_FRAMES]
+    return sorted(parts, key=len, reverse=True)
 
 
 def _spectrum(t_s: Array, values: Array, common: float, single: float) -> _Spectrum:

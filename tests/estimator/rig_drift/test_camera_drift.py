@@ -260,6 +260,20 @@ def test_wrong_pairs_do_not_count() -> None:
     assert change.pairs < len(tracks) - 0.8 * some.sum()
 
 
+def test_bubbles_that_come_one_by_one_are_no_movement() -> None:
+    """Ten of 0.3 s, half a minute apart: the gaps between them tell nothing of the noise."""
+    cameras = rig()
+    tracks = Run(shake_mm=0.0).tracks(cameras, cameras, np.random.default_rng(0))
+    bubble = tracks["frame"] // 30
+    seldom = tracks.assign(particle=bubble, frame=tracks["frame"] + 3000 * bubble)
+    seldom["t_s"] = seldom["frame"] / 100.0
+    found = rig_change(seldom, calibration(cameras))
+    assert found is not None
+    change, noise = found
+    assert not change.moved and change.pairs == len(tracks)
+    assert noise.white_mm == pytest.approx(0.0137, rel=0.2)  # 0.1 px in both views
+
+
 @pytest.mark.parametrize("stated", [0.0, np.nan])
 def test_tracks_that_state_no_noise_are_tested_as_well(stated: float) -> None:
     cameras = rig(90.0)

@@ -63,7 +63,7 @@ _PIXEL = ("u_px", "v_px")
 
 @dataclass(frozen=True)
 class Seen:
-    """The pixels (N, 2) of one mark in one camera or two, with frames, cameras and sd (N,)."""
+    """The pixels (N, 2) of one mark in one camera or more, with frames, cameras and sd (N,)."""
 
     mark: str
     cameras: tuple[int, ...]
@@ -99,8 +99,8 @@ def validate(
     """Withhold marks of a run in turn, and smooth each as a bubble whose own motion is known.
 
     Each mark is smoothed beside the other marks and all sensors, and, if the run has
-    accelerometers, also beside the sensors only. A mark that both cameras see is a bubble that both
-    see; of any other mark only the two axes of its image count.
+    accelerometers, also beside the sensors only. A mark that several cameras see is a bubble that
+    these see; of any other mark only the two axes of its image count.
 
     marks : how many are withheld, those that are seen longest, of each camera in turn. model,
     accept : see `telerig.smooth`.
@@ -191,8 +191,8 @@ def validate_run(
 def seen_marks(run: RunData, calibration: Calibration) -> list[Seen]:
     """Return the marks of a run; InputError without marks.
 
-    A mark counts as seen by two cameras if both see it in `FEWEST_FRAMES` frames; otherwise the
-    camera that sees it more often counts.
+    A mark counts as seen by several cameras if two or more see it in `FEWEST_FRAMES` frames;
+    otherwise the camera that sees it most often counts.
     """
     table = run.references
     if table is None or not len(table):
@@ -209,15 +209,15 @@ def seen_marks(run: RunData, calibration: Calibration) -> list[Seen]:
     ).sort_values(["frame", "number"])
     out = []
     for name, rows in table.groupby(table["mark"].astype(str), sort=False):
-        counts = np.bincount(rows["number"].to_numpy(np.int64), minlength=2)
-        both = len(set.intersection(*(set(r["frame"]) for _, r in rows.groupby("number"))))
-        pair = bool(counts.all()) and both >= FEWEST_FRAMES
-        cameras = (0, 1) if pair else (int(counts.argmax()),)
-        rows = rows[rows["number"].isin(cameras)]
-        if pair:
-            shared = rows.groupby("frame")["number"].nunique()
-            ends = shared.index[shared == 2]
-            rows = rows[rows["frame"].between(ends.min(), ends.max())]
+        counts = np.bincount(rows["number"].to_numpy(np.int64))
+        each = rows.groupby("frame")["number"].nunique()
+        shared = each.index[each >= 2]
+        if len(shared) >= FEWEST_FRAMES:
+            rows = rows[rows["frame"].between(shared.min(), shared.max())]
+            cameras = tuple(np.unique(rows["number"].to_numpy(np.int64)).tolist())
+        else:
+            cameras = (int(counts.argmax()),)
+            rows = rows[rows["number"].isin(cameras)]
         out.append(
             Seen(
                 str(name), cameras, rows["frame"].to_numpy(np.int64),
@@ -236,7 +236,7 @@ def longest(every: Sequence[Seen], count: int) -> list[Seen]:
     ranked: dict[tuple[int, ...], int] = {}
     order: list[tuple[int, int, Seen]] = []
     for mark in sorted(every, key=lambda mark: -mark.frames):
-        if len(mark.frame) >= FEWEST_FRAMES * len(mark.cameras):
+        if len(mark.frame) >= FEWEST_FRAMES * min(len(mark.cameras), 2):
             ranked[mark.cameras] = ranked.get(mark.cameras, 0) + 1
             order.append((ranked[mark.cameras], len(order), mark))
     if not order:
@@ -291,35 +291,33 @@ def _nearest(origin: Array, direction: Array) -> Array:
 
 
 def track_of(mark: Seen, calibration: Calibration, t_s: Array) -> Tracks:
-    """Return a mark's pixels as a track, which begins and ends with pixels of both cameras.
+    """Return a mark's pixels as a track, which begins and ends with pixels of two cameras or more.
 
-    Where only one camera sees the mark, the other's pixel is a guess with an sd of `_UNSEEN_PX`.
+    Where only one camera sees the mark, the others' pixels are guesses with an sd of `_UNSEEN_PX`.
     """
-    cameras = calibration.cameras
-    by_camera = [
-        {int(f): (uv, s) for f, c, uv, s in zip(mark.frame, mark.camera, mark.uv_px, mark.sigma_px)
-         if c == i} for i in range(2)
-    ]  # fmt: skip
-    if len(mark.cameras) == 2:
-        frames = np.array(sorted(set(by_camera[0]) & set(by_camera[1])))
-        values = [[by_camera[i][f] for f in frames.tolist()] for i in range(2)]
-        uv = [np.array([entry[0] for entry in of]) for of in values]
-        sigma = [np.array([entry[1] for entry in of]) for of in values]
-        points = calibration.triangulate(*uv, sigma_px=float(np.median(mark.sigma_px))).points_mm
+    cameras, several = calibration.cameras, len(mark.cameras) > 1
+    frames, times = np.unique(mark.frame, return_counts=True)
+    frames = frames[times > 1] if several else frames[[0, -1]]
+    uv = [np.full((len(frames), 2), np.nan) for _ in cameras]
+    sigma = [np.full(len(frames), np.nan if several else _UNSEEN_PX) for _ in cameras]
+    for i in mark.cameras:
+        mine = (mark.camera == i) & np.isin(mark.frame, frames)
+        at = np.searchsorted(frames, mark.frame[mine])
+        uv[i][at], sigma[i][at] = mark.uv_px[mine], mark.sigma_px[mine]
+    if several:
+        by_name = {camera.name: pixels for camera, pixels in zip(cameras, uv)}
+        points = calibration.triangulate(
+            by_name, sigma_px=float(np.median(mark.sigma_px)), include_calibration=False
+        ).points_mm
     else:
         (seeing,) = mark.cameras
-        frames = np.array([mark.frame.min(), mark.frame.max()])
-        ends = np.array([by_camera[seeing][f][0] for f in frames.tolist()])
-        points = _nearest(*cameras[seeing].unproject(ends))
-        uv = [camera.project(points) for camera in cameras]
-        uv[seeing] = ends
-        sigma = [np.full(2, _UNSEEN_PX) for _ in cameras]
-        sigma[seeing] = np.array([by_camera[seeing][f][1] for f in frames.tolist()])
+        points = _nearest(*cameras[seeing].unproject(uv[seeing]))
+        uv = [pixels if i == seeing else cameras[i].project(points) for i, pixels in enumerate(uv)]
     columns: dict[str, Any] = {"frame": frames, "particle": 0, "t_s": t_s[frames]}
     columns |= {f"{a}_mm": points[:, i] for i, a in enumerate("xyz")}
     for camera, px, sd in zip(cameras, uv, sigma):
         columns |= {f"{camera.name}_u_px": px[:, 0], f"{camera.name}_v_px": px[:, 1]}
-        for name, value in (("suu", sd**2), ("suv", 0.0), ("svv", sd**2)):
+        for name, value in (("suu", sd**2), ("suv", 0.0 * sd), ("svv", sd**2)):
             columns[f"{camera.name}_{name}_px2"] = value
     detections = pd.DataFrame(
         {

@@ -150,6 +150,33 @@ def test_a_mark_of_both_cameras_is_a_bubble_of_both(run: RunData, calibration: C
     assert_allclose(track[["x_mm", "y_mm", "z_mm"]], point[3:], atol=1e-6)
 
 
+def test_marks_of_three_cameras(run: RunData) -> None:
+    """One that the third camera alone sees, and one that all see, but not in the same frames."""
+    cameras = list(true_cameras(run_preset("swarm_three").calibration).values())
+    three = calibration_from_cameras(cameras)
+    frames = np.arange(40)
+    point = np.array([1.0, 2.0, 3.0]) + np.outer(frames, [0.0, 0.5, 0.0])
+    seen = {"wire": (slice(0, 40), slice(5, 40), slice(10, 36)), "dot": (None, None, slice(0, 40))}
+    rows = [
+        pd.DataFrame({"frame": frames, "camera": camera.name, "mark": name, "sigma_px": 0.1,
+                      "u_px": camera.project(point)[:, 0], "v_px": camera.project(point)[:, 1]})[of]
+        for name, every in seen.items()
+        for camera, of in zip(cameras, every, strict=True) if of is not None
+    ]  # fmt: skip
+    marks = {m.mark: m for m in seen_marks(replace(run, references=pd.concat(rows)), three)}
+    assert {name: mark.cameras for name, mark in marks.items()} == {"wire": (0, 1, 2), "dot": (2,)}
+    assert len(longest(list(marks.values()), 6)) == 2
+    wire, dot = (track_of(marks[name], three, run.t_s).table for name in ("wire", "dot"))
+    assert wire["frame"].tolist() == list(range(5, 40))
+    assert_allclose(wire[["x_mm", "y_mm", "z_mm"]], point[5:], atol=1e-6)
+    last = cameras[2].name
+    assert wire[f"{last}_u_px"].notna().to_numpy().tolist() == [10 <= f < 36 for f in range(5, 40)]
+    assert wire[f"{last}_suv_px2"].isna().equals(wire[f"{last}_u_px"].isna())
+    assert dot["frame"].tolist() == [0, 39]
+    assert_allclose(dot[[f"{last}_u_px", f"{last}_v_px"]], cameras[2].project(point[[0, 39]]))
+    assert np.all(dot[f"{cameras[0].name}_suu_px2"] > 1e7)
+
+
 def test_a_run_without_marks_is_refused(run: RunData, calibration: Calibration) -> None:
     with pytest.raises(InputError, match="nothing that is known to stand still"):
         validate(replace(run, references=None), calibration)

@@ -25,14 +25,18 @@ def sampling_rate(t_s: ArrayLike) -> float:
 
 
 def noise_density(t_s: ArrayLike, reading_m_s2: ArrayLike) -> float:
-    """Return the noise density in micro-g per root hertz that a record (N, 3) shows.
+    """Return the noise density in micro-g per root hertz that a record (N, k) of k axes shows.
 
     It is the level of the spectrum between 1/8 and 0.45 of the sampling rate: the median over
-    frequencies, and the lower quartile over parts of the record.
+    frequencies, and the lower quartile over parts of the record. An axis that never changes shows
+    none.
     """
     from scipy.signal import spectrogram
 
     reading = np.asarray(reading_m_s2, float)
+    reading = reading[:, np.ptp(reading, axis=0) > 0]
+    if not reading.shape[1]:
+        return _LEAST_UG_SQRT_HZ
     rate = sampling_rate(t_s)
     frequency, _, power = spectrogram(
         reading, rate, nperseg=min(_SEGMENT, len(reading)), axis=0, detrend="linear"

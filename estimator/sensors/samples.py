@@ -52,7 +52,7 @@ def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
         warn(f"{words}, and {f'{name} is' if often else 'they are'} not used", found.samples)
     density = sensor.noise_density_ug_sqrt_hz
     if density is None:
-        density = noise_density(t, reading)
+        density = noise_density(t, np.delete(reading, list(unused), axis=1))
         words = f"no noise density is given; {density:.3g} ug/sqrt(Hz) are estimated"
         todo = "give noise_density_ug_sqrt_hz from the data sheet"
         findings.append(Finding(words, where, todo, is_fault=False))

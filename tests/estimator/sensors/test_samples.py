@@ -162,6 +162,20 @@ def test_a_noise_density_is_estimated() -> None:
     assert "no noise density is given" in words[0]
 
 
+def test_axes_that_are_not_used_show_no_noise() -> None:
+    """A sensor of one axis, whose other columns are 0; and a clipped axis."""
+    one = shaken() * [0.0, 1.0, 0.0]
+    assert noise_density(T, one) == pytest.approx(DENSITY, rel=0.15)
+    clipped = shaken()
+    clipped[:, 0] = clipped[:, 0].clip(-0.1, 0.1)
+    for reading, unused in ((one, (0, 2)), (clipped, (0,))):
+        found, _ = screen(reading, noise_density_ug_sqrt_hz=None)
+        assert found.unused_axes == unused
+        assert found.noise_density_ug_sqrt_hz == pytest.approx(DENSITY, rel=0.15)
+    still, _ = screen(0 * one, noise_density_ug_sqrt_hz=None)
+    assert still.unused_axes == (0, 1, 2)
+
+
 @pytest.mark.skipif(not BOX.is_dir(), reason="the real records of ../shared/real are not here")
 @pytest.mark.parametrize(("file", "first", "density"), [("8g", 3, 18), ("16g", 0, 300)])
 def test_real_records_lose_nothing_but_two_knocks(file: str, first: int, density: float) -> None:

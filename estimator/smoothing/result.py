@@ -582,7 +582,8 @@ def _baselines(solution: Solution, tracks: pd.DataFrame, *, rts: bool) -> dict[s
     rows = graph.row(np.asarray(item), np.asarray(seen))
     naive = np.full((graph.rows, 3), np.nan)
     naive[rows] = tracks[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-    naive[rows] += problem.encoder_mm[seen, None] * problem.axis
+    read_mm = np.where(problem.in_encoder_record, problem.encoder_mm, np.nan)
+    naive[rows] += read_mm[seen, None] * problem.axis
     covariance = np.tile(1e-4 * np.eye(3), (graph.rows, 1, 1))
     names = [["sxx", "sxy", "sxz"], ["sxy", "syy", "syz"], ["sxz", "syz", "szz"]]
     if f"{names[0][0]}_mm2" in tracks:

@@ -47,7 +47,9 @@ BROAD_BAND = "broad band"
 _SAME = 0.05
 _NEAR, _NEAR_S = 0.6, 1e-3
 _TERMS = 9
-_READING_SIGMA_MM = 10.0
+_READING_SIGMA_MM, _UNREAD_SIGMA_MM = 10.0, 1e3
+"""Of a carriage at rest in the model about its readings, and where frames are outside the encoder's
+record: what it moves there is not known, and must not be taken for motion of the bubbles."""
 _ALIGNED = 1 - 1e-9
 _FEW_KINDS = 16
 
@@ -185,7 +187,8 @@ def _carriage(problem: SmoothingProblem, model: ShakeModel) -> list[_Placed]:
     if model.carriage.kind == "force":
         part = forced_mass(model.carriage.acceleration_rms_mm_s2, force_hz=model.carriage.corner_hz)
     else:
-        part = independent(_READING_SIGMA_MM)
+        whole = bool(problem.in_encoder_record.all())
+        part = independent(_READING_SIGMA_MM if whole else _UNREAD_SIGMA_MM)
     placed = [_Placed(part, "carriage", problem.axis, CARRIAGE, "carriage")]
     if model.carriage.servo is not None:
         rms, frequency, damping = model.carriage.servo

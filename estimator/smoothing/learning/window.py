@@ -47,9 +47,26 @@ def learning_parts(
 
     This is `learning_window`; or, if tracks are short, several pieces of the run in each of which
     some bubbles are always seen. Arguments as for `learning_signals`.
+
+    Frames outside the encoder's record are left out: what the carriage moves there would be taken
+    for shake.
     """
-    window = learning_window(problem, weights)
-    return _pieces(problem, weights, window) or [window]
+    first, end = _record(problem)
+    if end - first == len(problem.t_s):
+        window = learning_window(problem, weights)
+        return _pieces(problem, weights, window) or [window]
+    read = cut_out(problem, first, end, weights)
+    parts = learning_parts(read.problem)
+    return [Window(p.problem, first + p.first, read.bubbles[p.bubbles]) for p in parts]
+
+
+def _record(problem: SmoothingProblem) -> tuple[int, int]:
+    """Return the frames within the encoder's record, from the first to before the end; all frames
+    if there are not two."""
+    inside = np.flatnonzero(problem.in_encoder_record)
+    if len(inside) < 2:
+        return 0, len(problem.t_s)
+    return int(inside[0]), int(inside[-1]) + 1
 
 
 def _pieces(
@@ -168,10 +185,12 @@ def frames_of_observations(problem: SmoothingProblem) -> Ints:
 
 
 def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Window]:
-    """Return up to ``most`` windows outside the used one, of its length or `MOST_FRAMES`."""
+    """Return up to ``most`` windows outside the used one, of its length or `MOST_FRAMES`, within
+    the encoder's record."""
     end = used.first + len(used.problem.t_s)
     length = min(end - used.first, MOST_FRAMES)
-    before, after = _spread(0, used.first, length), _spread(end, len(problem.t_s), length)
+    begin, last = _record(problem)
+    before, after = _spread(begin, used.first, length), _spread(end, last, length)
     firsts = np.array(before + after, np.int64)
     if not len(firsts):
         return []

@@ -391,6 +391,12 @@ class SmoothingProblem:
         first, last = self.stage.t_s[[0, -1]]
         return np.asarray((self.t_s >= first - 1e-9) & (self.t_s <= last + 1e-9))
 
+    def read(self, observed: Observations) -> Observations:
+        """Return the observations in frames within the encoder's record: outside it `encoder_mm` is
+        the reading at its end, whatever the carriage does."""
+        inside = self.in_encoder_record
+        return observed if inside.all() else observed.of(inside[observed.frame])
+
     @property
     def arms_with_sensor(self) -> set[int]:
         """Indices of the cameras whose arm carries an accelerometer."""

@@ -69,7 +69,7 @@ class MarkMotion:
     @classmethod
     def of(cls, problem: SmoothingProblem) -> MarkMotion | None:
         """Return the regression; None without marks or encoder, or if neither moves."""
-        seen, cameras = problem.references, problem.cameras
+        seen, cameras = problem.read(problem.references), problem.cameras
         if not len(seen) or problem.stage is None or not np.ptp(problem.encoder_mm) > 0:
             return None
         rows = np.stack([directions(camera) for camera in cameras])

@@ -102,6 +102,20 @@ def test_the_evidence_of_pieces_is_the_sum_of_theirs() -> None:
     assert apart[1] - apart[0] == pytest.approx(each[1] - each[0], rel=0.02)
 
 
+@pytest.mark.parametrize("frames", [600, 3 * MOST_FRAMES])
+def test_frames_outside_the_encoders_record_are_not_learned_from(frames: int) -> None:
+    problem = _long(frames)
+    low, high = frames // 5, frames // 2
+    stage = Stage(problem.t_s[low:high], np.zeros(high - low))
+    (window,) = learning_parts(replace(problem, stage=stage))
+    end = window.first + len(window.problem.t_s)
+    assert low <= window.first < end <= high
+    assert end - window.first == min(high - low, MOST_FRAMES)
+    np.testing.assert_array_equal(window.problem.t_s, problem.t_s[window.first : end])
+    np.testing.assert_array_equal(window.bubbles, [0, 1])
+    assert other_windows(replace(problem, stage=stage), window, 5) == []
+
+
 @pytest.mark.slow
 def test_the_record_states_the_pieces_and_holds_the_rest_of_the_run_against_them() -> None:
     problem = _coming_and_going(4 * MOST_FRAMES, 200, bubbles=20)

@@ -83,6 +83,15 @@ def test_changed_magnifications_a_wrong_scale_and_a_wrong_axis_are_refused(
         assert refusals[0].fix["encoder_factor"] == pytest.approx(1 / 1.01, abs=1.5e-3)
 
 
+def test_a_record_that_ends_early_is_no_encoder_that_is_stuck() -> None:
+    """Marks that go on after its end say nothing against it."""
+    run = run_of("S1", 905)
+    stage = run.stage[run.stage["t_s"] < 0.6 * run.t_s[-1]]
+    _, found = placed(stage=stage)
+    assert [f.code for f in found if f.code is not None] == []
+    assert any("covers 60 % of the frames" in f.words for f in found)
+
+
 def test_a_given_model_that_holds_the_scale_does_not_hide_it() -> None:
     """The motion is right then, and the origin of the laboratory frame 2.3 mm off."""
     inputs = run_of("S1", 905).inputs("references") | stretched() | stating(None)

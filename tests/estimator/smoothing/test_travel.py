@@ -115,6 +115,18 @@ def test_standard_deviations_hold_it() -> None:
     assert last == pytest.approx(1e-3 * SPEED * problem().t_s[-1], rel=0.02)
 
 
+def test_where_the_encoder_was_not_read_the_carriage_is_anywhere() -> None:
+    """It stops in the middle of a run: the stage travels on, by 30 mm, and the bubble as before."""
+    known = problem()
+    assert known.stage is not None
+    half = Stage(known.stage.t_s[:60], known.stage.position_mm[:60])
+    table = trajectories(solve(replace(known, stage=half), STILL), None)
+    off = table["y_mm"] - known.bubbles[0].guess_mm[:, 1]
+    assert np.all(np.abs(off) < 3 * table["sy_mm"])
+    assert table["sy_mm"].iloc[-1] > 3 * table["sy_mm"].iloc[:50].max()
+    np.testing.assert_allclose(off.iloc[:50], 0.0, atol=0.05)
+
+
 def test_marks_tell_the_scale_and_the_carriage_is_where_it_was() -> None:
     model = replace(STILL, encoder_scale_sigma=0.01)
     off = replace(problem(0.01, marks=True), travel=travel(0.01))

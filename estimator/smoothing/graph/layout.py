@@ -272,6 +272,8 @@ def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[fl
     There is one at every sample of an accelerometer (its time minus the sensor's delay), and at
     every frame that is far from such a sample. A frame or an encoder reading near a node takes its
     state from there, carried to its own time by the drift (`carry`), because positions are smooth.
+    So do, without accelerometers, readings at the times of frames that are stated to other digits:
+    what moves in the step between such nodes is lost in rounding.
 
     delays_s : delay of each accelerometer.
     """
@@ -280,13 +282,14 @@ def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[fl
     step = min((float(np.median(np.diff(r))) for r in rough), default=0.0)
     if len(times):
         times = times[np.r_[True, np.diff(times) > _SAME * step]]
-    reach = min(_NEAR * step, _NEAR_S)
     encoder = np.zeros(0)
     if problem.stage is not None and model.carriage.kind != "readings":
         encoder = problem.stage.t_s
-    for smooth in (problem.t_s, encoder):
-        _, late = _nearest(times, smooth)
-        times = np.sort(np.concatenate([times, smooth[np.abs(late) > reach]]))
+    smooth = [float(np.median(np.diff(s))) for s in (problem.t_s, encoder) if len(s) > 1]
+    reach = min(_NEAR * step if rough else _SAME * min(smooth), _NEAR_S)
+    for source in (problem.t_s, encoder):
+        _, late = _nearest(times, source)
+        times = np.sort(np.concatenate([times, source[np.abs(late) > reach]]))
     placed = [_nearest(times, source) for source in (problem.t_s, encoder, *rough)]
     node, late_s = [p[0] for p in placed], [p[1] for p in placed]
     return Nodes(times, node[0], late_s[0], node[1], late_s[1], tuple(node[2:]), tuple(late_s[2:]))

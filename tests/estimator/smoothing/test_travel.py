@@ -115,6 +115,20 @@ def test_standard_deviations_hold_it() -> None:
     assert last == pytest.approx(1e-3 * SPEED * problem().t_s[-1], rel=0.02)
 
 
+@pytest.mark.parametrize("late_s", [1e-9, 3e-7, 1e-5])
+def test_times_that_are_stated_to_other_digits_are_those_of_the_frames(late_s: float) -> None:
+    known, model = problem(), replace(STILL, carriage=CarriageModel("force"))
+    assert known.stage is not None
+    late = replace(known, stage=replace(known.stage, t_s=known.stage.t_s + late_s))
+    found, exact = solve(late, model), solve(known, model)
+    assert len(found.graph.nodes.t_s) == len(exact.graph.nodes.t_s) == len(known.t_s)
+    np.testing.assert_allclose(place(found), place(exact), atol=2 * SPEED * late_s + 1e-6)
+    for one in (found, exact):
+        assert one.covariances is not None
+    sds = (trajectories(one, None)["sy_mm"] for one in (found, exact))
+    np.testing.assert_allclose(*sds, rtol=1e-3)
+
+
 def test_where_the_encoder_was_not_read_the_carriage_is_anywhere() -> None:
     """It stops in the middle of a run: the stage travels on, by 30 mm, and the bubble as before."""
     known = problem()

@@ -272,27 +272,34 @@ def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[fl
     There is one at every sample of an accelerometer (its time minus the sensor's delay), and at
     every frame that is far from such a sample. A frame or an encoder reading near a node takes its
     state from there, carried to its own time by the drift (`carry`), because positions are smooth.
-    So do, without accelerometers, readings at the times of frames that are stated to other digits:
-    what moves in the step between such nodes is lost in rounding.
+    So do, without accelerometers, readings at the times of frames that are stated to other digits,
+    and readings that arrived together: what moves in a step between such nodes is lost in rounding.
 
     delays_s : delay of each accelerometer.
     """
     rough = [a.t_s - d for a, d in zip(problem.accelerometers, delays_s)]
     times = np.sort(np.concatenate([*rough, np.zeros(0)]))
     step = min((float(np.median(np.diff(r))) for r in rough), default=0.0)
-    if len(times):
-        times = times[np.r_[True, np.diff(times) > _SAME * step]]
+    times = _apart(times, step)
     encoder = np.zeros(0)
     if problem.stage is not None and model.carriage.kind != "readings":
         encoder = problem.stage.t_s
-    smooth = [float(np.median(np.diff(s))) for s in (problem.t_s, encoder) if len(s) > 1]
-    reach = min(_NEAR * step if rough else _SAME * min(smooth), _NEAR_S)
-    for source in (problem.t_s, encoder):
+    smooth = [
+        (source, float(np.median(np.diff(source))) if len(source) > 1 else 0.0)
+        for source in (problem.t_s, encoder)
+    ]
+    reach = min(_NEAR * step if rough else _SAME * min(pace for _, pace in smooth if pace), _NEAR_S)
+    for source, pace in smooth:
         _, late = _nearest(times, source)
-        times = np.sort(np.concatenate([times, source[np.abs(late) > reach]]))
+        times = np.sort(np.concatenate([times, _apart(source[np.abs(late) > reach], pace)]))
     placed = [_nearest(times, source) for source in (problem.t_s, encoder, *rough)]
     node, late_s = [p[0] for p in placed], [p[1] for p in placed]
     return Nodes(times, node[0], late_s[0], node[1], late_s[1], tuple(node[2:]), tuple(late_s[2:]))
+
+
+def _apart(t_s: Array, pace_s: float) -> Array:
+    """Return those of increasing times (n,) that do not nearly equal the one before."""
+    return t_s[np.diff(t_s, prepend=-np.inf) > _SAME * pace_s]
 
 
 def _nearest(nodes: Array, t_s: Array) -> tuple[Ints, Array]:

@@ -129,6 +129,20 @@ def test_times_that_are_stated_to_other_digits_are_those_of_the_frames(late_s: f
     np.testing.assert_allclose(*sds, rtol=1e-3)
 
 
+def test_readings_that_arrived_together_count_once_in_time() -> None:
+    known = problem()
+    assert known.stage is not None
+    t, x = known.stage.t_s, known.stage.position_mm
+    twice = Stage(np.insert(t, 60, t[59] + 1e-6), np.insert(x, 60, x[59]))
+    model = replace(STILL, carriage=CarriageModel("force"))
+    steps = np.diff(solve(replace(known, stage=twice), model).graph.nodes.t_s)
+    np.testing.assert_allclose(steps, 0.005, atol=1e-9)
+    one = Stage(t[:1] - 1.0, x[:1])
+    nodes = solve(replace(known, stage=one), model).graph.nodes
+    np.testing.assert_allclose(nodes.t_s, np.r_[-1.0, t], atol=1e-9)
+    assert not nodes.encoder_late_s.any()
+
+
 def test_where_the_encoder_was_not_read_the_carriage_is_anywhere() -> None:
     """It stops in the middle of a run: the stage travels on, by 30 mm, and the bubble as before."""
     known = problem()

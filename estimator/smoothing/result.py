@@ -332,15 +332,16 @@ def _accelerations(solution: Solution) -> dict[str, Any]:
 
 def _along_path(solution: Solution, found: Accelerations) -> dict[str, float]:
     """Return the variances of velocity and acceleration along the paths, divided by those of errors
-    that are independent along the axes.
+    that are independent along the axes; 1 where bubbles are seen once only, without a path.
 
     Both are those of the middle of a track, where most frames are; near its ends both are larger.
     """
     square = solution.velocities_mm_s**2
     share = square / np.maximum(square.sum(-1, keepdims=True), 1e-18)
     speed = solution.velocity_variances() + considered_variance(solution)[1]
-    totals = [np.median((share * v).sum(-1)) for v in (speed, found.sd_mm_s2**2)]
-    left = 1 - np.divide(found.inertia.cancelled, totals)
+    totals = np.array([np.median((share * v).sum(-1)) for v in (speed, found.sd_mm_s2**2)])
+    cancelled = np.array(found.inertia.cancelled, float)
+    left = 1 - np.divide(cancelled, totals, out=np.zeros(2), where=totals > 0)
     return dict(zip(("velocity", "acceleration"), left.clip(_LEAST_LEFT, 1).tolist(), strict=True))
 
 

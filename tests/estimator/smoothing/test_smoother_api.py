@@ -464,3 +464,14 @@ def test_it_is_reached_without_libraries_that_only_its_work_needs() -> None:
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     later = {"cv2", "filterpy", "gtsam", "h5py", "matplotlib", "pydantic", "scipy", "skimage"}
     assert not later & set(done.stdout.split())
+
+
+def test_bubbles_that_are_seen_once_are_saved(tmp_path: Path) -> None:
+    """They have no velocity, so nothing lies along their paths."""
+    run = s2()
+    inputs = run.inputs("images")
+    inputs["tracks"] = inputs["tracks"].iloc[[10]]
+    found = smooth(**inputs, model="default")
+    assert found.summary["along_path"] == {"velocity": 1.0, "acceleration": 1.0}
+    found.save(tmp_path / "out")
+    assert len(pd.read_csv(tmp_path / "out" / "bubbles.csv")) == 1

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
+from telerig.estimator.sensors.record_numbers import runs
 
 FALSE_ALARMS = 1e-3
 """Share of sound runs in which a factor between two records may be called wrong."""
@@ -30,10 +32,11 @@ _TURNED_BANDS = 3
 """A lightly damped arm is opposed to the stage from its resonance up to the next, which is hardly
 eight times as high; three bands span that."""
 
-_LEAST_BINS, _TAPERED = 4, 1.94
-"""Frequencies in the lowest band; a sum over neighbouring ones has 1.94 times the variance
-that independent ones would give it with a Hann taper (Percival and Walden, Spectral Analysis, 1993,
-table 248)."""
+_LOWEST, _LEAST_BINS = 2, 4
+"""First of the frequencies in the lowest band, and their number."""
+
+_LEAST_RUN = 0.5
+"""Runs of samples that are shorter than this share of the longest one are left out."""
 
 
 @dataclass(frozen=True)
@@ -57,31 +60,47 @@ class Response:
 
         How many independent frequencies a band has follows from what the coherence of these
         spectra would be with random phases: a single line is always coherent, and shows nothing.
-        The taper ends where the samples do: cut off, slow motions of both would leak into all
-        bands, coherent with each other.
+        Every run of samples has a Hann taper and a mean of its own: cut off, slow motions of both
+        would leak into all bands, coherent with each other. What is slower than a run counts as
+        little as what is slower than a record without gaps.
         """
-        there = np.flatnonzero(known)
-        taper = np.zeros(len(known))
-        if len(there):
-            first, end = there[0], there[-1] + 1
-            taper[first:end] = np.hanning(end - first) * known[first:end]
-        both = [np.fft.rfft(taper * (v - v[known].mean())) for v in (output, motion)]
+        taper, both, longest = _tapered(known, output, motion)
+        if not longest:
+            return cls(np.zeros(0, int), *np.zeros((3, 0)))
+        # a sum over neighbouring frequencies has so many times the variance that independent ones
+        # would give it: 1.94 without gaps (Percival and Walden, Spectral Analysis, 1993, table 248)
+        alike = len(taper) * float((taper**4).sum() / (taper**2).sum() ** 2)
+        least = round(_LOWEST * len(taper) / longest)
         band, gains, coherences, variances = [], [], [], []
-        low, high = 2, 2 + _LEAST_BINS
-        while high <= len(both[0]) and known.any():
+        low, high = _LOWEST, _LOWEST + _LEAST_BINS
+        while high <= len(both[0]):
             y, x = (spectrum[low:high] for spectrum in both)
             cross, power = complex(np.vdot(x, y)), float(np.vdot(x, x).real)
             whole = power * float(np.vdot(y, y).real)
-            by_chance = float((np.abs(x) ** 2) @ (np.abs(y) ** 2)) * _TAPERED
+            by_chance = float((np.abs(x) ** 2) @ (np.abs(y) ** 2)) * alike
             coherence = min(abs(cross) ** 2 / whole, 1 - 1e-9) if whole > 0 else 0.0
             count = whole / by_chance if by_chance > 0 else 1.0
-            if count > 1 and (1 - coherence) ** (count - 1) < FALSE_ALARMS:
+            if low >= least and count > 1 and (1 - coherence) ** (count - 1) < FALSE_ALARMS:
                 band.append(int(np.log2(high)))
                 gains.append(np.log(cross / power))
                 coherences.append(coherence)
                 variances.append((1 - coherence) / (2 * count * coherence))
             low, high = high, 2 * high
         return cls(np.array(band, int), *map(np.array, (gains, coherences, variances)))
+
+
+def _tapered(known: Bools, *series: Array) -> tuple[Array, list[NDArray[np.complex128]], int]:
+    """Return a taper (N,) over the longer runs of known samples (N,), the spectra of series (N,)
+    without their means in each, and the length of the longest run, 0 without any."""
+    found = [run for run in runs(known) if run[1] - run[0] > 2]  # of three samples one is left
+    longest = max((end - first for first, end in found), default=0)
+    taper, level = np.zeros(len(known)), [np.zeros(len(known)) for _ in series]
+    for first, end in found:
+        if end - first >= _LEAST_RUN * longest:
+            taper[first:end] = np.hanning(end - first)
+            for out, values in zip(level, series):
+                out[first:end] = values[first:end] - values[first:end].mean()
+    return taper, [np.fft.rfft(taper * values) for values in level], longest
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,24 @@ def test_slow_motions_that_end_before_the_record_show_nothing(rng: Generator) ->
         assert not len(Response.of(*both, known).band)
 
 
+@pytest.mark.parametrize(("seen", "gap"), [(60, 40), (40, 60), (30, 220)])
+def test_slow_motions_between_gaps_show_nothing(rng: Generator, seen: int, gap: int) -> None:
+    """Bubbles that come one by one: cut off at each gap they leak in the same way."""
+    known, t = np.arange(COUNT) % (seen + gap) < seen, np.linspace(0, 1, COUNT)
+    for _ in range(50):
+        hz = rng.uniform(2.0, 8.0, (2, 1))
+        both = 20 * np.sin(2 * np.pi * (hz * t + rng.uniform(size=(2, 1))))
+        assert len(Response.of(*both + rng.normal(size=(2, COUNT)), known).band) <= 1
+
+
+def test_a_factor_is_found_between_gaps(rng: Generator) -> None:
+    push, known = rng.normal(size=COUNT), np.arange(COUNT) % 250 < 120
+    arms = [push + 0.5 * rng.normal(size=COUNT), push]
+    found = CommonGain.of([Response.of(arm, push / -25.4, known) for arm in arms])
+    assert found is not None and found.opposed and found.excludes(1.0)
+    assert found.gain == pytest.approx(25.4, rel=0.2)
+
+
 def test_noise_of_the_motion_widens_the_bounds(rng: Generator) -> None:
     """A coarse encoder makes the gain too small: the bounds contain 1 with either as the cause."""
     push = rng.normal(size=COUNT)

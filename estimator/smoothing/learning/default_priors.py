@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
+from telerig.estimator.sensors.record_numbers import GAP_STEPS
 from telerig.estimator.smoothing.graph.layout import BROAD_BAND, directed, variances
 from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
@@ -263,23 +264,26 @@ def acceleration_rms(stage: Stage, sigma_mm: float) -> float:
 
     It maximises Whittle's likelihood (Arkiv foer Matematik 2, 1953) of their second differences,
     which need no trend taken away. A vibration of the stage is a line: parabolas over many readings
-    would not follow it.
+    would not follow it. Gaps of the record are not bridged: a straight line has no acceleration.
 
     sigma_mm : standard deviation of a reading.
     """
     from scipy.signal import welch
 
-    if len(stage.t_s) < _FEWEST_READINGS:
-        return 1000.0
-    step = float(np.median(np.diff(stage.t_s)))
-    even = np.arange(stage.t_s[0], stage.t_s[-1] + step / 2, step)
-    bend = np.diff(np.interp(even, stage.t_s, stage.position_mm), 2)
-    frequency, seen = welch(bend, 1 / step, nperseg=min(len(bend), _SEGMENT), detrend="linear")
-    frequency, seen = frequency[2:], seen[2:] / (2 * np.sin(np.pi * frequency[2:] * step)) ** 4
-    unit, noise = forced_mass(1.0).density(frequency), 2 * step * max(sigma_mm, 1e-5) ** 2
-    rms = np.geomspace(1.0, 1e6, 240)
-    cost = [np.sum(np.log(d := r**2 * unit + noise) + seen / d) for r in rms]
-    return float(rms[np.argmin(cost)])
+    step = float(np.median(np.diff(stage.t_s))) if len(stage.t_s) > 1 else 0.0
+    gaps = np.flatnonzero(np.diff(stage.t_s) > GAP_STEPS * step) + 1
+    rms, cost = np.geomspace(1.0, 1e6, 240), np.zeros(240)
+    for mine in np.split(np.arange(len(stage.t_s)), gaps):
+        if len(mine) < _FEWEST_READINGS:
+            continue
+        t_s, position_mm = stage.t_s[mine], stage.position_mm[mine]
+        even = np.arange(t_s[0], t_s[-1] + step / 2, step)
+        bend = np.diff(np.interp(even, t_s, position_mm), 2)
+        frequency, seen = welch(bend, 1 / step, nperseg=min(len(bend), _SEGMENT), detrend="linear")
+        frequency, seen = frequency[2:], seen[2:] / (2 * np.sin(np.pi * frequency[2:] * step)) ** 4
+        unit, noise = forced_mass(1.0).density(frequency), 2 * step * max(sigma_mm, 1e-5) ** 2
+        cost += [np.sum(np.log(d := r**2 * unit + noise) + seen / d) for r in rms]
+    return float(rms[np.argmin(cost)]) if cost.any() else 1000.0
 
 
 _INFLATE_BEYOND = 0.05

@@ -275,3 +275,8 @@ def test_carriage_that_a_pump_shakes_may_move_as_the_encoder_reads() -> None:
     true = 0.04 / np.sqrt(2) * (2 * np.pi * 39.0) ** 2
     assert 0.5 * true < rms < 3 * true
     assert acceleration_rms(Stage(t, 80.0 * t + noise), 0.005) < 0.02 * true
+    place = 80.0 * t + vibration + noise
+    kept = (t < 0.3 * t[-1]) | (t > 0.7 * t[-1])  # it was not read in between
+    assert acceleration_rms(Stage(t[kept], place[kept]), 0.005) == pytest.approx(rms, rel=0.15)
+    bursts = Stage(t[kept] + 100.0 * (t[kept] > t[-1] / 2), place[kept])
+    assert acceleration_rms(bursts, 0.005) == pytest.approx(rms, rel=0.15)

@@ -174,18 +174,18 @@ class Smoothing(ShortText):
 
         self.tables.write(out, self.verdict.get("inflation", (1.0, 1.0, 1.0)))
         open_, ended = list[pd.DataFrame](), list[pd.DataFrame]()
-        for part in self.tables.parts():
+        last = self.tables.last_parts()
+        for number, part in enumerate(self.tables.parts()):
             bubbles = bubble_table(replace(self, tables=part))
             if not len(bubbles):
                 continue
             append_table(bubbles, out / "bubbles.csv")
             known = pd.concat([*open_, bubbles], ignore_index=True)
-            going_on = known["particle"].isin(bubbles["particle"])
+            going_on = known["particle"].map(last) > number
             open_ = [known[going_on]]
             if not going_on.all():
                 ended.append(bubble_summary(self, known[~going_on]))
-        if open_:
-            ended.append(bubble_summary(self, open_[0]))
+        if ended:
             summary = pd.concat(ended, ignore_index=True)
             summary = summary.sort_values("particle", kind="stable", ignore_index=True)
             write_table(summary, out / "bubble_summary.csv")

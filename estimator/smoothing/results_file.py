@@ -142,6 +142,10 @@ class Tables:
         """Yield the tables in parts; here all rows are one part."""
         yield self
 
+    def last_parts(self) -> dict[int, int]:
+        """Return by particle the number of the last part in which it has rows."""
+        return dict.fromkeys(self.trajectories["particle"].unique().tolist(), 0)
+
 
 @dataclass(frozen=True)
 class StoredTables:
@@ -197,6 +201,16 @@ class StoredTables:
             table = file["trajectories"]
             step = max(1, len(table["frame"]) // _SAMPLED)
             return pd.DataFrame({n: table[n][()][::step] for n in columns if n in table})
+
+    def last_parts(self) -> dict[int, int]:
+        """Return by particle the number of the last part in which it has rows: a bubble may be out
+        of sight in all of a part."""
+        with self._open() as file:
+            rows = file.attrs["rows_of_pieces"]
+            particles = file["trajectories/particle"][()]
+        names, back = np.unique(particles[::-1], return_index=True)
+        last = np.searchsorted(np.cumsum(rows), len(particles) - 1 - back, side="right")
+        return dict(zip(names.tolist(), last.tolist()))
 
     def parts(self) -> Iterator[Tables]:
         """Yield the trajectories piece by piece, and the bodies."""

@@ -226,6 +226,23 @@ def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
         np.testing.assert_allclose(other["d_eq_mm"], 1.5)
 
 
+def test_a_bubble_that_no_camera_sees_in_a_piece_is_one_bubble(tmp_path: Path) -> None:
+    problem, _, _ = run(np.random.default_rng(3), bubbles=2, seconds=0.4)
+    calibration = calibration_from_cameras(list(problem.cameras), name="truth")
+    table = tracks_of(problem)
+    hidden = (table["particle"] == 0) & table["frame"].between(20, 59)
+    table = table[~hidden].reset_index(drop=True)
+    found = telerig.smooth(
+        table, calibration, model="default", t_s=problem.t_s, options=Options(frames=10)
+    )
+    found.save(tmp_path / "out")
+    written = pd.read_csv(tmp_path / "out" / "bubble_summary.csv")
+    seen = table.groupby("particle")["frame"].agg(["min", "max"])
+    assert written["particle"].tolist() == seen.index.tolist()
+    assert written["first_frame"].tolist() == seen["min"].tolist()
+    assert written["last_frame"].tolist() == seen["max"].tolist()
+
+
 def test_a_shake_without_bubbles_is_smoothed_in_pieces(tmp_path: Path) -> None:
     problem, _ = crowded(200)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")

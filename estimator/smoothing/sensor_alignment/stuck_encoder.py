@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import directions, seen_of
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
@@ -12,6 +12,10 @@ from telerig.estimator.smoothing.sensor_alignment.mark_motion import LEAST_TRAVE
 
 _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
+_COMPARED_S, _LEAST_SEEN, _FOLLOWED = 0.3, 5, 0.5
+"""Longest time before and after the carriage comes to rest in which images are compared with the
+encoder, fewest sightings in it, and least share of the encoder's change of speed that they show."""
+
 _BEHIND = 0.2
 """An encoder is stuck if so large a share of all marks' sightings moves without it."""
 
@@ -19,7 +23,9 @@ _BEHIND = 0.2
 def stuck(problem: SmoothingProblem) -> list[Finding]:
     """Return a finding if the encoder's reading stays while the carriage must be moving.
 
-    It stays if it changes by noise only in the whole run, or not at all in a part of it.
+    It stays if it changes by noise only in the whole run, or not at all in a part of it. A carriage
+    that comes to rest there, or starts, changes the motion in the images by as much as the reading
+    says.
     """
     stage = problem.stage
     if stage is None:
@@ -43,12 +49,56 @@ def stuck(problem: SmoothingProblem) -> list[Finding]:
         return []
     if np.median(np.abs(around)) / float(np.median(np.diff(t))) <= _MOVING_MM_S:
         return []
+    if _rests(problem, float(t[first]), float(t[last])):
+        return []
     return [
         _finding(
             f"the encoder reads {x[first]:.6g} mm from {t[first]:.6g} to {t[last]:.6g} s without "
             "any change, while the carriage moves: it is stuck"
         )
     ]
+
+
+def _rests(problem: SmoothingProblem, begin_s: float, end_s: float) -> bool:
+    """Return whether images show that the carriage rests while its reading stays: what is seen
+    changes its speed as the encoder does where the rest begins, or where it ends.
+
+    It does not if nothing is seen on both sides of an end.
+    """
+    length = min(end_s - begin_s, _COMPARED_S)
+    followed = []
+    for observed in (problem.references, problem.observations):
+        for at in (begin_s, end_s):
+            sides = [(problem.t_s >= a) & (problem.t_s <= a + length) for a in (at - length, at)]
+            followed += _followed(problem, problem.read(observed), sides)
+        if followed:
+            return float(np.median(followed)) > _FOLLOWED
+    return False
+
+
+def _followed(problem: SmoothingProblem, observed: Observations, sides: list[Bools]) -> list[float]:
+    """Return by marks or bubbles of each camera which share of the encoder's change of speed from
+    one side to the other (F,) the images show."""
+    out = []
+    for c, camera in enumerate(problem.cameras):
+        mine = np.flatnonzero(observed.camera == c)
+        weights = seen_of(camera, problem.axis)
+        if not len(mine) or weights is None:
+            continue
+        place = camera.unproject(observed.uv_px[mine])[0] @ directions(camera).T @ weights
+        frame, item = observed.frame[mine], observed.item[mine]
+        for one in np.unique(item):
+            parts = [(item == one) & side[frame] for side in sides]
+            if min(map(np.count_nonzero, parts)) < _LEAST_SEEN:
+                continue
+            speeds = []
+            for part in parts:
+                t, read = problem.t_s[frame[part]], problem.encoder_mm[frame[part]]
+                speeds.append(np.polyfit(t - t[0], np.column_stack([place[part], read]), 1)[0])
+            seen, told = speeds[1] - speeds[0]
+            if abs(told) > _MOVING_MM_S / 2:
+                out.append(float(-seen / told))
+    return out
 
 
 def unfollowed(problem: SmoothingProblem) -> list[Finding]:
@@ -94,7 +144,7 @@ def _speeds(problem: SmoothingProblem, observed: Observations) -> Array:
     """Return the mean speeds (mm/s) along the travel axis of up to 50 marks or bubbles of each
     camera, of the encoder in the same frames, and the number of these, as rows (n, 3).
     """
-    rows, observed = [], problem.read(observed)
+    rows = []
     for c, camera in enumerate(problem.cameras):
         mine = np.flatnonzero(observed.camera == c)
         weights = seen_of(camera, problem.axis)

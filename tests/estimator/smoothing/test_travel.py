@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from shake_learning_data import ARM_HZ, CAMERAS, COMMON_HZ, UP, run
 
+from telerig.estimator.sensors.findings import Code
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import (
     considered_variance,
@@ -36,6 +37,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Travel,
 )
 from telerig.estimator.smoothing.result import shake, trajectories
+from telerig.estimator.smoothing.sensor_alignment.stuck_encoder import stuck
 from telerig.estimator.smoothing.smooth import problem_of
 from telerig.estimator.smoothing.verdict.modes import shake_modes
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra
@@ -75,6 +77,27 @@ def problem(scale: float = 0.0, *, marks: bool = False, axis: Array = UP) -> Smo
         Stage(t, reading),
         marks=tuple(Mark(f"m{k}", p + 0.1) for k, p in enumerate(places)),
         references=seen(fixed, 0.1) if marks else Observations.none(),
+    )  # fmt: skip
+
+
+def stopped(*, marks: bool = False, bubbles: bool = True, hangs: bool = False) -> SmoothingProblem:
+    """The stage comes to rest with 1 m/s^2 before an encoder of 5 um counts; or this one hangs."""
+    known = problem(marks=marks)
+    t, late = known.t_s, np.clip(known.t_s - 0.2, 0, None)
+    brake = np.minimum(late, SPEED / 1000)
+    position = SPEED * t - SPEED * late + SPEED * brake - 500 * brake**2
+    moves = (SPEED * t if hangs else position) - SPEED * t  # beyond what `problem` has
+
+    def seen(obs: Observations) -> Observations:
+        rows = np.array([c.camera_from_rig.rotation[:2] @ UP for c in known.cameras])
+        scale = known.cameras[0]["scale_px_per_mm"]
+        shift = scale * moves[obs.frame, None] * rows[obs.camera]
+        return replace(obs, uv_px=obs.uv_px - shift)
+
+    return replace(
+        known, stage=Stage(t, np.round(position / 0.005) * 0.005),
+        observations=seen(known.observations) if bubbles else Observations.none(),
+        references=seen(known.references),
     )  # fmt: skip
 
 
@@ -141,6 +164,13 @@ def test_readings_that_arrived_together_count_once_in_time() -> None:
     nodes = solve(replace(known, stage=one), model).graph.nodes
     np.testing.assert_allclose(nodes.t_s, np.r_[-1.0, t], atol=1e-9)
     assert not nodes.encoder_late_s.any()
+
+
+@pytest.mark.parametrize(("marks", "bubbles"), [(False, True), (True, True), (True, False)])
+def test_a_stage_that_comes_to_rest_is_no_encoder_that_is_stuck(marks: bool, bubbles: bool) -> None:
+    assert stuck(stopped(marks=marks, bubbles=bubbles)) == []
+    (found,) = stuck(stopped(marks=marks, bubbles=bubbles, hangs=True))
+    assert found.code is Code.ENCODER_STUCK
 
 
 def test_where_the_encoder_was_not_read_the_carriage_is_anywhere() -> None:

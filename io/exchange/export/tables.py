@@ -119,7 +119,7 @@ def trackpy_table(results: RunResults) -> pd.DataFrame:
         table["particle_name"] = points["particle"]
     others = [c for c in points if c not in ("frame", "particle", "x_mm", "y_mm", "z_mm")]
     for name in set(others) & set(table):
-        raise column_of_that_name(name, results)
+        raise column_of_that_name(str(name), results)
     return table.join(points[others]).sort_values(["frame", "particle"]).reset_index(drop=True)
 
 

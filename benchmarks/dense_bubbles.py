@@ -52,7 +52,7 @@ COVERED = (0.1, 0.2, 0.3, 0.4)
 def prepared(image: NDArray[np.generic]) -> Array:
     """Grey over the level of the screen; what is not the lit field is 1."""
     field = lit_field(image)
-    background = None if field is None else screen_level(image, field)
+    background = None if field is None else screen_level(image, field, falls_off=True)
     seen = image if field is None else np.where(field, image, background).astype(image.dtype)
     return normalised(seen, background)[0].astype(np.float64)
 

@@ -181,10 +181,12 @@ def find_bubbles(
         gain = brightness(image, background, field)
         if not gain > LEAST_BRIGHTNESS:
             return _bubbles({}, [], np.nan, f"the screen has {gain:.0%} of its usual brightness")
-    elif field is None:
+    given = field is not None
+    if background is None and not given:
         field = lit_field(image)
     if field is not None:
-        background = screen_level(image, field) if background is None else background
+        if background is None:
+            background = screen_level(image, field, falls_off=not given)
         outside = np.minimum(background * np.float32(gain), image.max())
         image = np.where(field, image, outside).astype(image.dtype, copy=False)
     ratio, clipped = normalised(image, background, gain)

@@ -26,10 +26,13 @@ _EDGE_SHARE = 1 / 3
 """What is dark along such a share of the border is the edge of the screen, no bubble."""
 
 
-def screen_level(image: NDArray[Any], field: Bools | None = None) -> Float32:
+def screen_level(
+    image: NDArray[Any], field: Bools | None = None, *, falls_off: bool = False
+) -> Float32:
     """Return the level of the lit screen (rows, columns), from an image with bubbles before it.
 
     field : (rows, columns) where the image shows the screen; None for everywhere.
+    falls_off : whether the light falls off at the field's edge, which the level follows.
 
     In the image at an eighth of its size, dark things up to a quarter of the image are closed. Then
     a broad mean over all pixels that are not darker than this is taken. This works if every quarter
@@ -43,6 +46,7 @@ def screen_level(image: NDArray[Any], field: Bools | None = None) -> Float32:
         middle = float(np.median(image[field]))
         seen = np.where(field, seen, np.float32(_OUTSIDE * middle))
         least = np.float32(_LEAST_LEVEL * middle)
+    if field is not None and not falls_off:
         share = cv2.resize(field.astype(np.float32), small_size, interpolation=cv2.INTER_AREA)
         within = share > _WITHIN
     small = cv2.resize(seen, small_size, interpolation=cv2.INTER_AREA)

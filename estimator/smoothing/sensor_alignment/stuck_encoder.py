@@ -144,7 +144,7 @@ def _speeds(problem: SmoothingProblem, observed: Observations) -> Array:
     """Return the mean speeds (mm/s) along the travel axis of up to 50 marks or bubbles of each
     camera, of the encoder in the same frames, and the number of these, as rows (n, 3).
     """
-    rows = []
+    rows, observed = [], problem.read(observed)
     for c, camera in enumerate(problem.cameras):
         mine = np.flatnonzero(observed.camera == c)
         weights = seen_of(camera, problem.axis)

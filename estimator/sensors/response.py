@@ -43,7 +43,8 @@ _LEAST_RUN = 0.5
 class Response:
     """The response in K bands in which two motions are coherent.
 
-    band : (K,) number of the band; each is twice as wide as the one below.
+    band : (K,) number of the band, the same frequencies in all records as long as `known`; each is
+        twice as wide as the one below.
     log_gain : (K,) complex logarithm of output over input, if all noise is in the output.
     coherence : (K,) squared; the gain over it is that if all noise is in the input.
     variance : (K,) of the real part of log_gain, by chance alone.
@@ -73,6 +74,7 @@ class Response:
         least = round(_LOWEST * len(taper) / longest)
         band, gains, coherences, variances = [], [], [], []
         low, high = _LOWEST, _LOWEST + _LEAST_BINS
+        first = high
         while high <= len(both[0]):
             y, x = (spectrum[low:high] for spectrum in both)
             cross, power = complex(np.vdot(x, y)), float(np.vdot(x, x).real)
@@ -81,7 +83,7 @@ class Response:
             coherence = min(abs(cross) ** 2 / whole, 1 - 1e-9) if whole > 0 else 0.0
             count = whole / by_chance if by_chance > 0 else 1.0
             if low >= least and count > 1 and (1 - coherence) ** (count - 1) < FALSE_ALARMS:
-                band.append(int(np.log2(high)))
+                band.append(round(np.log2(high / first * len(known) / len(taper))))
                 gains.append(np.log(cross / power))
                 coherences.append(coherence)
                 variances.append((1 - coherence) / (2 * count * coherence))
@@ -90,16 +92,20 @@ class Response:
 
 
 def _tapered(known: Bools, *series: Array) -> tuple[Array, list[NDArray[np.complex128]], int]:
-    """Return a taper (N,) over the longer runs of known samples (N,), the spectra of series (N,)
-    without their means in each, and the length of the longest run, 0 without any."""
+    """Return a taper over the longer runs of known samples (N,), from the first of them to the
+    last, the spectra there of series (N,) without their means in each, and the length of the
+    longest run, 0 without any."""
     found = [run for run in runs(known) if run[1] - run[0] > 2]  # of three samples one is left
     longest = max((end - first for first, end in found), default=0)
-    taper, level = np.zeros(len(known)), [np.zeros(len(known)) for _ in series]
+    found = [run for run in found if run[1] - run[0] >= _LEAST_RUN * longest]
+    if not found:
+        return np.zeros(0), [np.zeros(0, complex) for _ in series], 0
+    begin, length = found[0][0], found[-1][1] - found[0][0]
+    taper, level = np.zeros(length), [np.zeros(length) for _ in series]
     for first, end in found:
-        if end - first >= _LEAST_RUN * longest:
-            taper[first:end] = np.hanning(end - first)
-            for out, values in zip(level, series):
-                out[first:end] = values[first:end] - values[first:end].mean()
+        taper[first - begin : end - begin] = np.hanning(end - first)
+        for out, values in zip(level, series):
+            out[first - begin : end - begin] = values[first:end] - values[first:end].mean()
     return taper, [np.fft.rfft(taper * values) for values in level], longest
 
 

@@ -1,9 +1,10 @@
 """A long run is smoothed in pieces: which frames each is solved with, and what they share.
 
 Each piece is solved with more frames on both sides, which are not taken from its solution: 1.5
-times as long as the slowest process remembers. What is constant along the run (biases, delays and
-scales of sensors, the encoder's scale, the calibration, marks) is known to a piece from all others:
-a first round, of pieces without margins, collects the information of each on them
+times as long as the slowest process remembers, and where a bubble is hidden in all of the piece,
+from its sightings before and after, if memory allows. What is constant along the run (biases,
+delays and scales of sensors, the encoder's scale, the calibration, marks) is known to a piece from
+all others: a first round, of pieces without margins, collects the information of each on them
 (docs/decisions/032). A run that fits into one piece is solved as it is.
 """
 
@@ -85,15 +86,66 @@ def pieces_of(
         frames = count if fits else min(_FRAMES, max(int(_ROWS * count / max(rows, 1)), 2))
     number = -(-count // frames)
     edges = np.linspace(0, count, number + 1).round().astype(int).tolist()
-    margin = margin_s(problem, model) if number > 1 else 0.0
+    if number == 1:
+        return [Piece(0, count, 0, count)]
+    margin, sightings = margin_s(problem, model), _Sightings.of(problem)
     out = []
     for first, end in pairwise(edges):
         t = problem.t_s[[first, end - 1]] + np.array([-margin, margin])
         low, high = np.searchsorted(problem.t_s, t, side="right").tolist()
         # a margin longer than the piece itself would cost more than one piece for all
         low, high = max(low, 2 * first - end, 0), min(high, 2 * end - first, count)
-        out.append(Piece(first, end, min(low, first), max(high, end)))
+        piece = Piece(first, end, min(low, first), max(high, end))
+        wider = sightings.reached(piece)
+        # as large as a piece becomes with its widest margins
+        fits = sightings.rows(wider) <= 3 * _ROWS and wider.high - wider.low <= 3 * _FRAMES
+        out.append(wider if fits else piece)
     return out
+
+
+class _Sightings(NamedTuple):
+    """When the B bubbles of a run of F frames are seen.
+
+    first, last : (B,) first and last frame of each.
+    keys : frame + F * bubble of all sightings, in ascending order.
+    frames : F.
+    """
+
+    first: Ints
+    last: Ints
+    keys: Ints
+    frames: int
+
+    @classmethod
+    def of(cls, problem: SmoothingProblem) -> _Sightings:
+        seen, count = problem.observations, len(problem.t_s)
+        ends = np.array([(b.first, b.last) for b in problem.bubbles], np.int64).reshape(-1, 2)
+        keys = np.unique(seen.item.astype(np.int64) * count + seen.frame)
+        return cls(ends[:, 0], ends[:, 1], keys, count)
+
+    def rows(self, piece: Piece) -> int:
+        """Return the number of frames of all bubbles with which a piece is solved."""
+        length = np.minimum(self.last, piece.high - 1) - np.maximum(self.first, piece.low) + 1
+        return int(length.clip(0).sum())
+
+    def reached(self, piece: Piece) -> Piece:
+        """Return the piece with margins that begin at the sightings before and after of bubbles
+        that are hidden in all of its own frames: without them only a prior tells their places."""
+        here = np.flatnonzero((self.first < piece.first) & (self.last >= piece.end))
+        begin = here * self.frames
+        after = np.searchsorted(self.keys, begin + piece.first)
+        hidden = after == np.searchsorted(self.keys, begin + piece.end)
+        here, begin, after = here[hidden], begin[hidden], after[hidden]
+        if not len(here):
+            return piece
+        low = np.maximum(self.keys.take(after - 1, mode="clip") - begin, self.first[here])
+        high = np.minimum(self.keys.take(after, mode="clip") - begin, self.last[here]) + 1
+        margins = piece.first - piece.low, piece.high - piece.end
+        return replace(
+            piece,
+            low=max(min(piece.first, int(low.min())) - margins[0], 0),
+            high=min(max(piece.end, int(high.max())) + margins[1], self.frames),
+        )
 
 
 def with_clock_numbers(problem: SmoothingProblem) -> SmoothingProblem:

@@ -203,8 +203,7 @@ class StoredTables:
             return pd.DataFrame({n: table[n][()][::step] for n in columns if n in table})
 
     def last_parts(self) -> dict[int, int]:
-        """Return by particle the number of the last part in which it has rows: a bubble may be out
-        of sight in all of a part."""
+        """Return by particle the number of the last part in which it has rows."""
         with self._open() as file:
             rows = file.attrs["rows_of_pieces"]
             particles = file["trajectories/particle"][()]

@@ -76,9 +76,8 @@ def all_of(problem: SmoothingProblem, first: int, end: int) -> Window:
     """
     seen, marks = problem.observations.between(first, end), problem.references.between(first, end)
     t_s = problem.t_s[first:end]
-    often = np.bincount(seen.item, minlength=len(problem.bubbles))
-    lasting = np.array([b.last >= first and b.first < end for b in problem.bubbles], bool)
-    chosen, known = np.flatnonzero(lasting & (often > 0)), np.unique(marks.item)
+    lasting = [b.last >= first and b.first < end for b in problem.bubbles]
+    chosen, known = np.flatnonzero(lasting), np.unique(marks.item)
     sensors = (near_frames(sensor, t_s) for sensor in problem.accelerometers)
     cut = replace(
         problem,

@@ -226,21 +226,42 @@ def test_tables_in_a_file_are_those_of_memory(tmp_path: Path) -> None:
         np.testing.assert_allclose(other["d_eq_mm"], 1.5)
 
 
-def test_a_bubble_that_no_camera_sees_in_a_piece_is_one_bubble(tmp_path: Path) -> None:
+def test_a_bubble_that_no_camera_sees_in_a_piece_has_rows_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     problem, _, _ = run(np.random.default_rng(3), bubbles=2, seconds=0.4)
     calibration = calibration_from_cameras(list(problem.cameras), name="truth")
     table = tracks_of(problem)
     hidden = (table["particle"] == 0) & table["frame"].between(20, 59)
     table = table[~hidden].reset_index(drop=True)
-    found = telerig.smooth(
-        table, calibration, model="default", t_s=problem.t_s, options=Options(frames=10)
+    joint, found = (
+        telerig.smooth(
+            table, calibration, model="default", t_s=problem.t_s, options=Options(frames=n)
+        )
+        for n in (None, 10)
     )
+    paths, expected = (
+        s.trajectories[s.trajectories["particle"] == 0].set_index("frame") for s in (found, joint)
+    )
+    assert paths.index.tolist() == expected.index.tolist() == list(range(80))
+    out_of_sight = slice(30, 49)
+    for axis in AXES:
+        wide = expected[f"s{axis}_mm"][out_of_sight]
+        np.testing.assert_array_less(paths[f"s{axis}_mm"][out_of_sight] / wide, 2.5)
+        off = (paths[f"{axis}_mm"] - expected[f"{axis}_mm"])[out_of_sight]
+        np.testing.assert_array_less(np.abs(off / wide), 1.0)
     found.save(tmp_path / "out")
     written = pd.read_csv(tmp_path / "out" / "bubble_summary.csv")
     seen = table.groupby("particle")["frame"].agg(["min", "max"])
     assert written["particle"].tolist() == seen.index.tolist()
     assert written["first_frame"].tolist() == seen["min"].tolist()
     assert written["last_frame"].tolist() == seen["max"].tolist()
+    monkeypatch.setattr(pieces_module, "_ROWS", 1)
+    monkeypatch.setattr(pieces_module, "_FRAMES", 10)
+    alone = telerig.smooth(
+        table, calibration, model="default", t_s=problem.t_s, options=Options(frames=10)
+    )
+    assert len(alone.trajectories) == len(found.trajectories), "rows are there without room, too"
 
 
 def test_a_shake_without_bubbles_is_smoothed_in_pieces(tmp_path: Path) -> None:

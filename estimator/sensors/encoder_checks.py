@@ -1,4 +1,5 @@
-"""Checks an encoder's record for jumps, single wrong readings and overflow of the counter."""
+"""Checks an encoder's record for jumps, single wrong readings, overflow of the counter and bunched
+times."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Code, Finding
-from telerig.estimator.sensors.record_numbers import GAP_STEPS
+from telerig.estimator.sensors.record_numbers import GAP_STEPS, runs
 from telerig.estimator.sensors.spikes import LONGEST_SPIKE, prediction_residual
 from telerig.short_text import counted, counted_list
 from telerig.statistics import robust_sd
@@ -26,6 +27,9 @@ _SHARE = 0.3
 _HARMLESS_MM = 0.05
 _REAL_M_S2 = 50.0
 _SHOWN = 3
+_BUNCHED = 0.1
+"""A bunch takes less than this share of the mean step and of the time to the next one."""
+_LEAST_BUNCHES = 10
 
 
 @dataclass(frozen=True)
@@ -81,13 +85,17 @@ def check_encoder(
 ) -> tuple[Bools, list[Finding]]:
     """Return which readings (E,) can be used, and what is wrong with the others.
 
-    Single wrong readings are masked. A jump that affects the frames is refused (`ENCODER_JUMP`).
+    Single wrong readings are masked. A jump that affects the frames is refused (`ENCODER_JUMP`),
+    and so are times that come in bunches (`ENCODER_CLOCK`).
     What looks like a wrong end of the record may be a stage that starts or stops between two
     readings, where these are far apart.
     """
     t, frames = np.asarray(t_s, float), np.asarray(frames_t_s, float)
-    faults = encoder_faults(t, position_mm)
     kept = np.ones(len(t), bool)
+    bunched = _bunched(t, np.asarray(position_mm, float), frames, where)
+    if bunched is not None:
+        return kept, [bunched]
+    faults = encoder_faults(t, position_mm)
     spikes = []
     for fault in (f for f in faults if f.kind == "spike"):
         first = int(np.searchsorted(t, fault.t_s))
@@ -120,6 +128,32 @@ def check_encoder(
         more = f" (and {len(spikes) - 1} more)" if len(spikes) > 1 else ""
         findings.append(Finding(f"{spikes[0].words}{more}; they are not used", where))
     return kept, findings
+
+
+def _bunched(t: Array, position: Array, frames: Array, where: str) -> Finding | None:
+    """Return a finding if many readings of a moving stage have nearly the times of others.
+
+    They were buffered, and have the times at which the buffer was sent: within a bunch the stage
+    would move faster than it can.
+    """
+    short = np.diff(t) < _BUNCHED * (t[-1] - t[0]) / (len(t) - 1)
+    bunches = np.array(list(runs(short)), np.int64).reshape(-1, 2)
+    first, last = bunches[(t[bunches[:, 0]] >= frames[0]) & (t[bunches[:, 1]] <= frames[-1])].T
+    way, took = np.abs(position[last] - position[first]), t[last] - t[first]
+    wrong = (way > _HARMLESS_MM) & (4e-3 * way > _REAL_M_S2 * took**2)
+    wrong &= took < _BUNCHED * (np.append(t[first[1:]], t[-1]) - t[first])
+    if wrong.sum() < _LEAST_BUNCHES:
+        return None
+    size = int(np.median((last - first)[wrong])) + 1
+    return Finding(
+        f"the readings come in bunches: {size} of them within {np.median(took[wrong]):.2g} s, in "
+        f"which the stage moves {np.median(way[wrong]):.3g} mm (medians of {int(wrong.sum())} "
+        "bunches). They were buffered, and their times are not those at which they were taken",
+        where,
+        "record the encoder's own time stamps, or spread the readings of a bunch evenly over the "
+        "time since the one before",
+        Code.ENCODER_CLOCK,
+    )
 
 
 def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]:

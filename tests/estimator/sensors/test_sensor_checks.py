@@ -11,6 +11,7 @@ import pytest
 import telerig
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.sensors.encoder_checks import check_encoder, encoder_faults
+from telerig.estimator.sensors.findings import Code
 from telerig.estimator.sensors.gravity import Gravity, fitting_axes
 from telerig.estimator.sensors.stopped import clippings
 from telerig.io.simulation.presets import run_preset
@@ -74,6 +75,23 @@ def test_a_stage_that_stops_within_the_last_step_of_a_slow_encoder_is_no_fault()
         position[-1] -= 12.0
         kept, found = check_encoder(t, position, t)
         assert kept[:-1].all() and kept[-1] == sound and (not found) == sound
+
+
+@pytest.mark.parametrize("size", [2, 8, 16])
+def test_readings_that_were_buffered_are_refused(size: int) -> None:
+    """At 1 kHz, each with the time of the last of its bunch, some microseconds apart."""
+    rng = np.random.default_rng(9)
+    t = np.arange(0, 1.6, 1e-3)
+    position = 280 * t + 0.1 * np.sin(30 * t) + 0.001 * rng.standard_normal(len(t))
+    sent = t.reshape(-1, size)[:, -1:] + 2e-6 * np.arange(size)
+    frames = np.arange(0.1, 1.5, 0.002)
+    _, (finding,) = check_encoder(sent.ravel(), position, frames)
+    assert finding.code == Code.ENCODER_CLOCK
+    assert f"in bunches: {size} of them within" in finding.warning
+    at_rest = 0.001 * rng.standard_normal(len(t))
+    assert check_encoder(sent.ravel(), at_rest, frames)[1] == []
+    jitter = t + 4e-4 * rng.uniform(-1, 1, len(t))
+    assert all(f.code is None for f in check_encoder(jitter, 280 * jitter, frames)[1])
 
 
 def test_coarse_readings_are_not_clipped() -> None:

@@ -83,6 +83,8 @@ def _recording(
     from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.doctor.checks import Check, Status, failure
     from telerig.estimator.doctor.recording import check_recording
+    from telerig.estimator.tracking.track import stage_axis, upwards
+    from telerig.io.report.run.report import up_name
     from telerig.io.report.trial import write_trial_report
 
     count = TrackingOptions(frames=frames).first_frames
@@ -102,7 +104,8 @@ def _recording(
             detections = None if trial.tracks is None else trial.tracks.detections
             shake = None if trial.smoothing is None else trial.smoothing.shake
             page = folder / "trial.html"
-            write_trial_report(page, part, rows, detections, shake)
+            up = up_name(upwards(part, stage_axis(part, calibration)))
+            write_trial_report(page, part, rows, detections, shake, up=up)
             if not quiet:
                 say(f"written: {page}")
         return trial.checks

@@ -18,6 +18,10 @@ _CLIPPED_SHARE = 0.5
 _WHITE_SHARE = 0.98
 _EVERY_PX = 16
 _LIT_SHARE, _BRIGHTEST = 0.6, 0.95
+BYTE_SCALE = 255.0
+"""Grey level of white in an image of 8 bits."""
+SCALES_OF_16_BITS = tuple(float(2**bits - 1) for bits in (10, 12, 14, 16))
+"""Grey levels of white that an image stored in 16 bits may have."""
 LEAST_BRIGHTNESS = 0.25
 """Brightness relative to the background below which an image counts as dark."""
 
@@ -77,11 +81,15 @@ def nothing_to_see(image: NDArray[Any]) -> str:
 
 
 def full_scale(image: NDArray[Any]) -> float:
-    """Return the grey level of white in an image; 16 bits may hold 10, 12 or 14."""
+    """Return the grey level of white in an image; 16 bits may hold 10, 12 or 14.
+
+    It is that of the least depth that holds the image, so a dark image may be taken for one of
+    less depth than the camera has.
+    """
     if image.dtype.itemsize == 1:
-        return 255.0
+        return BYTE_SCALE
     high = float(image.max())
-    return next((float(2**bits - 1) for bits in (10, 12, 14) if high <= 2**bits - 1), 65535.0)
+    return next((white for white in SCALES_OF_16_BITS if high <= white), SCALES_OF_16_BITS[-1])
 
 
 def normalised(

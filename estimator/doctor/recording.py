@@ -17,7 +17,7 @@ from telerig.arrays import Array
 from telerig.command_options import Experiment
 from telerig.errors import TelerigError
 from telerig.estimator.bubbles.background.screen import screen_level
-from telerig.estimator.bubbles.flat_field import full_scale
+from telerig.estimator.bubbles.flat_field import BYTE_SCALE, SCALES_OF_16_BITS, full_scale
 from telerig.estimator.calibration.result.calibration import Calibration, of_run
 from telerig.estimator.doctor.checks import Check, Status
 from telerig.estimator.plan import MOST_STATES, expect
@@ -132,10 +132,10 @@ def _images(run: RunData, camera: str) -> Iterator[Check]:
     """Check light and frames of a camera's images."""
     region = described_fields(run).get(camera)
     some = np.unique(np.linspace(0, run.frame_count - 1, _LOOKED_AT).round().astype(int))
-    levels, saturated = [], []
+    levels, saturated = list[Array](), list[tuple[float, float]]()
     missing: list[int] = []
     doubled: list[int] = []
-    before, scale = None, 0.0
+    before, scale, peak = None, 0.0, 0.0
     for frame in range(run.frame_count):
         image = run.image(camera, frame)
         if image is None:
@@ -145,24 +145,20 @@ def _images(run: RunData, camera: str) -> Iterator[Check]:
         if same == before:
             doubled.append(frame)
         before = same
+        white = full_scale(image)
+        scale, peak = max(scale, white), max(peak, float(image.max()))
         if frame in some:
-            scale = max(scale, full_scale(image))
             screen = screen_level(image, region)
             inside = screen[::8, ::8] if region is None else screen[region][::64]
             levels.append(np.quantile(inside, [0.05, 0.5, 0.95]))
-            saturated.append(float(np.mean(image >= scale)))
+            saturated.append((white, float(np.mean(image >= white))))
     if not levels:
         yield Check(f"images of {camera}", "failure", "no image can be read", "look at the files")
         return
     dark, level, bright = np.median(levels, axis=0)
-    yield _judged(
-        f"light of {camera}",
-        f"the backlight is at {share(level, scale)} of full scale (at least "
-        f"{share(LEAST_LEVEL, 1)})",
-        level >= LEAST_LEVEL * scale,
-        "give more light, open the aperture, or expose for longer if the motion permits it",
-    )
-    worst = float(np.median(saturated))
+    at_white = [part if white == scale else 0.0 for white, part in saturated]
+    yield _light(camera, level, scale, depth_known=peak >= scale)
+    worst = float(np.median(at_white))
     yield _judged(
         f"saturation of {camera}",
         f"{share(worst, 1)} of the pixels are at full scale (at most {share(MOST_SATURATED, 1)})",
@@ -188,6 +184,29 @@ def _images(run: RunData, camera: str) -> Iterator[Check]:
             len(frames) <= MOST_MISSING * run.frame_count,
             todo,
         )
+
+
+def _light(camera: str, level: float, scale: float, *, depth_known: bool) -> Check:
+    """Check the grey level of the backlight.
+
+    scale : full scale by the least depth (bits) that holds all images. depth_known : whether some
+    pixels are at this level; if not, the camera may have more bits.
+    """
+    what, words = f"light of {camera}", f"the backlight is at {share(level, scale)} of full scale"
+    words += f" (at least {share(LEAST_LEVEL, 1)})"
+    good = level >= LEAST_LEVEL * scale
+    other = next((white for white in SCALES_OF_16_BITS if white > scale > BYTE_SCALE), None)
+    if depth_known or not good or other is None:
+        todo = "give more light, open the aperture, or expose for longer if the motion permits it"
+        return _judged(what, words, good, todo)
+    bits, more = (round(np.log2(white + 1)) for white in (scale, other))
+    return Check(
+        what,
+        "note",
+        f"{words} if the camera has {bits} bits, the least that hold all grey levels: the images "
+        f"do not tell; of {more} bits it would be {share(level, other)}",
+        f"look up the camera's bit depth, and give more light if it is more than {bits} bits",
+    )
 
 
 def _steps(run: RunData) -> Iterator[Check]:

@@ -29,11 +29,14 @@ def write_trial_report(
     checks: Sequence[tuple[str, str, str, str]],
     detections: pd.DataFrame | None,
     shake: pd.DataFrame | None,
+    *,
+    up: str = "-y",
 ) -> None:
     """Write the page of a trial recording.
 
     checks : (name, "ok", "note", "warning" or "failure", words, what to do). detections : as in
     `telerig.Tracks`; None without tracks. shake : as in shake.csv; None where it was not smoothed.
+    up : the axis of the rig that points upwards, as for `telerig.plot`.
     """
     bad = [check for check in checks if check[1] == "failure"]
     verdict = Verdict(
@@ -50,7 +53,7 @@ def write_trial_report(
     head = ("check", "", "found", "to do")
     page = render_page(Page(
         "telerig doctor of a trial recording", "Trial recording", run.name, verdict,
-        [*_views(run, detections), *_shake(run, shake)],
+        [*_views(run, detections), *_shake(run, shake, up)],
         [Section("checks", "What was looked at", table(head, rows, (99, 99)))], TERMS,
     ))  # fmt: skip
     write_text_atomic(file, page)
@@ -78,14 +81,14 @@ def _views(run: RunData, detections: pd.DataFrame | None) -> Iterator[Picture]:
         )  # fmt: skip
 
 
-def _shake(run: RunData, shake: pd.DataFrame | None) -> Iterator[Figure]:
+def _shake(run: RunData, shake: pd.DataFrame | None, up: str) -> Iterator[Figure]:
     """Yield each camera's shake in time, and its spectrum."""
     if shake is None:
         return
     for camera in run.cameras:
-        yield Figure(f"Shake of camera {camera}", partial(plot.shake, shake, camera),
+        yield Figure(f"Shake of camera {camera}", partial(plot.shake, shake, camera, up=up),
                      "Offset from the carriage.", 2.2)  # fmt: skip
         yield Figure(f"Spectrum of the shake of camera {camera}",
-                     partial(plot.spectrum, shake, camera),
+                     partial(plot.spectrum, shake, camera, up=up),
                      "A narrow peak is a resonance of the rig, which can be stiffened or damped.",
                      2.2)  # fmt: skip

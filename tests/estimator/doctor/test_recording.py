@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,13 +25,16 @@ from telerig.estimator.doctor import recording
 from telerig.estimator.doctor.recording import Recording, check_recording, sensor_shake
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.io.dataset.run import RunData
+from telerig.io.report import trial as trial_page
+from telerig.io.report.page.figures import Figure
+from telerig.io.report.page.page import Page
 from telerig.io.results.smoothing import Verdict
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
 from telerig.scripts.main import app
 
-Image = NDArray[np.uint8]
+Image = NDArray[np.unsignedinteger[Any]]
 
 
 @dataclass
@@ -84,6 +89,31 @@ def test_light_and_frames_of_a_camera(images: list[Image | None], failed: list[s
     found = [c for c in recording._images(run, "left") if c.status == "failure"]
     assert [c.what.removesuffix(" of left") for c in found] == failed
     assert all(c.todo for c in found)
+
+
+def of_12_bits(level: float, brightest: float = 0.0) -> list[Image | None]:
+    """The pictures at a grey level of 4095, in 16 bits; a pixel of frame 2 may be brighter."""
+    images = [image.astype(np.uint16) * 4 for image in pictures(level / 4) if image is not None]
+    images[2][0, 0] = max(brightest, images[2][0, 0])
+    return list(images)
+
+
+@pytest.mark.parametrize(
+    ("images", "status", "words"),
+    [
+        (of_12_bits(750), "note", "if the camera has 10 bits, .* of 12 bits it would be 18"),
+        (of_12_bits(750, 4095), "failure", "at 18.* % of full scale"),
+        (of_12_bits(120), "failure", "at 11.* % of full scale"),
+        (of_12_bits(850, 1023), "ok", "at 8.* % of full scale"),
+    ],
+)
+def test_a_depth_that_the_images_do_not_tell_is_said(
+    images: list[Image | None], status: str, words: str
+) -> None:
+    """The depth is judged over all images of the camera, also those not looked at otherwise."""
+    run: Any = Shown(images)
+    (light,) = [c for c in recording._images(run, "left") if c.what == "light of left"]
+    assert light.status == status and re.search(words, light.words), light.words
 
 
 def test_frames_that_the_times_lack_are_counted() -> None:
@@ -251,6 +281,29 @@ def test_the_command_looks_at_a_calibrated_run_and_ends_with_1_for_a_trouble(
     page = (tank_copy / "results" / "rise" / "trial.html").read_text(encoding="utf-8")
     assert 'class="verdict rejected"' in page and "Spectrum of the shake of camera" not in page
     assert page.count("data:image/svg+xml") == 2
+
+
+def test_the_page_names_the_axis_that_rig_toml_says_is_up(
+    tank_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = tank_copy / "rig.toml"
+    lines = rig.read_text(encoding="utf-8").splitlines()
+    lines = [line for line in lines if not line.startswith("up_left")]
+    lines.insert(lines.index("[stage]") + 1, "up_left = [0.0, 0.0, 1.0]")
+    rig.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    shake = pd.DataFrame({"t_s": [0.0]})
+    pages: list[Page] = []
+
+    def trial(run: RunData, *_: Any, **__: Any) -> Any:
+        return SimpleNamespace(checks=(), tracks=None, smoothing=SimpleNamespace(shake=shake))
+
+    monkeypatch.setattr(recording, "check_recording", trial)
+    monkeypatch.setattr(trial_page, "render_page", lambda page: pages.append(page) or "")
+    CliRunner().invoke(app, ["doctor", str(tank_copy / "runs" / "rise")])
+    (page,) = pages
+    draws = [one.draw for one in page.look if isinstance(one, Figure)]
+    assert len(draws) == 4
+    assert {draw.keywords.get("up") for draw in draws if isinstance(draw, partial)} == {"z"}
 
 
 def test_a_run_without_a_calibration_is_told_so(tank_copy: Path) -> None:

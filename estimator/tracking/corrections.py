@@ -21,7 +21,7 @@ from telerig.estimator.tracking.linking.filter import TrackEvent
 from telerig.estimator.tracking.linking.frames_to_rows import Linked
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_path
-from telerig.io.files.csv_table import read_table, write_table
+from telerig.io.files.csv_table import read_table, whole_id, write_table
 from telerig.io.tables.run import CORRECTIONS as _ROWS
 from telerig.short_text import counted, counted_list
 
@@ -260,9 +260,12 @@ def _refuse_overlap(one: Correction, found: Tracks, where: Path) -> None:
         )
 
 
-def _is_id(text: str) -> bool:
-    """Return whether a text is a whole number that tables hold as one."""
-    return text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS
+def _number(text: str) -> int | None:
+    """Return the whole number of an id, 7 for "07" and "7.0"; None if tables do not hold it so."""
+    if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS:
+        return int(text)
+    number = whole_id(text)
+    return number if number is not None and number >= 0 else None
 
 
 def read_corrections(run: Path, numbered: bool) -> Corrections:
@@ -295,14 +298,14 @@ def _read(file: Path, numbered: bool) -> Corrections:
             first = "" if np.isnan(frame) else int(frame)
             what = f"{action} has particle {particle!r}, other {other!r}, frame {first!r}"
             raise InputError(what, where=where, todo=_TODO[action])
-        if numbered and not all(_is_id(text) for text in (particle, other or "0")):
+        if numbered and None in (_number(particle), _number(other or "0")):
             what, todo = (
                 f"{particle!r} or {other!r} is no whole number",
                 "give numbers, as tracks.csv",
             )
             raise InputError(what, where=where, todo=todo)
         if numbered:
-            particle, other = (str(int(text)) if text else "" for text in (particle, other))
+            particle, other = (str(_number(text)) if text else "" for text in (particle, other))
         start = 0 if np.isnan(frame) else int(frame)
         out.append(Correction(int(row), action, particle, other, start, reason))
     return Corrections(file, tuple(out))

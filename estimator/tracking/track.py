@@ -58,6 +58,7 @@ from telerig.estimator.tracking.linking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import plain
+from telerig.io.files.csv_table import whole_id
 from telerig.io.files.frame_table import FrameTable
 from telerig.io.files.hashing import hash_if_there
 from telerig.io.results.calibration_words import NO_COVARIANCE
@@ -502,10 +503,12 @@ def _whole(ids: Iterable[str]) -> dict[str, int]:
 def numbers_of(ids: set[str]) -> tuple[dict[str, int], dict[int, str] | None]:
     """Return the number of each given id, and the ids' names by number.
 
-    The names are None if all given ids are whole numbers below `LARGEST_ID`.
+    The names are None if all given ids are whole numbers below `LARGEST_ID`, each written in one
+    way, "3" or "3.0".
     """
-    given, numbers = sorted(ids), _whole(ids)
-    if all(str(numbers.get(text)) == text for text in given):
+    given = sorted(ids)
+    numbers = {text: number for text in given if (number := whole_id(text)) is not None}
+    if len(set(numbers.values())) == len(given) and min(numbers.values(), default=0) >= 0:
         return numbers, None
     return {text: i for i, text in enumerate(given)}, dict(enumerate(given))
 

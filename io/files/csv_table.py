@@ -329,11 +329,16 @@ def _id(cells: Sequence[str], column: Column, rows: Rows) -> Any:
 
 def _as_ids(names: pd.Series[Any]) -> pd.Series[Any]:
     """Return names as int64 if all are whole numbers, as float64 with NaN if some are blank."""
-    every = [name for name in names.unique() if name]
-    if not all(map(_WHOLE_ID.fullmatch, every)):
+    every = {name: whole_id(name) for name in names.unique() if name}
+    if None in every.values():
         return names
-    numbers = names.map({"": np.nan} | {name: int(float(name)) for name in every})
+    numbers = names.map({"": np.nan} | every)
     return numbers.astype(float if (names == "").any() else np.int64)
+
+
+def whole_id(name: str) -> int | None:
+    """Return the whole number of an id, 3 also for "3.0"; None for a name, such as "007"."""
+    return int(float(name)) if _WHOLE_ID.fullmatch(name) else None
 
 
 def _number(cells: Sequence[str], column: Column, rows: Rows) -> Array:

@@ -110,6 +110,7 @@ def test_a_join_with_a_track_that_is_not_there_is_said(tmp_path: Path) -> None:
 
 def test_numbers_with_zeros_before_them_are_numbers(tmp_path: Path) -> None:
     assert corrected(tmp_path, "rename,01,007,,x\n", [[1], [1]]) == [[7], [7]]
+    assert corrected(tmp_path, "join,2.0,3.0,,x\n", [[2], [3]]) == [[2], [2]]
     with pytest.raises(InputError, match="there is a track 2 already"):
         corrected(tmp_path, "rename,1,02,,x\n", [[1, 2]])
 

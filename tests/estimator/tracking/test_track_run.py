@@ -147,11 +147,30 @@ def test_detections_without_a_rig_have_the_calibrations_image_sizes(
 def test_given_ids_pass_through(rise: Path, whole: Tracks) -> None:
     run = telerig.load_run(rise / "runs" / "rise")
     given = whole.detections[["frame", "camera", "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]]
-    for text, expected in (("41", 41), ("bubble A", "bubble A")):
+    for text, expected in (("41", 41), ("41.0", 41), ("bubble A", "bubble A")):
         changed = replace(run, detections=given.assign(particle=text), source="detections")
         again = telerig.track(changed, truth_calibration())
         assert set(again.table["particle"]) == {expected}
         assert set(again.detections["particle"]) == {expected}
+
+
+@pytest.mark.parametrize(
+    ("ids", "numbers"),
+    [
+        (("1.0", "20.0"), {"1.0": 1, "20.0": 20}),
+        (("1", "2.0"), {"1": 1, "2.0": 2}),
+        (("1", "1.0"), None),
+        (("1.0", "1.5"), None),
+        (("-1.0",), None),
+        (("1.0", "a"), None),
+    ],
+)
+def test_ids_that_are_all_whole_numbers_are_such(
+    ids: tuple[str, ...], numbers: dict[str, int] | None
+) -> None:
+    """pandas writes 1 as "1.0" where other cells of the column are blank."""
+    found, names = track_module.numbers_of(set(ids))
+    assert (found if names is None else None) == numbers
 
 
 def test_an_id_given_in_one_camera_stays(rise: Path, whole: Tracks) -> None:

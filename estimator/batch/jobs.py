@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from telerig.command_options import (
     SmoothingOptions,
     TrackingOptions,
 )
-from telerig.errors import InputError
+from telerig.errors import InputError, TelerigWarning
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.files.names import absent
 from telerig.io.results.folders.calibration import CalibrationResults
@@ -142,7 +143,8 @@ def jobs_of(
     """Return the jobs of a batch: calibration, tracking and smoothing of every dataset.
 
     A job stands after the jobs that it needs. A dataset without views of the target must have been
-    calibrated before.
+    calibrated before. One that was, and has its views both as images and as dots.csv, is not
+    calibrated again, with a `TelerigWarning`.
 
     calibration : a calibration.json to use for all datasets, none of which is then calibrated.
     calibrating, tracking, smoothing : options of the kinds of jobs; None for the defaults.
@@ -268,6 +270,14 @@ def _jobs_of_one(
     calibrates = "calibrate" in kinds and not given
     data = load_dataset(place, need_views=calibrates and not calibrated_before)
     jobs = []
+    if calibrates and not data.views and (place / "calibration" / "dots.csv").is_file():
+        warnings.warn(
+            f"{place} has both images and calibration/dots.csv, so it is not calibrated; the "
+            "calibration that it has is used: to make it anew, give `telerig calibrate` --from "
+            "images or --from dots",
+            TelerigWarning,
+            stacklevel=2,
+        )
     if data.views and calibrates:
         jobs.append(Job("calibrate", str(place), options["calibrate"], **shared))
     calibrated = tuple(job.name for job in jobs)

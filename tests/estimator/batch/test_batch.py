@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.command_options import CalibrationOptions
+from telerig.errors import TelerigWarning
 from telerig.estimator.batch import batch as work
 from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
 from telerig.estimator.batch.jobs import Job, jobs_of, share_of
@@ -75,6 +76,15 @@ def test_a_dataset_is_calibrated_then_tracked_then_smoothed(datasets):
     assert jobs[2].needs == (jobs[0].name, jobs[1].name)
     assert len({j.name for j in jobs}) == 6
     assert Job.from_json(jobs[2].as_json()) == jobs[2]
+
+
+def test_what_is_not_calibrated_for_two_sources_is_said(tank_copy):
+    image = tank_copy / "calibration" / "left" / "0.tif"
+    image.parent.mkdir(exist_ok=True)
+    image.touch()
+    with pytest.warns(TelerigWarning, match=r"both images and calibration/dots\.csv.*--from dots"):
+        jobs = jobs_of([tank_copy])
+    assert [job.kind for job in jobs] == ["track", "smooth"]
 
 
 def test_with_a_calibration_given_nothing_is_calibrated(datasets):

@@ -115,6 +115,8 @@ def self_calibrate(
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
     known = [*findings, *pre.findings]
+    if dots_free == "nominal":
+        known += checks.unused_distance(problem)
     if target.symmetry_order() > 1:
         problem, turned = symmetric_target.number_consistently(problem, nominal)
         known += turned

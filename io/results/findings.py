@@ -224,6 +224,12 @@ class Code(Enum):
         2.0,
         "ratio: an inch is 2.54 cm and a cm 10 mm, and a stated scale is within 20 %",
     )
+    DISTANCE_UNUSED = Kind(
+        _NOTE,
+        "scale_distance_mm has no effect: the dots are held at their nominal places, which are "
+        "{nominal_mm:.6g} mm apart where rig.toml states a measured distance of {stated_mm:.6g} mm",
+        "Give --dots 3d or --dots plane for the measured distance to set the scale",
+    )
     EXCHANGED = Kind(
         _USABLE,
         "{cameras} seem to be exchanged: their scales are {first:.3f} and {second:.3f} px/mm, "

@@ -173,6 +173,15 @@ def loose_offsets(problem: Problem, state: State) -> list[Finding]:
     return [Code.OFFSET.found(cameras=problem.cameras[c].name) for c in cameras]
 
 
+def unused_distance(problem: Problem) -> list[Finding]:
+    """Return the finding that a measured distance has no effect, for dots at nominal places."""
+    if problem.scale is None:
+        return []
+    (a, b), stated, _ = problem.scale
+    nominal = float(np.linalg.norm(problem.nominal_mm[a] - problem.nominal_mm[b]))
+    return [Code.DISTANCE_UNUSED.found(nominal_mm=nominal, stated_mm=stated)]
+
+
 def scales_beside_nominal(problem: Problem, state: State) -> list[Finding]:
     """Return findings of scales that contradict rig.toml: exchanged cameras, or a wrong unit.
 

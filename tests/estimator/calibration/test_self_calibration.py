@@ -189,6 +189,9 @@ def test_what_dots_may_do(dots_free: str, scene: Any) -> None:
     error = made.space_rms_um(calibration)
     assert (error > 2.0) == (dots_free == "nominal")
     assert (calibration.statistics["noise_floor_px"] > 0.03) == (dots_free != "3d")
+    unused = [f for f in calibration.findings or () if f.code.name == "DISTANCE_UNUSED"]
+    assert len(unused) == (dots_free == "nominal")
+    assert all(f.numbers["stated_mm"] == made.target.scale_distance_mm for f in unused)
 
 
 # --- the mirror twin --------------------------------------------------------------------------

@@ -181,10 +181,18 @@ class Follower:
 
     diameter_mm : diameter of a dot.
     margin_px : least distance of a whole dot's centre from the border of the image.
+    held_mm : position of the stage that is assumed until one is known: the first known one, so that
+        a record that begins late is no travel.
     """
 
     def __init__(
-        self, view: TankView, *, diameter_mm: float, margin_px: float, frame_count: int
+        self,
+        view: TankView,
+        *,
+        diameter_mm: float,
+        margin_px: float,
+        frame_count: int,
+        held_mm: float = 0.0,
     ) -> None:
         self.view, self.diameter_mm, self.margin_px = view, diameter_mm, margin_px
         self.marks: list[Mark] = []
@@ -197,7 +205,7 @@ class Follower:
         self._last: tuple[int, Array, bool] | None = None
         self._speed = np.zeros(2)
         self._step_mm: float | None = None
-        self._held_mm = 0.0
+        self._held_mm = held_mm
 
     def add(
         self, frame: int, dots: DotSightings, position_mm: float | None

@@ -71,20 +71,21 @@ def follow_references(
     names = list(views)
     learnt = ordered_map(partial(_look, run, views, strip), names, quick_workers(len(names)))
     looks = {name: look for name, look in zip(names, learnt) if look is not None}
+    held = held_positions(run.position_mm, run.frame_count)
     followers = {
         name: Follower(
             views[name],
             diameter_mm=strip.dot_diameter_mm,
             margin_px=look.margin_px,
             frame_count=run.frame_count,
+            held_mm=float(held[0]),
         )
         for name, look in looks.items()
     }
     if looks:
         store.fill("dots", partial(_find_dots, run, looks), progress, "references", executor)
     sightings = _sightings(run, followers, store)
-    held = _held_positions(run)
-    kept = {name: f.kept(moved=_moved(f, held)) for name, f in followers.items()}
+    kept = {name: f.kept(moved=moved_far(f, held)) for name, f in followers.items()}
     mark = _mark_numbers(sightings, kept)
     strips = {
         name: StripInImages.of(followers[name], looks[name], marks, held)
@@ -147,18 +148,20 @@ def _sightings(
     return joined[REFERENCE_COLUMNS]
 
 
-def _held_positions(run: RunData) -> Array:
+def held_positions(position_mm: Array | None, frame_count: int) -> Array:
     """Return the stage's positions (F,) in mm; a missing one is replaced by the last known one, or
-    0.
+    before all by the first. Without any they are 0.
+
+    position_mm : (F,), NaN where unknown.
     """
-    if run.position_mm is None:
-        return np.zeros(run.frame_count)
-    known = np.where(np.isfinite(run.position_mm), np.arange(run.frame_count), -1)
-    last = np.maximum.accumulate(known)
-    return np.where(last >= 0, run.position_mm[np.maximum(last, 0)], 0.0)
+    if position_mm is None or not np.isfinite(position_mm).any():
+        return np.zeros(frame_count)
+    known = np.flatnonzero(np.isfinite(position_mm))
+    last = np.searchsorted(known, np.arange(frame_count), side="right") - 1
+    return np.asarray(position_mm[known[np.maximum(last, 0)]])
 
 
-def _moved(follower: Follower, held_mm: Array) -> bool:
+def moved_far(follower: Follower, held_mm: Array) -> bool:
     """Whether the tank moved through the image far enough to tell its marks from dirt."""
     along = follower.view.basis @ follower.view.axis_rig
     places = held_mm[:, None] * along - np.nan_to_num(follower.shift_mm)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from telerig.errors import GeometryError
 from telerig.estimator.marks.following import AMBIGUOUS, HIDDEN, MOVED, Follower, TankView
 from telerig.estimator.marks.strip_dots import DotSightings
+from telerig.estimator.tracking.follow_marks import held_positions, moved_far
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
@@ -31,10 +32,18 @@ def play(
     encoder: bool = True,
     hidden: frozenset[tuple[int, int]] = frozenset(),
     extra: dict[int, Array] | None = None,
+    read_mm: Array | None = None,
 ) -> tuple[Follower, list[tuple[int, int, int]]]:
-    """A strip at the given heights seen at the given positions: (frame, dot, mark)."""
+    """A strip at the given heights seen at the given positions: (frame, dot, mark).
+
+    read_mm : what the encoder reads; None for the positions.
+    """
+    read = positions_mm if read_mm is None else read_mm
+    held = float(held_positions(read, len(read))[0])
     view = TankView.of(camera(), UP)
-    follower = Follower(view, diameter_mm=1.0, margin_px=8.0, frame_count=len(positions_mm))
+    follower = Follower(
+        view, diameter_mm=1.0, margin_px=8.0, frame_count=len(positions_mm), held_mm=held
+    )
     rng, rows = np.random.default_rng(0), []
     size = np.array(camera().image_size_px) - 1
     for frame, position in enumerate(positions_mm):
@@ -49,7 +58,7 @@ def play(
             uv, seen = np.vstack([uv, extra[frame]]), np.append(seen, -1)
         order = rng.permutation(len(uv))
         dots = DotSightings(uv[order], np.full(len(uv), 0.02))
-        found = follower.add(frame, dots, float(position) if encoder else None)
+        found = follower.add(frame, dots, float(read[frame]) if encoder else None)
         rows += [(frame, int(seen[order][i]), mark) for i, mark in found]
     return follower, rows
 
@@ -125,6 +134,25 @@ def test_a_dot_off_its_place_is_left_out() -> None:
 def test_a_run_in_which_nothing_moves_keeps_its_marks() -> None:
     follower, _ = play(EVEN, np.zeros(10))
     assert len(follower.kept(moved=False)) >= 7
+
+
+def test_a_record_that_begins_late_is_no_travel() -> None:
+    """The stage rests at 100 mm, and a dot that is hidden once stays a mark; or it moves."""
+    read = np.where(np.arange(20) < 5, np.nan, 100.0)
+    hidden = frozenset({(10, 10)})
+    follower, rows = play(EVEN, np.zeros(20), read_mm=read, hidden=hidden)
+    moved = moved_far(follower, held_positions(read, 20))
+    assert not moved
+    assert {mark for _, dot, mark in rows if dot == 10} <= {
+        m.number for m in follower.kept(moved=moved)
+    }
+    position = 1.0 * np.arange(20)
+    follower, _ = play(EVEN, position, read_mm=read + position)
+    held = held_positions(read + position, 20)
+    assert moved_far(follower, held)
+    along = held[:, None] * (follower.view.basis @ UP) - follower.shift_mm
+    # the step at which the record begins is not seen
+    assert np.ptp(along[:, 0]) == pytest.approx(18.0, abs=0.1)
 
 
 def test_a_camera_along_the_travel_is_refused() -> None:

@@ -2,7 +2,7 @@
 
 The covariances of a smoothing depend on what is measured when and how well, not on the readings. So
 the smoothing graph of the planned run, with the shake's true spectrum as its prior, gives the exact
-posterior. Where marks or an accelerometer on each arm measure the shake, it is 0.80-1.16 times the
+posterior. Where marks or an accelerometer on each arm measure the shake, it is 0.79-1.16 times the
 error of runs that are smoothed without knowing the spectrum (docs/decisions/038).
 """
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
+from telerig.statistics import parts_without_gaps
 
 Prior = tuple[Array, Array]
 
@@ -29,9 +30,6 @@ correlated."""
 
 _FIRST_BIN = 2
 _LEAST_FRAMES = 16
-_GAP_STEPS = 5.0
-"""Steps longer than so many median steps are gaps, which no spectrum bridges."""
-
 _LEAST_CYCLES = 4.0
 """An oscillation with fewer cycles in a stretch cannot be distinguished from a slow wander."""
 
@@ -252,16 +250,13 @@ def _spectra(part: Series) -> list[_Spectrum]:
 
 
 def _without_gaps(t_s: Array) -> list[Ints]:
-    """Return the places of increasing times (N,) between which there is no gap, the longest first.
+    """Return the places of increasing times (N,) between which there is no gap, the longest part
+    first, without short ones.
 
     Bubbles that come one by one leave gaps that are longer than the time in which they are seen:
     interpolated, these would have neither the noise of a pixel nor its frequencies.
     """
-    step = np.diff(t_s)
-    if not len(step):
-        return []
-    ends = np.flatnonzero(step > _GAP_STEPS * np.median(step)) + 1
-    parts = [some for some in np.split(np.arange(len(t_s)), ends) if len(some) >= _LEAST_FRAMES]
+    parts = [some for some in parts_without_gaps(t_s) if len(some) >= _LEAST_FRAMES]
     return sorted(parts, key=len, reverse=True)
 
 

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Code, Finding
-from telerig.estimator.sensors.record_numbers import GAP_STEPS, runs
+from telerig.estimator.sensors.record_numbers import runs
 from telerig.estimator.sensors.spikes import LONGEST_SPIKE, prediction_residual
 from telerig.short_text import counted, counted_list
-from telerig.statistics import robust_sd
+from telerig.statistics import GAP_STEPS, robust_sd
 
 _SIGMAS = 10.0
 _COUNTS = 4.0

@@ -10,9 +10,6 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Bools
 from telerig.rig.units import MICRO_G_M_S2
 
-GAP_STEPS = 5.0
-"""Steps longer than this many median steps are gaps of a record."""
-
 _SEGMENT = 256
 _BAND = (0.125, 0.45)
 _LEAST_UG_SQRT_HZ = 1.0

@@ -12,10 +12,11 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.findings import Finding
 from telerig.estimator.sensors.given import Sensor
-from telerig.estimator.sensors.record_numbers import GAP_STEPS, noise_density, sampling_rate
+from telerig.estimator.sensors.record_numbers import noise_density, sampling_rate
 from telerig.estimator.sensors.spikes import shifted_samples, spike_samples
 from telerig.estimator.sensors.stopped import clippings, frozen_samples
 from telerig.rig.units import MICRO_G_M_S2
+from telerig.statistics import GAP_STEPS
 
 _MOST_MASKED = 0.5
 _MOST_CLIPPED = 0.1

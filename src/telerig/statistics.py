@@ -1,11 +1,14 @@
-"""Robust statistics that every part of the program uses."""
+"""Robust statistics, and parts of records, that every part of the program uses."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Ints
+
+GAP_STEPS = 5.0
+"""Steps longer than this many median steps are gaps of a record."""
 
 NORMAL_FROM_MEDIAN = 1.4826
 """Ratio of a normal distribution's standard deviation to the median of its absolute deviations."""
@@ -34,3 +37,10 @@ def rms(values: Array) -> float | None:
     """Return the RMS of the finite values; None without any."""
     finite = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
+
+
+def parts_without_gaps(t_s: Array) -> list[Ints]:
+    """Return the places of increasing times (N,) between which there is no gap, part by part."""
+    step = np.diff(t_s)
+    usual = float(np.median(step)) if len(step) else 0.0
+    return np.split(np.arange(len(t_s)), np.flatnonzero(step > GAP_STEPS * usual) + 1)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.sensors.record_numbers import GAP_STEPS
 from telerig.estimator.smoothing.graph.layout import BROAD_BAND, directed, variances
 from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
@@ -28,7 +27,7 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.factors.state_space import broad_band, forced_mass
-from telerig.statistics import robust_sd
+from telerig.statistics import parts_without_gaps, robust_sd
 
 SHAKE_RMS_MM = 0.2
 _ARM_RMS_MM, _LEAST_RMS_MM = 0.07, 1e-3
@@ -271,9 +270,8 @@ def acceleration_rms(stage: Stage, sigma_mm: float) -> float:
     from scipy.signal import welch
 
     step = float(np.median(np.diff(stage.t_s))) if len(stage.t_s) > 1 else 0.0
-    gaps = np.flatnonzero(np.diff(stage.t_s) > GAP_STEPS * step) + 1
     rms, cost = np.geomspace(1.0, 1e6, 240), np.zeros(240)
-    for mine in np.split(np.arange(len(stage.t_s)), gaps):
+    for mine in parts_without_gaps(stage.t_s):
         if len(mine) < _FEWEST_READINGS:
             continue
         t_s, position_mm = stage.t_s[mine], stage.position_mm[mine]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import directions, seen_of
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
@@ -70,7 +72,7 @@ def _rests(problem: SmoothingProblem, begin_s: float, end_s: float) -> bool:
     for observed in (problem.references, problem.observations):
         for at in (begin_s, end_s):
             sides = [(problem.t_s >= a) & (problem.t_s <= a + length) for a in (at - length, at)]
-            followed += _followed(problem, problem.read(observed), sides)
+            followed += _followed(problem, observed, sides)
         if followed:
             return float(np.median(followed)) > _FOLLOWED
     return False
@@ -80,13 +82,7 @@ def _followed(problem: SmoothingProblem, observed: Observations, sides: list[Boo
     """Return by marks or bubbles of each camera which share of the encoder's change of speed from
     one side to the other (F,) the images show."""
     out = []
-    for c, camera in enumerate(problem.cameras):
-        mine = np.flatnonzero(observed.camera == c)
-        weights = seen_of(camera, problem.axis)
-        if not len(mine) or weights is None:
-            continue
-        place = camera.unproject(observed.uv_px[mine])[0] @ directions(camera).T @ weights
-        frame, item = observed.frame[mine], observed.item[mine]
+    for frame, item, place in _along_travel(problem, observed):
         for one in np.unique(item):
             parts = [(item == one) & side[frame] for side in sides]
             if min(map(np.count_nonzero, parts)) < _LEAST_SEEN:
@@ -99,6 +95,20 @@ def _followed(problem: SmoothingProblem, observed: Observations, sides: list[Boo
             if abs(told) > _MOVING_MM_S / 2:
                 out.append(float(-seen / told))
     return out
+
+
+def _along_travel(
+    problem: SmoothingProblem, observed: Observations
+) -> Iterator[tuple[Ints, Ints, Array]]:
+    """Yield frames, items and places (n,) along the travel axis (mm) of what each camera sees
+    within the encoder's record, of the cameras that see the axis."""
+    observed = problem.read(observed)
+    for c, camera in enumerate(problem.cameras):
+        mine = np.flatnonzero(observed.camera == c)
+        weights = seen_of(camera, problem.axis)
+        if len(mine) and weights is not None:
+            place = camera.unproject(observed.uv_px[mine])[0] @ directions(camera).T @ weights
+            yield observed.frame[mine], observed.item[mine], place
 
 
 def unfollowed(problem: SmoothingProblem) -> list[Finding]:
@@ -144,18 +154,12 @@ def _speeds(problem: SmoothingProblem, observed: Observations) -> Array:
     """Return the mean speeds (mm/s) along the travel axis of up to 50 marks or bubbles of each
     camera, of the encoder in the same frames, and the number of these, as rows (n, 3).
     """
-    rows, observed = [], problem.read(observed)
-    for c, camera in enumerate(problem.cameras):
-        mine = np.flatnonzero(observed.camera == c)
-        weights = seen_of(camera, problem.axis)
-        if not len(mine) or weights is None:
-            continue
-        place = camera.unproject(observed.uv_px[mine])[0] @ directions(camera).T @ weights
-        for item in np.unique(observed.item[mine])[:50]:
-            one = observed.item[mine] == item
-            frame = observed.frame[mine[one]]
-            if len(frame) > 10:
-                both = np.column_stack([place[one], problem.encoder_mm[frame]])
-                t = problem.t_s[frame]
-                rows.append([*np.abs(np.polyfit(t - t[0], both, 1)[0]), len(frame)])
+    rows = []
+    for frame, item, place in _along_travel(problem, observed):
+        for one in np.unique(item)[:50]:
+            mine = item == one
+            if mine.sum() > 10:
+                t, read = problem.t_s[frame[mine]], problem.encoder_mm[frame[mine]]
+                both = np.column_stack([place[mine], read])
+                rows.append([*np.abs(np.polyfit(t - t[0], both, 1)[0]), len(t)])
     return np.array(rows).reshape(-1, 3)

@@ -70,7 +70,8 @@ def _shape(results: SmoothingResults) -> str:
     )
     return (
         f"{words}The fit of a spheroid to the outlines of all cameras has a chi-square of "
-        f"{number(chi2, 2)} (median); if there were only noise: {expected}."
+        f"{number(chi2, 2)} (median); if there were only noise: {expected}. What is beyond it "
+        "widens the standard deviations of sizes and shapes."
     )
 
 

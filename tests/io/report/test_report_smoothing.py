@@ -216,7 +216,7 @@ def test_the_page_tests_the_spheroid_by_what_tracking_tells_of_shapes(folder: Pa
     changed(folder, bodies=asdict(Shapes(triaxial=0.02, bodies=60)))
     words = drawn_words(folder, "Aspect ratio in time")
     assert "differ by 4.0 % (1 sd)" in words and "chi-square of 1.9 (median)" in words
-    assert words.endswith("only noise: 1.4 of 2 outlines (degrees of freedom: 2).")
+    assert "only noise: 1.4 of 2 outlines (degrees of freedom: 2)." in words
     frames.assign(aspect=1.5).to_csv(folder / "bubbles.csv", index=False)
     assert "too few to test" in drawn_words(folder, "Aspect ratio in time")
 

@@ -45,13 +45,14 @@ MOST_COLUMNS = 1000
 class Column:
     """Describe a column that a table may have; a blank cell is read as NaN or "".
 
-    kind : "number" (float), "whole" (whole number), "text", "name" (text that follows the rule of
-        `telerig.io.files.names`) or "id" (names that are read as numbers if all are whole numbers).
+    kind : "number" (float), "sd" (number from 0 on: a standard deviation), "whole" (whole number),
+        "text", "name" (text that follows the rule of `telerig.io.files.names`) or "id" (names that
+        are read as numbers if all are whole numbers).
     unit : in the notation of UDUNITS, "" for none. what : the meaning in words.
     """
 
     name: str
-    kind: Literal["number", "whole", "text", "name", "id"] = "number"
+    kind: Literal["number", "sd", "whole", "text", "name", "id"] = "number"
     required: bool = True
     blank: bool = False
     unit: str = ""
@@ -75,7 +76,8 @@ def read_table(
     Returns the columns in the file's order. The index is the row in the file (the header is row 1).
     "whole" columns are int64, or float64 where cells may be blank. Raises InputError for a missing
     or unknown column, more than `MOST_COLUMNS`, a cell that is no number up to `LARGEST_NUMBER`, a
-    text with control characters, a row with too few or too many cells, and an empty table.
+    negative standard deviation, a text with control characters, a row with too few or too many
+    cells, and an empty table.
     """
     file = Path(path)
     table = _sound_table(file, columns, extra)
@@ -224,6 +226,7 @@ def _sound_table(
         else:
             bad = ~(cells.abs() <= LARGEST_NUMBER) & ~(cells.isna() & column.blank)
             bad |= (cells % 1 > 0) & (column.kind == "whole")
+            bad |= (cells < 0) & (column.kind == "sd")
         if bad.any():
             return None
         values[name] = _as_ids(cells) if column.kind == "id" else cells
@@ -360,6 +363,13 @@ def _number(cells: Sequence[str], column: Column, rows: Rows) -> Array:
     return values
 
 
+def _sd(cells: Sequence[str], column: Column, rows: Rows) -> Array:
+    values = _number(cells, column, rows)
+    what = "is {!r:.80}, but a standard deviation is not negative"
+    rows.refuse(values < 0, column.name, lambda i: what.format(cells[i]), "correct the cell")
+    return values
+
+
 def _whole(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
     values = _number(cells, column, rows)
     broken = (values % 1 != 0) & ~np.isnan(values)
@@ -373,10 +383,10 @@ _WHOLE_ID = re.compile(r"(?:0|-?[1-9]\d{0,14})(?:\.0*)?")
 """Not "007", which is a name; "3.0" is what programs make of 3 where other cells are blank."""
 _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 _CONVERT: dict[str, Callable[..., Any]] = {
-    "number": _number, "whole": _whole, "text": _text, "name": _name, "id": _id,
+    "number": _number, "sd": _sd, "whole": _whole, "text": _text, "name": _name, "id": _id,
 }  # fmt: skip
 _DTYPES: dict[tuple[str, bool], Any] = {
-    ("number", False): np.float64, ("number", True): np.float64,
+    **{(kind, blank): np.float64 for kind in ("number", "sd") for blank in (False, True)},
     ("whole", False): np.int64, ("whole", True): np.float64,
     **{(kind, blank): str for kind in _TEXTS for blank in (False, True)},
 }  # fmt: skip

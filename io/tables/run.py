@@ -22,6 +22,7 @@ from telerig.io.tables.table import (
     known,
     may,
     named,
+    sd,
     sure,
     text,
     xyz,
@@ -68,7 +69,7 @@ OUTLINE = (
     *may("chi2_dof", "", "chi-square per degree of freedom of the fit"),
     *may([f"{part}{k}_px" for k in range(3, 7) for part in "cs"], "px",
          "normal displacement, sum of c_k cos k phi + s_k sin k phi in the eccentric anomaly phi"),
-    *may("sigma_outline_px", "px", "standard deviation of these coefficients"),
+    *sd("sigma_outline_px", "px", "standard deviation of these coefficients"),
     text("flags", "border, defocus, overlap (fitted to the arcs in sight), merged (could not be "
          "split safely), small, saturated; joined by |"),
 )  # fmt: skip
@@ -112,7 +113,7 @@ TRACKS = Table(
         *known("ray_miss_mm", "mm", "signed distance of the two rays; of more, RMS distance of the "
                "point from them"),
         *known("d_eq_mm", "mm", "diameter of the sphere of equal volume"),
-        *may("sd_eq_mm", "mm", "its standard deviation"),
+        *sd("sd_eq_mm", "mm"),
         *OF_SHAPE,
         *known("confidence", "", "probability that these outlines and no others are the bubble's"),
         text("centre", "what is at the position: volume (corrected for the shape) or silhouettes"),

@@ -14,6 +14,7 @@ from telerig.io.tables.table import (
     TIME,
     Table,
     may,
+    sd,
     sure,
     whole,
     xyz,
@@ -40,16 +41,16 @@ def _state(prefix: str, what: str) -> list[Column]:
     ]
 
 
-def _with_sd(name: str, unit: str, what: str, sd: str = "s_{}") -> list[Column]:
+def _with_sd(name: str, unit: str, what: str) -> list[Column]:
     """Declare a number and its standard deviation."""
-    return [*may(name, unit, what), *may(sd.format(name), unit, "its standard deviation")]
+    return [*may(name, unit, what), *sd(f"s_{name}", unit)]
 
 
 _MOTION = (
     *may(xyz(VELOCITY), "mm s-1", "velocity in the laboratory frame"),
-    *may(xyz(f"s{VELOCITY}"), "mm s-1", "its standard deviation"),
+    *sd(xyz(f"s{VELOCITY}"), "mm s-1"),
     *may(xyz(ACCELERATION), "mm s-2", "acceleration in the laboratory frame"),
-    *may(xyz(f"s{ACCELERATION}"), "mm s-2", "its standard deviation"),
+    *sd(xyz(f"s{ACCELERATION}"), "mm s-2"),
 )
 NUMBERS = ("reynolds", "weber", "eotvos", "drag")
 """Dimensionless numbers; the standard deviation of each has the prefix ``s_``."""
@@ -66,7 +67,8 @@ TRAJECTORIES = Table(
     (
         FRAME, _ID, TIME,
         *(replace(one, blank=False) for one in _state("", "in the laboratory frame")),
-        *_state("s", "(standard deviation; of the position with the calibration's errors)"),
+        *(replace(one, kind="sd") for one in _state(
+            "s", "(standard deviation; of the position with the calibration's errors)")),
         *_state("naive_", "by triangulating and adding the encoder"),
         *_state("rts_", "by a plain smoother; blank for tracks of more than 5,000 frames, and "
                 "beyond the first 40,000 rows"),
@@ -84,9 +86,9 @@ SHAKE = Table(
         FRAME, TIME,
         *sure([f"{{camera}}_{axis}_mm" for axis in AXES], "mm",
               "shake of the camera: its offset from where the carriage's position puts it"),
-        *may([f"s{{camera}}_{axis}_mm" for axis in AXES], "mm", "its standard deviation"),
+        *sd([f"s{{camera}}_{axis}_mm" for axis in AXES], "mm"),
         *may("position_mm", "mm", "position of the carriage"),
-        *may("sposition_mm", "mm", "its standard deviation"),
+        *sd("sposition_mm", "mm"),
     ),
 )  # fmt: skip
 
@@ -101,7 +103,7 @@ BUBBLES = Table(
         *_with_sd("curvature_1_mm", "mm-1", "curvature of the path in the laboratory"),
         *OF_SHAPE[3:],
         *may(xyz(POSITION), "mm", "position in the laboratory frame"),
-        *may(xyz(f"s{POSITION}"), "mm", "its standard deviation"),
+        *sd(xyz(f"s{POSITION}"), "mm"),
         *_OBSERVED,
     ),
 )  # fmt: skip

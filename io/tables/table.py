@@ -136,6 +136,11 @@ def may(names: str | Sequence[str], unit: str, what: str) -> list[Column]:
     return known(names, unit, what, required=False)
 
 
+def sd(names: str | Sequence[str], unit: str, what: str = "its standard deviation") -> list[Column]:
+    """Declare columns of standard deviations, or parts of one, as `may` does."""
+    return [replace(one, kind="sd") for one in may(names, unit, what)]
+
+
 def xyz(pattern: str) -> list[str]:
     """Return the names of three columns, with x, y and z in place of {}."""
     return [pattern.format(axis) for axis in "xyz"]
@@ -155,7 +160,7 @@ SILHOUETTES = tuple(f"silhouettes_{axis}_mm" for axis in "xyz")
 COVARIANCE = ("sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2")
 
 OF_PIXELS = (
-    Column("sigma_px", required=False, unit="px", what="standard deviation of u and v"),
+    Column("sigma_px", "sd", required=False, unit="px", what="standard deviation of u and v"),
     *(
         Column(name, required=False, unit="px2", what="covariance of u and v, else from sigma_px")
         for name in PIXEL_COVARIANCE
@@ -166,8 +171,8 @@ OF_PIXELS = (
 CALIBRATION_SHARE = tuple(xyz("calibration_s{}_mm"))
 EXTRAPOLATED = "extrapolated"
 OF_CALIBRATION = (
-    *may(CALIBRATION_SHARE, "mm", "standard deviation of the position by the errors of the "
-         "calibration, which are common to the run; missing where they are not known"),
+    *sd(CALIBRATION_SHARE, "mm", "standard deviation of the position by the errors of the "
+       "calibration, which are common to the run; missing where they are not known"),
     *may(EXTRAPOLATED, "", "1 where the position lies beyond the dots of the calibration in an "
          "image, else 0"),
 )  # fmt: skip
@@ -175,30 +180,30 @@ OF_CALIBRATION = (
 
 OF_SIZE = (
     *may("d_eq_mm", "mm", "diameter of the sphere of equal volume"),
-    *may("sd_eq_mm", "mm", "its standard deviation"),
+    *sd("sd_eq_mm", "mm"),
 )
 OF_SHAPE = (
     *may("aspect", "", "equatorial over polar semi-axis of a spheroid: above 1 if flat (oblate)"),
-    *may("s_aspect", "", "its standard deviation"),
+    *sd("s_aspect", ""),
     *may("tilt_deg", "deg", "angle between the polar axis and the vertical, 0 to 90"),
-    *may("s_tilt_deg", "deg", "its standard deviation"),
+    *sd("s_tilt_deg", "deg"),
     *may("equator_mm", "mm", "equatorial semi-axis"),
-    *may("s_equator_mm", "mm", "its standard deviation"),
+    *sd("s_equator_mm", "mm"),
     *may("polar_mm", "mm", "polar semi-axis"),
-    *may("s_polar_mm", "mm", "its standard deviation"),
+    *sd("s_polar_mm", "mm"),
     *may(["pole_x", "pole_y", "pole_z"], "", "unit vector along the polar axis, pointing upwards"),
     *may("r_size_aspect", "", "correlation of the errors of the logarithms of d_eq_mm and aspect"),
     *may("spheroid_chi2", "", "how far a spheroid misses the outlines: chi-square with 2 degrees "
          "of freedom for two views, 5 for three"),
-    *may("noise_eq_mm", "mm", "part of sd_eq_mm by the noise of the outlines, which is independent "
-         "from frame to frame"),
-    *may("fixed_eq_mm", "mm", "part of sd_eq_mm by modes on the rims and by the mean square of the "
-         "unseen shape"),
-    *may("noise_aspect", "", "part of s_aspect by the noise of the outlines"),
-    *may("fixed_aspect", "", "part of s_aspect by the mean square of the unseen shape"),
+    *sd("noise_eq_mm", "mm", "part of sd_eq_mm by the noise of the outlines, which is independent "
+       "from frame to frame"),
+    *sd("fixed_eq_mm", "mm", "part of sd_eq_mm by modes on the rims and by the mean square of the "
+       "unseen shape"),
+    *sd("noise_aspect", "", "part of s_aspect by the noise of the outlines"),
+    *sd("fixed_aspect", "", "part of s_aspect by the mean square of the unseen shape"),
     *may("stretch", "", "difference of the logarithms of two horizontal extents beyond those of a "
          "spheroid (across the first camera's line of sight, minus along it)"),
-    *may("noise_stretch", "", "part of its standard deviation by the noise of the outlines"),
+    *sd("noise_stretch", "", "part of its standard deviation by the noise of the outlines"),
 )  # fmt: skip
 """What outlines tell of a bubble's shape; blank where one is missing, cut or covered."""
 

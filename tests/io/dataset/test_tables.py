@@ -208,7 +208,7 @@ def test_a_missing_mark_is_no_dot(tmp_path: Path) -> None:
 
 SIGMAS = [
     ("sigma_px", "0.0", "column sigma_px: is 0, not positive"),
-    ("sigma_px", "-0.1", "column sigma_px: is -0.1, not positive"),
+    ("sigma_px", "-0.1", "column sigma_px: is '-0.1', but a standard deviation is not negative"),
     ("sigma_px", "", "column sigma_px: is blank"),
     ("suu_px2,suv_px2,svv_px2", "1,2,1", "is no covariance"),
     ("suu_px2,suv_px2,svv_px2", "0,0,1", "is no covariance"),

@@ -11,8 +11,10 @@ import pandas as pd
 import pytest
 from places import ROOT
 
+from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_table
 from telerig.io.tables import calibration, run, smoothing
+from telerig.io.tables.declared import TABLES
 from telerig.io.tables.table import Table
 
 CAMERAS = ("left", "right")
@@ -77,3 +79,16 @@ def test_a_column_of_any_camera_has_its_unit() -> None:
         found = table.column(name)
         assert found is not None and found.unit == unit
     assert run.TRACKS.column("temperature_k") is None
+
+
+@pytest.mark.parametrize("table", TABLES, ids=[table.file for table in TABLES])
+def test_a_negative_standard_deviation_is_refused(tmp_path: Path, table: Table) -> None:
+    file, columns = tmp_path / "table.csv", table.of(CAMERAS)
+    names = [one.name for one in columns]
+    cells = {one.name: "0" if one.kind in ("number", "sd", "whole") else "a" for one in columns}
+    for one in columns:
+        if "standard deviation" in one.what or one.what.startswith("part of s"):
+            row = ",".join((cells | {one.name: "-0.5"}).values())
+            file.write_text(",".join(names) + f"\n{','.join(cells.values())}\n{row}\n")
+            with pytest.raises(InputError, match=rf"{file} row 3, column {one.name}.*negative"):
+                table.read(file, CAMERAS)

@@ -61,7 +61,6 @@ def batch(
     say which. 2: the input cannot be used. 130: interrupted; the same command continues.
     """
     from telerig.estimator.batch.batch import (
-        DONE,
         Journal,
         batch_words,
         local_executor,
@@ -71,6 +70,7 @@ def batch(
     )
     from telerig.estimator.batch.cluster import dask_executor
     from telerig.estimator.batch.jobs import check_options, jobs_of, shake_of_model, share_of
+    from telerig.io.results.batch import has_failed
     from telerig.io.results.manifest import check_place
 
     def tell(job: Job, record: dict[str, Any], done: int, of: int) -> None:
@@ -104,7 +104,7 @@ def batch(
         write_batch(records, out, report=report, again=typed_command())
     say(batch_words(records))
     say_written(out, report and of == 1)
-    if any(r["status"] != DONE for r in records):
+    if any(map(has_failed, records)):
         raise typer.Exit(EXIT_REJECTED)
 
 

@@ -43,8 +43,9 @@ def run(
     Exit code 0: all done. 1: a calibration was rejected or a run failed. 2: the dataset cannot be
     used. 130: interrupted; the same command continues.
     """
-    from telerig.estimator.batch.batch import DONE, FAILED, LEFT_OUT, batch_words, failure
+    from telerig.estimator.batch.batch import FAILED, KEPT, LEFT_OUT, batch_words, failure
     from telerig.estimator.batch.jobs import check_options, jobs_of, shake_of_model
+    from telerig.io.results.batch import has_failed
 
     calibrating, smoothing = shake_of_model(calibrating, smoothing, only or ())
     check_options(calibration, calibrating)
@@ -54,16 +55,16 @@ def run(
     )  # fmt: skip
     records: dict[str, dict[str, Any]] = {}
     for job in jobs:
-        missing = [name for name in job.needs if records[name]["status"] != DONE]
+        missing = [name for name in job.needs if has_failed(records[name])]
         result = failure(LEFT_OUT, f"needs {missing[0]}") if missing else _done(job, quiet)
         records[job.name] = {"kind": job.kind, "dataset": job.dataset, "run": job.run, **result}
-        if not missing and (not quiet or result["status"] != DONE):
+        if not missing and (not quiet or has_failed(result)):
             say(result["words"])
-            if result["status"] != FAILED:
+            if result["status"] not in (FAILED, KEPT):
                 say_written(job.results, report)
             say("")
     say(batch_words(list(records.values())))
-    if any(r["status"] != DONE for r in records.values()):
+    if any(map(has_failed, records.values())):
         raise typer.Exit(EXIT_REJECTED)
 
 

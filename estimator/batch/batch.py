@@ -24,26 +24,36 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from telerig.command_options import CalibrationOptions, SmoothingOptions, TrackingOptions
 from telerig.errors import InputError, TelerigWarning
-from telerig.estimator.batch.jobs import Job, check_run_name
+from telerig.estimator.batch.jobs import MAIN_RESULT, Job, check_run_name
 from telerig.estimator.batch.work import calibrate_dataset, smooth_run, track_run
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
-from telerig.io.results.batch import BatchFile, listed, verdict_and_flags, verdict_counts
+from telerig.io.results.batch import (
+    BatchFile,
+    has_failed,
+    listed,
+    verdict_and_flags,
+    verdict_counts,
+)
 from telerig.io.results.manifest import is_whole, read_manifest, replaced_results
 from telerig.io.results.smoothing import SmoothingFile
 from telerig.io.tables.smoothing import BATCH_BUBBLES, SUMMARY
 from telerig.progress import Progress
 from telerig.version import VERSION
 
-DONE, REJECTED, FAILED, CRASHED, LEFT_OUT = "done", "rejected", "failed", "crashed", "left out"
+if TYPE_CHECKING:
+    from telerig.estimator.calibration.result.calibration import Calibration
+
+DONE, KEPT, REJECTED = "done", "kept", "rejected"
+FAILED, CRASHED, LEFT_OUT = "failed", "crashed", "left out"
 _KEPT_OUTPUT = 2000
 _END_WITHIN_S = 5.0
 _CHILD = "telerig.scripts.batch_job"
@@ -61,19 +71,21 @@ def do_job(job: Job, stage: Progress | None = None) -> dict[str, Any]:
     """
     if job.only_report:
         return _draw(job)
+    if job.kept:
+        return _keep(job)
     return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
 
 
-def _refuse_rejected(job: Job) -> None:
-    """Raise InputError for a run whose dataset has a calibration that was rejected."""
-    from telerig.estimator.calibration.result.calibration import calibration_for
+def _own_calibration(job: Job) -> Calibration:
+    """Read the calibration of the job's dataset. Raises InputError for one that was rejected."""
+    from telerig.estimator.calibration.result.calibration import load_calibration
 
-    if job.calibration:
-        return
-    calibration, (file, *_) = calibration_for(Path(job.where), None)
+    file = Path(job.dataset) / "results" / "calibration" / MAIN_RESULT["calibrate"]
+    calibration = load_calibration(file)
     if calibration.rejection:
         todo = "correct its cause and calibrate again, or give another one (--calibration)"
         raise InputError(calibration.rejection, where=str(file), todo=todo)
+    return calibration
 
 
 def _draw(job: Job) -> dict[str, Any]:
@@ -184,22 +196,32 @@ def failure(status: str, words: str) -> dict[str, Any]:
     return {"status": status, "words": words, "figures": {}}
 
 
-def _calibrate(job: Job, stage: Progress | None) -> dict[str, Any]:
-    """Calibrate a dataset and write its results."""
+def _keep(job: Job) -> dict[str, Any]:
+    """Use the calibration that the dataset has."""
+    figures = _calibration_figures(_own_calibration(job))
+    return {"status": KEPT, "words": job.kept, "figures": figures}
+
+
+def _calibration_figures(found: Calibration) -> dict[str, Any]:
     from telerig.io.results.findings import objections
 
+    statistics = ("views", "dots_kept", "share_kept", "rms_px")
+    return {
+        "verdict": found.verdict["status"],
+        "flags": list(dict.fromkeys(one.code.name for one in objections(found.findings or ()))),
+        **{name: found.statistics.get(name) for name in statistics},
+        "lens_model": found.model.get("name"),
+    }
+
+
+def _calibrate(job: Job, stage: Progress | None) -> dict[str, Any]:
+    """Calibrate a dataset and write its results."""
     assert isinstance(job.options, CalibrationOptions)
     found = calibrate_dataset(
         Path(job.dataset), job.results, job.options, again=job.command, report=job.report,
         stage=stage,
     )  # fmt: skip
-    verdict, against = found.verdict, objections(found.findings or ())
-    figures = {
-        "verdict": verdict["status"],
-        "flags": list(dict.fromkeys(finding.code.name for finding in against)),
-        **{k: found.statistics[k] for k in ("views", "dots_kept", "share_kept", "rms_px")},
-        "lens_model": found.model.get("name"),
-    }
+    verdict, figures = found.verdict, _calibration_figures(found)
     rejected = verdict["status"] == "REJECTED"
     words = "\n".join(verdict["reasons"]) if rejected else found.report()
     return {"status": REJECTED if rejected else DONE, "words": words, "figures": figures}
@@ -212,7 +234,8 @@ def _track(job: Job, stage: Progress | None) -> dict[str, Any]:
     assert isinstance(job.options, TrackingOptions)
     begun, run = time.perf_counter(), Path(job.where)
     check_run_name(run)
-    _refuse_rejected(job)
+    if not job.calibration:
+        _own_calibration(job)
     summary = track_run(
         run, job.results, job.options, job.calibrations, again=job.command, report=job.report,
         stage=stage,
@@ -227,7 +250,8 @@ def _smooth(job: Job, stage: Progress | None) -> dict[str, Any]:
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
 
     assert isinstance(job.options, SmoothingOptions)
-    _refuse_rejected(job)
+    if not job.calibration:
+        _own_calibration(job)
     found = smooth_run(
         Path(job.where), job.results, job.options, job.calibrations, again=job.command,
         tracks=Path(job.tracks or job.results), report=job.report, stage=stage,
@@ -307,7 +331,7 @@ class Journal:
 def table_of(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return the journal's records of the jobs as a table, one row per job in the given order.
 
-    The columns are `COLUMNS`, `FIGURES` and words, which gives the reason of a failure.
+    The columns are `COLUMNS`, `FIGURES` and words, which gives the reason of any status but done.
     """
     rows = []
     for record in records:
@@ -376,8 +400,8 @@ def write_batch(
 
 
 def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return a summary in words: the number of jobs of each kind and status, and every failure with
-    what to do.
+    """Return a summary in words: the number of jobs of each kind and status, and why one
+    failed or was kept, with what to do.
 
     records : the journal's record of each job.
     """
@@ -455,7 +479,7 @@ def _known_record(
 ) -> dict[str, Any] | None:
     """Return the record of a job that need not be done, or None for a job that has to be done."""
     for needed in job.needs:
-        if records[needed]["status"] != DONE:
+        if has_failed(records[needed]):
             words = f"needs {needed}, which was {records[needed]['status']}"
             return journal.write(job, failure(LEFT_OUT, words))
     before = journal.done(job)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from telerig.command_options import (
     SmoothingOptions,
     TrackingOptions,
 )
-from telerig.errors import InputError, TelerigWarning
+from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.files.names import absent
 from telerig.io.results.folders.calibration import CalibrationResults
@@ -40,6 +39,7 @@ class Job:
     tracks : tracks.csv or its folder; "" for the run's results folder.
     report : whether to write report.html.
     only_report : whether to write nothing else.
+    kept : why the dataset is not calibrated, but has the calibration that it had before; else "".
     needs : names of the jobs that have to be done before.
     """
 
@@ -51,6 +51,7 @@ class Job:
     tracks: str = ""
     report: bool = True
     only_report: bool = False
+    kept: str = ""
     needs: tuple[str, ...] = ()
 
     @property
@@ -143,8 +144,8 @@ def jobs_of(
     """Return the jobs of a batch: calibration, tracking and smoothing of every dataset.
 
     A job stands after the jobs that it needs. A dataset without views of the target must have been
-    calibrated before. One that was, and has its views both as images and as dots.csv, is not
-    calibrated again, with a `TelerigWarning`.
+    calibrated before. One that was, and has no views or has them both as images and as dots.csv, is
+    not calibrated again: its calibration is `Job.kept`.
 
     calibration : a calibration.json to use for all datasets, none of which is then calibrated.
     calibrating, tracking, smoothing : options of the kinds of jobs; None for the defaults.
@@ -193,7 +194,7 @@ def jobs_of(
                 raise
             jobs.append(Job("calibrate", str(place), options["calibrate"], **shared))
     _check_only(jobs, only)
-    if not jobs:
+    if all(job.kept for job in jobs):
         raise InputError(
             "there is nothing to do: no dataset has a run, and none is to be calibrated",
             where=", ".join(map(str, places)),
@@ -270,16 +271,16 @@ def _jobs_of_one(
     calibrates = "calibrate" in kinds and not given
     data = load_dataset(place, need_views=calibrates and not calibrated_before)
     jobs = []
-    if calibrates and not data.views and (place / "calibration" / "dots.csv").is_file():
-        warnings.warn(
-            f"{place} has both images and calibration/dots.csv, so it is not calibrated; the "
-            "calibration that it has is used: to make it anew, give `telerig calibrate` --from "
-            "images or --from dots",
-            TelerigWarning,
-            stacklevel=2,
-        )
-    if data.views and calibrates:
-        jobs.append(Job("calibrate", str(place), options["calibrate"], **shared))
+    if calibrates:
+        kept = ""
+        if not data.views:
+            both = (place / "calibration" / "dots.csv").is_file()
+            kept = (
+                ("both images and calibration/dots.csv" if both else "no views of the target")
+                + " are there, so the calibration made before is used"
+                + both * "\n  -> to make it anew: `telerig calibrate` --from images or --from dots"
+            )
+        jobs.append(Job("calibrate", str(place), options["calibrate"], kept=kept, **shared))
     calibrated = tuple(job.name for job in jobs)
     for run in data.runs:
         if only and run not in only:

@@ -29,8 +29,9 @@ class JobRecord(Part):
 
     kind : "calibrate", "track" or "smooth".
     dataset, run : folder of the dataset, and name of the run; "" for a calibration.
-    status : "done", "rejected", "failed", "crashed" or "left out".
-    words : the result or the reason of a failure, in words.
+    status : "done", "rejected", "failed", "crashed", "left out", or "kept": a calibration that was
+        there before.
+    words : the result or the reason of any other status, in words.
     figures : numbers of the result by name, and its "verdict" and "flags" where it has them: those
         of a run, or the codes of the objections to a calibration.
     seconds : duration; None if it is not known.
@@ -73,9 +74,14 @@ def verdict_and_flags(record: Mapping[str, Any]) -> str:
     return " ".join([verdict_of(record), *(record.get("figures") or {}).get("flags", ())])
 
 
+def has_failed(record: Mapping[str, Any]) -> bool:
+    """Return whether a job has no result, or one that is not to be used."""
+    return record.get("status") not in ("done", "kept")
+
+
 def verdict_counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Return how often each verdict occurs among the jobs that were done."""
-    found = (verdict_of(record) for record in records if record.get("status") == "done")
+    """Return how often each verdict occurs among the jobs that did not fail."""
+    found = (verdict_of(record) for record in records if not has_failed(record))
     return dict(Counter(word for word in found if word))
 
 

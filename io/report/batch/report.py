@@ -29,6 +29,7 @@ from telerig.io.report.page.page import (
 )
 from telerig.io.report.plot.axes import colour_of
 from telerig.io.results.batch import (
+    has_failed,
     listed,
     short_names,
     verdict_and_flags,
@@ -68,7 +69,7 @@ def page_of(results: BatchResults, folder: Path) -> Page:
     """
     jobs = results.jobs
     names = short_names(str(j["dataset"]) for j in jobs)
-    failed = [j for j in jobs if j["status"] != _DONE]
+    failed = [j for j in jobs if has_failed(j)]
     runs = {(j["dataset"], j["run"]) for j in jobs if j["run"]}
     lost = {(j["dataset"], j["run"]) for j in failed if j["run"]}
     datasets = len({j["dataset"] for j in jobs})
@@ -106,7 +107,7 @@ SOUND = ("GOOD", "RESOLVED")
 
 
 def _colour(jobs: Sequence[Job]) -> str:
-    failed = [j for j in jobs if j["status"] != _DONE]
+    failed = [j for j in jobs if has_failed(j)]
     if jobs and len(failed) == len(jobs):
         return "rejected"
     return "good" if not failed and set(verdict_counts(jobs)) <= set(SOUND) else "usable"
@@ -115,13 +116,13 @@ def _colour(jobs: Sequence[Job]) -> str:
 def _words(jobs: Sequence[Job]) -> str:
     """Return what the page says first: whether jobs failed, and what the verdicts are."""
     words = []
-    if any(j["status"] != _DONE for j in jobs):
+    if any(map(has_failed, jobs)):
         words.append(
             "What failed, and what to do, is listed below; the same command tries it again and "
             "leaves the rest."
         )
     else:
-        words.append("Every job was done.")
+        words.append("No job failed.")
     for kind, subject in (("calibrate", "calibration"), ("smooth", "smoothed run")):
         counts = verdict_counts(j for j in jobs if j["kind"] == kind)
         if counts:
@@ -200,18 +201,18 @@ def _calibration(job: Job, folder: Path, names: Mapping[str, str]) -> Row:
     share: Any = found.get("share_kept")
     cells = (
         names[job["dataset"]],
-        verdict_and_flags(job) or str(job["status"]),
+        ", ".join(filter(None, (verdict_and_flags(job), str(job["status"]).replace("done", "")))),
         str(found.get("lens_model") or ABSENT),
         str(found.get("views") or ABSENT),
         f"{100 * share:.1f}%" if is_number(share) else ABSENT,
         _text(found.get("rms_px")),
     )
-    return Row(cells, faint=job["status"] != _DONE, link=_link(job, folder, "calibration"))
+    return Row(cells, faint=has_failed(job), link=_link(job, folder, "calibration"))
 
 
 def _run(name: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Row:
     tracked, smoothed = (kinds.get(k, {}).get("figures") or {} for k in ("track", "smooth"))
-    failed = [j for j in kinds.values() if j["status"] != _DONE]
+    failed = [j for j in kinds.values() if has_failed(j)]
     verdict = verdict_and_flags(kinds.get("smooth", {})) or (
         f"{failed[0]['kind']} {failed[0]['status']}" if failed else ABSENT
     )

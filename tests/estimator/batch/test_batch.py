@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.command_options import CalibrationOptions
-from telerig.errors import TelerigWarning
 from telerig.estimator.batch import batch as work
 from telerig.estimator.batch.batch import Journal, do_job, perform, run_batch
 from telerig.estimator.batch.jobs import Job, jobs_of, share_of
@@ -78,13 +77,24 @@ def test_a_dataset_is_calibrated_then_tracked_then_smoothed(datasets):
     assert Job.from_json(jobs[2].as_json()) == jobs[2]
 
 
-def test_what_is_not_calibrated_for_two_sources_is_said(tank_copy):
-    image = tank_copy / "calibration" / "left" / "0.tif"
-    image.parent.mkdir(exist_ok=True)
-    image.touch()
-    with pytest.warns(TelerigWarning, match=r"both images and calibration/dots\.csv.*--from dots"):
-        jobs = jobs_of([tank_copy])
-    assert [job.kind for job in jobs] == ["track", "smooth"]
+@pytest.mark.parametrize("reason", ["both images and calibration/dots.csv", "no views"])
+def test_a_dataset_that_is_not_calibrated_again_has_its_row(tank_copy, reason, monkeypatch):
+    monkeypatch.setattr(work, "_outcome", outcome_here)
+    if reason == "no views":
+        shutil.rmtree(tank_copy / "calibration")
+    else:
+        image = tank_copy / "calibration" / "left" / "0.tif"
+        image.parent.mkdir(exist_ok=True)
+        image.touch()
+    jobs, out = jobs_of([tank_copy]), tank_copy / "batch"
+    assert [job.kind for job in jobs] == ["calibrate", "track", "smooth"]
+    result = CliRunner().invoke(app, ["batch", str(tank_copy), "--out", str(out)])
+    assert result.exit_code == 0 and f"calibrate kept: {reason}" in result.output
+    row = pd.read_csv(out / "batch.csv").iloc[0]
+    assert row["status"] == "kept" and reason in row["words"] and row["verdict"] == "GOOD"
+    assert "GOOD, kept" in (out / "report.html").read_text()
+    result = CliRunner().invoke(app, ["run", str(tank_copy)])
+    assert result.exit_code == 0 and f"calibrate kept: {reason}" in result.output
 
 
 def test_with_a_calibration_given_nothing_is_calibrated(datasets):
@@ -237,8 +247,13 @@ def test_a_rejected_calibration_of_before_is_not_used_unseen(tank_copy):
     assert not good.rejection
     replace(good, findings=(Code.FEW_KEPT.found(share=0.5),)).save(folder)
     warning = "the calibration is REJECTED, so no number that follows from it is right: only 50%"
-    for kind in ("track", "smooth"):
-        words = ["run", str(tank_copy), "--only", kind, "--no-report", "--quiet"]
+    shutil.rmtree(tank_copy / "calibration")
+    for kind, only in (
+        ("track", ["--only", "track"]),
+        ("smooth", ["--only", "smooth"]),
+        ("calibrate", []),
+    ):
+        words = ["run", str(tank_copy), *only, "--no-report", "--quiet"]
         done = CliRunner().invoke(app, words)
         assert done.exit_code == 1 and f"{kind}: 1 failed" in done.output, done.output
         assert warning in done.output and "--calibration" in done.output

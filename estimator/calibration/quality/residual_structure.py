@@ -103,6 +103,8 @@ def _regions(
     count = np.bincount(index, minlength=CELLS**2)
     sums = np.stack([np.bincount(index, v, minlength=CELLS**2) for v in values.T], -1)
     full = count >= LEAST_IN_CELL
+    if not full.any():
+        return ResidualTest(Code.PATTERN, camera, 0.0, 1.0, {})
     mean = sums[full] / count[full, None]
     squares = float((count[full, None] * mean**2).sum())
     p = float(chdtrc(2 * full.sum(), squares))

@@ -41,6 +41,10 @@ HELD_MM = 1e-6
 HELD_SCALE = 1e-7
 """Relative standard deviation of a scale that is held to fix the depth of a camera's origin."""
 
+SETS_SCALE = 10.0
+"""How much more certain of the target's size a known distance is, at least, than all nominal places
+together: a print that is stretched as a whole then moves the scale by 1 % of the stretch."""
+
 _WALL = ("wall_x_rad", "wall_y_rad")
 
 DOTS_FREE = ("3d", "plane", "nominal")
@@ -291,15 +295,18 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
     if set(EDGE_COVARIANCE) <= set(table):
         parts = table[list(EDGE_COVARIANCE)].fillna(0.0).to_numpy(float)
         edge = parts[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        scale = np.array([c["scale_px_per_mm"] for c in cameras])[camera[order]]
-        edge_mm = np.sqrt(np.linalg.eigvalsh(edge)[:, 1]) / scale
+        px_per_mm = np.array([c["scale_px_per_mm"] for c in cameras])[camera[order]]
+        edge_mm = np.sqrt(np.linalg.eigvalsh(edge)[:, 1]) / px_per_mm
         sigma[:2] = 2 * [float(np.hypot(target.print_sigma_mm, np.median(edge_mm)))]
+    nominal, scale = target.nominal_mm(ids), known_scale(target, ids)
+    if scale is not None:
+        sigma[:2] = 2 * [_beside_distance(sigma[0], nominal, *scale[1:])]
     return Problem(
         cameras=tuple(cameras),
         target=target,
         views=views,
         dot_ids=ids,
-        nominal_mm=target.nominal_mm(ids),
+        nominal_mm=nominal,
         dot_sigma_mm=np.tile(sigma, (len(ids), 1)),
         view=view[order],
         camera=camera[order],
@@ -309,7 +316,7 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
         covariance_px2=covariance,
         weight=np.ones(len(table)),
         free=tuple(("scale_px_per_mm",) for _ in cameras),
-        scale=known_scale(target, ids),
+        scale=scale,
         plate_shift=np.zeros((len(views), len(cameras))),
     )
 
@@ -371,6 +378,20 @@ def known_scale(
     _check_distance(target)
     a, b = (int(np.searchsorted(ids, d)) for d in target.scale_dots)
     return (a, b), float(target.scale_distance_mm), float(target.scale_sigma_mm)
+
+
+def _beside_distance(
+    print_sigma_mm: float, nominal_mm: Array, distance_mm: float, distance_sigma_mm: float
+) -> float:
+    """Return the standard deviation of the dots' nominal places where a distance sets the scale.
+
+    Errors that all dots of a print share, a printer's stretch, do not average out: the N places
+    (N, 3) may tell as much of the target's size as a single one, and less than the distance by
+    `SETS_SCALE`.
+    """
+    spread = np.linalg.norm((nominal_mm - nominal_mm.mean(0))[:, :2])
+    needed_mm = SETS_SCALE * distance_sigma_mm / distance_mm * spread
+    return float(np.clip(needed_mm, print_sigma_mm, np.sqrt(len(nominal_mm)) * print_sigma_mm))
 
 
 def _check_distance(target: Target) -> None:

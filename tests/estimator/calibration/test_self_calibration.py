@@ -75,6 +75,31 @@ def test_dense_target(scene: Any) -> None:
     assert made.space_rms_um(calibration) < 1.0
 
 
+@pytest.mark.parametrize("scale_sigma_mm", [0.001, 0.01])
+def test_a_known_distance_sets_the_scale_of_a_stretched_print(
+    scale_sigma_mm: float, scene: Any
+) -> None:
+    """A printer made all dots lie 0.5 % farther from each other than they should."""
+    made = scene("dense", 1, views=4)
+    stated = tuple(pitch / 1.005 for pitch in made.target.pitch_mm)
+    target = replace(
+        made.target, pitch_mm=stated, print_sigma_mm=0.02, scale_sigma_mm=scale_sigma_mm
+    )
+    calibration = replace(made, target=target).calibrate("radial")
+    for camera in calibration.cameras:
+        truth = made.true_cameras[camera.name]["scale_px_per_mm"]
+        error = camera["scale_px_per_mm"] - truth
+        assert abs(error) < 3 * calibration.sd(f"{camera.name}.scale_px_per_mm")
+
+
+def test_one_camera_with_few_dots(scene: Any) -> None:
+    """No part of the image has enough dots to test for a pattern."""
+    made = scene("paper", 3, views=1).changed(lambda d: d[d["camera"] == "left"])
+    made = replace(made, cameras=made.cameras[:1], nominal_rotvec_deg=None)
+    calibration = made.calibrate()
+    assert "FEW_VIEWS" in codes(calibration)
+
+
 def test_unknown_dots_of_another_shape(paper: Any) -> None:
     """The nominal table may be off by more than a millimetre: only its order matters."""
     rng = np.random.default_rng(0)

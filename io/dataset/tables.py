@@ -491,7 +491,7 @@ def _check_named_once(table: pd.DataFrame, name: str, path: Path) -> None:
 
 
 def _check_axes(table: pd.DataFrame, path: Path) -> None:
-    """Raise InputError unless a_px and b_px (px) are positive semi-axes with a_px >= b_px."""
+    """Raise InputError unless a_px >= b_px (px) are positive semi-axes and angles are radians."""
     given = [name for name in ("a_px", "b_px", "angle_rad") if name in table]
     missing = [name for name in ("a_px", "b_px") if name not in given]
     if given and missing:
@@ -516,6 +516,14 @@ def _check_axes(table: pd.DataFrame, path: Path) -> None:
         lambda i: f"is {a[i]:g}, less than b_px = {b[i]:g}",
         "the long semi-axis comes first: swap them and turn angle_rad by pi/2",
     )
+    if "angle_rad" in table:
+        angle = table["angle_rad"].to_numpy()
+        rows.refuse(
+            np.abs(angle) > 2 * np.pi + 1e-6,
+            "angle_rad",
+            lambda i: f"is {angle[i]:g}, more than a whole turn in radians",
+            "give radians; degrees are multiplied by pi / 180",
+        )
 
 
 def _finished(table: pd.DataFrame, sigma_known: bool) -> pd.DataFrame:

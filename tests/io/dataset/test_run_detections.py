@@ -84,6 +84,7 @@ BAD_DETECTIONS = [
     ("twice", change("0,right", "0,left"), ("row 3, column particle", "'007' stands twice")),
     ("axes", change("5,4,0.1", "4,5,0.1"), ("row 2, column a_px", "less than b_px = 5")),
     ("one axis", change("5,4,0.1", "5,,0.1"), ("row 2, column a_px", "no pair of semi-axes")),
+    ("degrees", change("5,4,0.1", "5,4,35"), ("row 2, column angle_rad", "a whole turn in rad")),
     ("ragged", change(",x\n", "\n"), ("row 2", "has 10 cells, the header has 11")),
     ("no column", "frame,camera,u_px\n0,left,3\n", ("row 1", "missing column: v_px")),
     ("empty", "frame,camera,u_px,v_px\n", ("no rows below its header",)),

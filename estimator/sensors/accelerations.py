@@ -1,14 +1,16 @@
 """Accelerations of sensors, encoder and images on one time grid, smoothed by the same kernel.
 
 A position has noise that grows when it is differentiated, a reading has not. For both to be
-comparable, positions x and readings a are convolved with a cubic B-spline h of knot spacing w:
-h'' * x needs no derivative of the data, because h'' is a second difference of triangles (de Boor,
-A Practical Guide to Splines, ch. IX), and h * a is the same acceleration. Constants and straight
-lines vanish in h'' * x, and no sample farther away than 2 w matters, so gaps stay gaps.
+comparable, positions a frame apart become second differences, which are the acceleration averaged
+by a triangle of a frame's length to each side; these are averaged over frames with the weights of a
+cubic B-spline (de Boor, A Practical Guide to Splines, ch. IX). Readings are convolved with what
+this kernel is in continuous time: the B-spline, taken at the frames, times the triangle. Constants
+and straight lines vanish in the second differences, and no sample farther away than the kernel
+reaches matters, so gaps stay gaps.
 
-Between frames the images' positions are a straight line, which convolves what they show with a
-triangle. Everything that is compared with them is convolved with the same triangle: at 20 frames a
-second a motion of 7 Hz would otherwise seem to be a third smaller in the images.
+At the times of frames both are the same acceleration whatever its frequency. Between them they are
+not: positions at 20 Hz show a vibration at 19 Hz as one at 1 Hz, and so do readings that are
+compared with them at frames only.
 """
 
 from __future__ import annotations
@@ -58,21 +60,25 @@ class Grid:
         )
 
     @property
-    def triangle(self) -> Array:
-        """The triangular kernel (2 knots - 1,) of half-width w; its sum is 1."""
-        return _triangle(self.knots)
+    def at_frame(self) -> Bools:
+        """Whether each time (n,) is that of a frame, of a grid that begins at one."""
+        return np.asarray(np.arange(self.count) % self.pace == 0)
 
-    def noise_gain(self, step_s: float) -> float:
-        """Return the factor (1/s^2) from errors of positions to errors of smoothed accelerations.
+    @property
+    def weights(self) -> Array:
+        """The weights of steps about a time: a cubic B-spline at frames, 0 between; sum 1."""
+        half = _triangle(self.knots)
+        spline = np.convolve(half, half)
+        middle = len(spline) // 2
+        comb = np.where((np.arange(len(spline)) - middle) % self.pace == 0, spline, 0.0)
+        return np.asarray(comb / comb.sum())
 
-        It is the ratio of the standard deviations, for positions with independent errors that are
-        measured every ``step_s``.
-        """
-        second = np.zeros(4 * self.knots - 1)
-        for shift, factor in ((0, 1.0), (self.knots, -2.0), (2 * self.knots, 1.0)):
-            second[shift : shift + 2 * self.knots - 1] += factor * self.triangle
-        independent = max(step_s / self.step_s, 1.0)
-        return float(np.sqrt((second**2).sum() * independent)) / self.width_s**2
+    @property
+    def noise_gain(self) -> float:
+        """Return the factor (1/s^2) from errors of positions to errors of smoothed accelerations:
+        the ratio of the standard deviations, if positions have independent errors in each frame."""
+        taps = np.convolve(self.weights, _second_difference(self.pace))
+        return float(np.sqrt((taps**2).sum())) / (self.pace * self.step_s) ** 2
 
 
 @dataclass(frozen=True)
@@ -113,13 +119,9 @@ def of_positions(grid: Grid, t_s: ArrayLike, positions_mm: ArrayLike) -> Acceler
     there = _bridged(grid.t_s, t)
     centred = x - x.mean(0)
     even = np.stack([np.interp(grid.t_s, t, column) for column in centred.T], -1)
-    bridge = _bridge(grid, t)
-    reach, second = 2 * grid.knots - 1 + len(bridge) // 2, np.zeros_like(even)
-    known = _eroded(there, reach)
-    kernel = np.convolve(grid.triangle, bridge)
-    smooth = np.stack([np.convolve(column, kernel, "same") for column in even.T], -1)
-    k = grid.knots
-    second[k:-k] = (smooth[2 * k :] - 2 * smooth[k:-k] + smooth[: -2 * k]) / grid.width_s**2
+    kernel = np.convolve(grid.weights, _second_difference(grid.pace))
+    known = _eroded(there, len(kernel) // 2)
+    second = _convolved(even, kernel) / (grid.pace * grid.step_s) ** 2
     return Accelerations(grid, np.where(known[:, None], second, 0.0), known)
 
 
@@ -131,22 +133,29 @@ def of_readings(
     t_s : (N,) increasing times. readings_mm_s2 : (N, 3).
     covered_s : (M,) times that the result covers, those of masked samples included; t_s by default.
     """
-    from scipy.signal import fftconvolve
-
     t, reading = np.asarray(t_s, float), np.asarray(readings_mm_s2, float)
     own = grid.covering(t if covered_s is None else covered_s)
     even = _averaged(t, reading - np.median(reading, axis=0), own)
-    bridge = _bridge(grid, t)
-    known = _eroded(_bridged(own.t_s, t), 2 * grid.knots - 1 + len(bridge) // 2)
-    spline = np.convolve(np.convolve(grid.triangle, grid.triangle), bridge)
-    values = fftconvolve(even, spline[:, None], "same", axes=0) if own.count else even
+    kernel = np.convolve(grid.weights, _triangle(grid.pace))
+    known = _eroded(_bridged(own.t_s, t), len(kernel) // 2)
+    values = _convolved(even, kernel)
     return Accelerations(own, np.where(known[:, None], values, 0.0), known)
 
 
-def _bridge(grid: Grid, t: Array) -> Array:
-    """Return the triangle by which samples at t (N,) lack what a line between frames does."""
-    own = round(float(np.median(np.diff(t))) / grid.step_s) if len(t) > 1 else grid.pace
-    return _triangle(grid.pace) if own < grid.pace else np.ones(1)
+def _convolved(columns: Array, kernel: Array) -> Array:
+    """Return columns (n, D) convolved with a kernel of odd length."""
+    from scipy.signal import fftconvolve
+
+    if not columns.size:
+        return columns
+    return np.asarray(fftconvolve(columns, kernel[:, None], "same", axes=0))
+
+
+def _second_difference(steps: int) -> Array:
+    """Return the kernel (2 steps + 1,) of a second difference at a spacing of so many steps."""
+    kernel = np.zeros(2 * steps + 1)
+    kernel[[0, steps, -1]] = 1.0, -2.0, 1.0
+    return kernel
 
 
 def _averaged(t: Array, values: Array, grid: Grid) -> Array:

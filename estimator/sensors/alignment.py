@@ -40,13 +40,14 @@ class Channel:
     The readings of some accelerometers are fitted to it, to find their clocks, units and axes.
 
     values : (n,) acceleration in mm/s^2 at the times of the frames.
-    known : (n,) True where it is valid.
+    known : (n,) True where it is valid, at every ``pace``-th time at most.
     sensors : indices of the accelerometers whose readings are fitted to it.
     """
 
     values: Array
     known: Bools
     sensors: tuple[int, ...]
+    pace: int = 1
 
     def fitted(
         self,
@@ -63,7 +64,7 @@ class Channel:
         inside = (index >= 0) & (index < len(x)) & self.known
         both = np.column_stack([self.values, x[np.clip(index, 0, len(x) - 1)]])
         if whitening is not None:
-            both, inside = filtered(both, inside, whitening)
+            both, inside = filtered(both, inside, whitening, self.pace)
         y, design = both[inside, 0], both[inside, 1:]
         y, design = y - y.mean(), design - design.mean(0)
         return y, np.asarray(design @ np.linalg.lstsq(design, y, rcond=None)[0])
@@ -202,8 +203,8 @@ class _Profile:
         turn = slice(None, None, -1 if reverse else 1)
         x = np.concatenate([readings[s].values for s in channel.sensors], axis=1)[turn]
         there = np.all([readings[s].known for s in channel.sensors], axis=0)[turn]
-        x, usable = filtered(x, there, whitening)
-        whole, there = filtered(channel.values[:, None], channel.known, whitening)
+        x, usable = filtered(x, there, whitening, channel.pace)
+        whole, there = filtered(channel.values[:, None], channel.known, whitening, channel.pace)
         known = there.astype(float)
         if not there.any():
             none = np.zeros(len(x) + len(known) - 1)
@@ -238,11 +239,16 @@ class _Profile:
         return effective_size(y - fit, fit)
 
 
-def filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bools]:
-    """Filter columns (n, D); also return where all samples under the filter are known (n,)."""
-    reach = len(whitening) - 1
-    out = np.stack([np.convolve(c, whitening)[: len(c)] for c in values.T], -1)
-    unknown = np.convolve(~known, np.ones(reach + 1))[: len(known)] > 0.5
+def filtered(values: Array, known: Bools, whitening: Array, pace: int = 1) -> tuple[Array, Bools]:
+    """Filter columns (n, D); also return where all samples under the filter are known (n,).
+
+    pace : the filter's coefficients are so many samples apart.
+    """
+    reach = pace * (len(whitening) - 1)
+    taps, under = np.zeros((2, reach + 1))
+    taps[::pace], under[::pace] = whitening, 1.0
+    out = np.stack([np.convolve(c, taps)[: len(c)] for c in values.T], -1)
+    unknown = np.convolve(~known, under)[: len(known)] > 0.5
     unknown[:reach] = True
     return np.where(unknown[:, None], 0.0, out), ~unknown
 

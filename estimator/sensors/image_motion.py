@@ -62,7 +62,7 @@ def frame_grid(t_s: Array, noise_mm: float, sensed_rms: Callable[[Grid], float] 
     if sensed_rms is None:
         return grids[len(grids) // 2]
     for grid in grids:
-        if noise_mm * grid.noise_gain(pace) < _NOISE_SHARE * sensed_rms(grid):
+        if noise_mm * grid.noise_gain < _NOISE_SHARE * sensed_rms(grid):
             return grid
     return grids[-1]
 

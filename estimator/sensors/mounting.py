@@ -116,13 +116,13 @@ def check_motion(
     grid = frame_grid(t_s, 0.0, None)
     if sensor.clock != "frames" or sensor.unused_axes or grid.count < 8 * grid.knots:
         return []
-    carriage = of_positions(grid, t_s, position_mm[:, None])
+    carriage, frames = of_positions(grid, t_s, position_mm[:, None]), grid.at_frame
     felt = of_readings(grid, sensor.t_s, 1e3 * sensor.reading_m_s2)
     if felt.grid.count < 2:
         return []
-    expected = Expected(axis, carriage.values[:, 0], carriage.known)
+    expected = Expected(axis, carriage.values[frames, 0], carriage.known[frames])
     gravity = Gravity.of(sensor.reading_m_s2)
-    found = mounting(sensor.axes, gravity, up, *felt.at(grid.t_s), [expected])
+    found = mounting(sensor.axes, gravity, up, *felt.at(grid.t_s[frames]), [expected])
     if not found.clear:
         return []
     words = "with its axes as stated, it does not feel the acceleration that the encoder shows"

@@ -20,7 +20,6 @@ from telerig.estimator.smoothing.sensor_alignment.images import (
     SLOWEST_S,
     Images,
     along_axis,
-    at_frames,
     readings_on,
 )
 
@@ -52,7 +51,7 @@ def encoder_clock(problem: SmoothingProblem, images: Images) -> Alignment | None
     if images.encoder is None:
         return None
     channels = [
-        Channel(values, seen.known, (0,))
+        images.channel(values, seen.known, (0,))
         for c, _, seen in images.cameras
         if (values := along_axis(problem, c, seen)) is not None
     ]
@@ -113,9 +112,10 @@ def clock_of(
     sensors = [problem.accelerometers[i] for i in group]
     channels = images.channels(problem, group, images_alone=images_alone)
     for other in beside:
-        values, known = at_frames(images, other)
+        values, known = images.read_by(other)
         force = values @ other.axes
-        channels += [Channel(f, known, (n,)) for f in force.T for n in range(len(group))]
+        numbers = range(len(group))
+        channels += [images.channel(f, known, (n,)) for f in force.T for n in numbers]
     found = None
     if all(s.clock == "frames" for s in sensors):
         near = [near_frames(s, problem.t_s, _SHARED_S) for s in sensors]

@@ -10,7 +10,6 @@ from itertools import combinations
 
 import numpy as np
 
-from telerig.estimator.sensors.accelerations import Accelerations
 from telerig.estimator.sensors.alignment import Alignment
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.response import FAR_SDS, CommonGain, Response
@@ -68,7 +67,7 @@ def encoder_findings(
         if halted:
             return halted
     elif images.encoder is not None:
-        common = CommonGain.of(_responses(problem, images, images.encoder, sensors))
+        common = CommonGain.of(_responses(problem, images, sensors))
     if common is not None and (common.excludes(1.0) or common.opposed):
         gain = -common.gain if common.opposed else common.gain
         return [_gain_finding(gain, common.reach, common.gain * common.sd, where)]
@@ -89,15 +88,15 @@ def encoder_findings(
 
 
 def _responses(
-    problem: SmoothingProblem,
-    images: Images,
-    encoder: Accelerations,
-    sensors: Sequence[Accelerometer],
+    problem: SmoothingProblem, images: Images, sensors: Sequence[Accelerometer]
 ) -> list[Response]:
     """Return the responses of the cameras, as images and sensors show them, to the encoder."""
+    at_frame = images.at_frames()
+    encoder = at_frame.encoder
+    assert encoder is not None, "the caller has looked"
     shown = [
         (values, seen.known)
-        for camera, _, seen in images.cameras
+        for camera, _, seen in at_frame.cameras
         if (values := along_axis(problem, camera, seen)) is not None
     ]
     for sensor in sensors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -72,6 +72,24 @@ class Images:
                 encoder = None
         return cls(grid, tuple(cameras), encoder) if cameras else None
 
+    def at_frames(self) -> Images:
+        """Return the same with the accelerations at the F times of frames alone."""
+
+        def picked(shown: Accelerations) -> Accelerations:
+            at = shown.grid.at_frame
+            return replace(shown, values=shown.values[at], known=shown.known[at])
+
+        cameras = tuple((index, source, picked(seen)) for index, source, seen in self.cameras)
+        encoder = None if self.encoder is None else picked(self.encoder)
+        return replace(self, cameras=cameras, encoder=encoder)
+
+    def read_by(self, sensor: Accelerometer) -> tuple[Array, Bools]:
+        """Return a sensor's smoothed readings (n, 3) on the grid, and which are known (n,)."""
+        found = readings_on(self.grid, sensor)
+        if found.grid.count < 2:
+            return np.zeros((self.grid.count, 3)), np.zeros(self.grid.count, bool)
+        return found.at(self.grid.t_s)
+
     def channels(
         self, problem: SmoothingProblem, group: Sequence[int], *, images_alone: bool = False
     ) -> list[Channel]:
@@ -86,15 +104,20 @@ class Images:
         for camera, _, seen in self.cameras:
             mounted = tuple(number[i] for i in group if mounts[i] in (camera, CARRIAGE))
             if mounted:
-                out += [Channel(v, seen.known, mounted) for v in seen.values.T]
+                out += [self.channel(v, seen.known, mounted) for v in seen.values.T]
         for values, known, two in self.differences(problem):
             carried = [i for i in group if mounts[i] in two]
             if {mounts[i] for i in carried} == set(two):
-                out.append(Channel(values, known, tuple(number[i] for i in carried)))
+                out.append(self.channel(values, known, tuple(number[i] for i in carried)))
         if self.encoder is not None and not images_alone:
-            carriage = self.encoder
-            out += [Channel(carriage.values[:, 0], carriage.known, (number[i],)) for i in group]
+            values, known = self.encoder.values[:, 0], self.encoder.known
+            out += [self.channel(values, known, (number[i],)) for i in group]
         return out
+
+    def channel(self, values: Array, known: Bools, sensors: tuple[int, ...]) -> Channel:
+        """Return what sensors have to explain of values (n,): those at frames, where positions
+        show the same of any frequency as readings do."""
+        return Channel(values, known & self.grid.at_frame, sensors, self.grid.pace)
 
     def differences(
         self, problem: SmoothingProblem
@@ -148,8 +171,6 @@ def readings_on(grid: Grid, sensor: Accelerometer) -> Accelerations:
 
 
 def at_frames(images: Images, sensor: Accelerometer) -> tuple[Array, Bools]:
-    """Return a sensor's smoothed readings (n, 3) on the images' grid, and which are known (n,)."""
-    found = readings_on(images.grid, sensor)
-    if found.grid.count < 2:
-        return np.zeros((images.grid.count, 3)), np.zeros(images.grid.count, bool)
-    return found.at(images.grid.t_s)
+    """Return a sensor's smoothed readings (F, 3) at the times of frames, and which are known."""
+    values, known = images.read_by(sensor)
+    return values[images.grid.at_frame], known[images.grid.at_frame]

@@ -40,6 +40,7 @@ def mounting_findings(
         if s.confirmed and not s.unused_axes and s.name not in without
     ]
     read = {s.name: at_frames(images, s) for s in sensors}
+    images = images.at_frames()
     exchanged = _exchanged(problem, images, sensors, read, log_evidence)
     if exchanged is not None:
         return [exchanged]

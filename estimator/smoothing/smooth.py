@@ -23,6 +23,7 @@ from telerig.estimator.smoothing.learning.cross_validation import learning_recor
 from telerig.estimator.smoothing.learning.default_priors import (
     adapted,
     default_model,
+    encoder_noise_mm,
     guessed_modes,
 )
 from telerig.estimator.smoothing.learning.learn import learn
@@ -605,6 +606,14 @@ def problem_of(
         record = replace(record, position_mm=record.position_mm / (1 + travel.scale))
     positions = np.zeros(len(at_frames))
     if record is not None:
+        stated, encoder_sigma = encoder_sigma, encoder_noise_mm(record, encoder_sigma)
+        if encoder_sigma > stated:
+            words = (
+                f"the readings scatter by {encoder_sigma:.2g} mm about a smooth motion, and "
+                f"position_sigma_mm is {stated:.2g}: counts are coarse, or times not exact"
+            )
+            todo = f"state position_sigma_mm = {encoder_sigma:.2g}, which is used, in rig.toml"
+            findings.append(Finding(words, files[0], todo))
         positions = np.interp(at_frames, record.t_s, record.position_mm)
     marks, seen, found = references_of(references, cameras, at_frames, positions, axis)
     findings += found

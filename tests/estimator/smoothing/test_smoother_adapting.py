@@ -18,6 +18,7 @@ from telerig.estimator.smoothing.learning.default_priors import (
     acceleration_rms,
     adapted,
     default_model,
+    encoder_noise_mm,
     fitted_floor,
     fitted_variance,
     rescaled,
@@ -280,3 +281,18 @@ def test_carriage_that_a_pump_shakes_may_move_as_the_encoder_reads() -> None:
     assert acceleration_rms(Stage(t[kept], place[kept]), 0.005) == pytest.approx(rms, rel=0.15)
     bursts = Stage(t[kept] + 100.0 * (t[kept] > t[-1] / 2), place[kept])
     assert acceleration_rms(bursts, 0.005) == pytest.approx(rms, rel=0.15)
+
+
+@pytest.mark.parametrize("kind", ["as stated", "inexact times", "coarse counts", "pump", "slow"])
+def test_noise_of_an_encoder_is_what_its_readings_show(kind: str) -> None:
+    rng, rate_hz = np.random.default_rng(5), 20.0 if kind == "slow" else 500.0
+    t = np.arange(600) / rate_hz
+    place = 280.0 * t + 0.1 * np.sin(2 * np.pi * 15.0 * t) + rng.normal(0, 0.005, 600)
+    if kind == "pump":  # a vibration is no noise
+        place += 0.05 * np.sin(2 * np.pi * 98.0 * t)
+    if kind == "coarse counts":
+        place = 0.1 * np.round(place / 0.1)
+    if kind == "inexact times":
+        t = t + rng.normal(0, 1e-4, 600)
+    true = {"inexact times": 0.028, "coarse counts": 0.029}.get(kind, 0.005)
+    assert encoder_noise_mm(Stage(t, place), 0.005) == pytest.approx(true, rel=0.2)

@@ -35,7 +35,6 @@ _LEAST_PARTS = 3
 _REACH = 2
 """So many lags from the best line, each part has its own peak."""
 
-_LONG_S = 1.2
 _WINDOW_S = 3.0
 _MOST_DRIFT = 0.02
 """No clock's rate is off by a larger share."""
@@ -44,8 +43,7 @@ _MOST_DRIFT = 0.02
 def without_drift(
     sensors: Sequence[Accelerometer], group: list[int], problem: SmoothingProblem, images: Images
 ) -> tuple[Sequence[Accelerometer], list[Finding]]:
-    """Correct the drift of a clock if the run is long enough and this explains the images
-    better."""
+    """Correct the drift of a clock if this explains the images clearly better."""
     t = problem.t_s
     channels = images.channels(problem, group)
 
@@ -55,7 +53,7 @@ def without_drift(
         return -np.inf if found is None else found.log_ratio
 
     best = sensors
-    for _ in range(MOST_REFINEMENTS if t[-1] - t[0] >= _LONG_S else 0):
+    for _ in range(MOST_REFINEMENTS):
         corrected = _corrected_drift(best, t, channels, images)
         needed = LEAST_LOG_RATIO if best is sensors else 0.0
         if corrected is None or not log_ratio(corrected) > log_ratio(best) + needed:

@@ -73,16 +73,21 @@ def test_a_clock_that_keeps_time_has_no_drift(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "scenario", "information", "within"),
-    [(905, "S6", "references", 0.02), *long((907, "S3", "one", 0.1))],
-)
-def test_a_wrong_rate_is_found(seed: int, scenario: str, information: str, within: float) -> None:
+    ("seed", "scenario", "information", "within", "frames"),
+    [
+        (905, "S6", "references", 0.02, None), (1, "S2", "one", 0.1, 300),
+        *long((907, "S3", "one", 0.1, None)),
+    ],
+)  # fmt: skip
+def test_a_wrong_rate_is_found(
+    seed: int, scenario: str, information: str, within: float, frames: int | None
+) -> None:
     """Beside one bubble of S3, the last third of the run alone shows no offset."""
 
     def fast(_: str, t: Any, reading: Any) -> Any:
         return t[0] + 1.01 * (t - t[0]), reading
 
-    sensors, said = placed(seed, information, fast, scenario=scenario)
+    sensors, said = placed(seed, information, fast, scenario=scenario, frames=frames)
     for sensor in sensors.values():
         assert sensor.drift_ppm == pytest.approx(1e6 * (1 - 1 / 1.01), rel=within)
     assert sum("drifts by +" in f.warning for f in said) == 2

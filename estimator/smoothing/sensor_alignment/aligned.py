@@ -24,7 +24,6 @@ from telerig.estimator.smoothing.sensor_alignment.clocks import (
     clocks_by_images,
     encoder_clock,
     in_place,
-    keeps_clock,
     placed_on_frames,
     sure,
     unaligned,
@@ -102,10 +101,10 @@ def _aligned(
             findings += found
             if sensor is not None:
                 placed[index] = sensor
-        free = [i for i in group if not keeps_clock(problem.accelerometers[i], clock)]
-        if clock is not None and clock.unique and free:
-            corrected, found = without_drift([placed[i] for i in free], free, problem, images)
-            placed.update(zip(free, corrected))
+        known = [i for i in group if i in placed and placed[i].confirmed]
+        if known:
+            corrected, found = without_drift([placed[i] for i in known], known, problem, images)
+            placed.update(zip(known, corrected))
             findings += found
     problem = _with(problem, [placed[i] for i in sorted(placed)])
     problem = _with_late_images(problem, late)

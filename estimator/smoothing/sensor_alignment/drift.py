@@ -14,6 +14,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.sensors.alignment import (
+    BEYOND,
     LEAST_LOG_RATIO,
     LEAST_SAMPLES,
     Alignment,
@@ -43,7 +44,8 @@ _MOST_DRIFT = 0.02
 def without_drift(
     sensors: Sequence[Accelerometer], group: list[int], problem: SmoothingProblem, images: Images
 ) -> tuple[Sequence[Accelerometer], list[Finding]]:
-    """Correct the drift of a clock if this explains the images clearly better."""
+    """Correct the drift of a clock if this explains the images clearly better, and by more than
+    chance if it is said to be that of the frames."""
     t = problem.t_s
     channels = images.channels(problem, group)
 
@@ -52,13 +54,14 @@ def without_drift(
         found = aligned_by(images, channels, near)
         return -np.inf if found is None else found.log_ratio
 
-    best = sensors
+    best, shared = sensors, any(s.clock == "frames" for s in sensors)
+    reached = log_ratio(sensors)
+    needed = max(reached + LEAST_LOG_RATIO, BEYOND * reached if shared else -np.inf)
     for _ in range(MOST_REFINEMENTS):
         corrected = _corrected_drift(best, t, channels, images)
-        needed = LEAST_LOG_RATIO if best is sensors else 0.0
-        if corrected is None or not log_ratio(corrected) > log_ratio(best) + needed:
+        if corrected is None or not (reached := log_ratio(corrected)) > needed:
             break
-        best = corrected
+        best, needed = corrected, reached
     if best is sensors:
         return sensors, []
     words = (

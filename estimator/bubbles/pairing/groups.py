@@ -204,9 +204,7 @@ def _view(table: pd.DataFrame, camera: Camera, axes: Array, wander: float) -> Vi
         *(outline_extent(table, across[:, k]) for k in range(len(axes)))
     ))  # fmt: skip
     known, scatter_factor, unsure = _trust(table)
-    a, b, measured, contrast, d_eq = columns(
-        table, ["a_px", "b_px", "area_px2", "contrast", "d_eq_px"]
-    ).T
+    a, b, measured, contrast = columns(table, ["a_px", "b_px", "area_px2", "contrast"]).T
     area = np.where(measured > 0, measured, np.pi * a * b)[:, None]
     area_mm2 = area * np.abs(np.linalg.det(mm_by_px))[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -215,7 +213,7 @@ def _view(table: pd.DataFrame, camera: Camera, axes: Array, wander: float) -> Vi
         log_contrast = np.log(contrast)
     back = np.linalg.pinv(across, rcond=_SAME_AXIS)
     middle = uv + (back @ middle_mm[..., None])[..., 0]
-    shape_px2 = np.square(wander * np.nan_to_num(d_eq) / 2)[:, None, None]
+    shape_px2 = wander**2 / np.pi * np.nan_to_num(area)[:, :, None]
     hidden_px2 = np.square(unsure * np.nan_to_num(a))[:, None, None]
     free = np.eye(2) - back @ across
     return View(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -102,6 +102,7 @@ def fit_bodies(
     shapes: Shapes = DEFAULT_SHAPES,
     *,
     gap_sigma_px: float = 0.0,
+    unsized_px2: Array | float = 0.0,
 ) -> Bodies:
     """Estimate centre of volume, size and shape of B bodies.
 
@@ -112,11 +113,17 @@ def fit_bodies(
     shapes : what the run tells of its bubbles (`learn_shapes`).
     gap_sigma_px : standard deviation of the difference between two views that shake or errors of
         the calibration can cause, and not the shape.
+    unsized_px2 : (C,) variance by the unknown shape of the centres of a body without any outline.
     """
     bodies = Bodies.none(*seen.shape)
+    spread = np.broadcast_to(unsized_px2, seen.shape[1])[:, None, None] * np.eye(2)
     for rows, used in grouped(sightings, seen):
-        views = Views.of(sightings.take(seen[np.ix_(rows, used)]), [cameras[c] for c in used])
+        own = sightings.take(seen[np.ix_(rows, used)])
+        added = np.where(np.any(own.shaped, axis=-1)[:, None, None, None], 0.0, spread[used])
+        own = replace(own, covariance_px2=own.covariance_px2 + added)
+        views = Views.of(own, [cameras[c] for c in used])
         points, noise, miss = views.triangulated
+        bodies.shift_covariance_px2[np.ix_(rows, used)] = added
         bodies._put(
             rows, points_mm=points, covariance_mm2=noise, silhouette_points_mm=points,
             used="silhouettes", ray_miss_mm=miss,
@@ -126,7 +133,7 @@ def fit_bodies(
             continue
         rows, views = rows[shaped], views.take(shaped)
         shape = best_shape(views, shapes, up)
-        stretch, own = _stretch(shape, cameras[0], up)
+        stretch, stretch_noise = _stretch(shape, cameras[0], up)
         noise = np.diagonal(shape.noise, axis1=1, axis2=2)[:, :2]
         centre = volume_centre(views, shape, shapes, gap_sigma_px)
         known = np.asarray(views.sightings.whole.any(-1))
@@ -136,7 +143,7 @@ def fit_bodies(
             used=np.where(known, "volume", "silhouettes"),
             d_eq_mm=2 * np.exp(shape.value[:, 0]), aspect=np.exp(shape.value[:, 1]),
             frame=shape.frame, shape_covariance=shape.covariance, chi2=shape.chi2,
-            stretch=stretch, noise=np.column_stack([noise, own]), fixed=shape.fixed,
+            stretch=stretch, noise=np.column_stack([noise, stretch_noise]), fixed=shape.fixed,
             entire=views.sightings.all_entire,
         )  # fmt: skip
         bodies.shift_covariance_px2[np.ix_(rows, used)] = centre.shift_covariance_px2

@@ -177,7 +177,7 @@ class RowMaker:
         gap_px = np.hypot(self.model.mean("frame_px"), self.model.mean("gap_rms_px"))
         fitted = fit_bodies(
             seen.sightings, rows, self.cameras, self.up, self.shapes,
-            gap_sigma_px=float(gap_px),
+            gap_sigma_px=float(gap_px), unsized_px2=self.model.scatter_px2(),
         )  # fmt: skip
         bodies.put(some, fitted)
 

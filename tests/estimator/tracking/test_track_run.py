@@ -33,6 +33,7 @@ from telerig.io.results.stale import stale
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
+from telerig.io.tables.table import COVARIANCE, PIXEL, PIXEL_COVARIANCE, POINT
 from telerig.scripts.main import app
 
 FRAMES = 10
@@ -100,6 +101,32 @@ def test_detections_alone_give_the_same_track(rise: Path, whole: Tracks, tmp_pat
     names = ["left_u_px", "left_v_px", "right_u_px", "right_v_px"]
     assert np.allclose(again.table[names], whole.table[names])
     assert set(again.table["centre"]) == {"silhouettes"}
+
+
+def test_centres_without_outlines_are_as_good_as_their_ray_misses_say(rise: Path) -> None:
+    """Their shapes shift them by 0.4 px, four times the noise that is stated."""
+    run, cameras = telerig.load_run(rise / "runs" / "rise"), truth_calibration().cameras
+    rng, rows, truth = np.random.default_rng(3), [], []
+    start = np.array([[x, 2.0 * x, z] for x in (-6.0, 0.0, 6.0) for z in (-5.0, 5.0)])
+    for frame in range(FRAMES):
+        truth.append(start - [0.0, 0.5 * frame, 0.0])
+        for camera in cameras:
+            for u, v in camera.project(truth[-1]) + 0.4 * rng.standard_normal((len(start), 2)):
+                rows.append((frame, camera.name, u, v, 0.01, 0.0, 0.01, ""))
+    names = ["frame", "camera", *PIXEL, *PIXEL_COVARIANCE, "particle"]
+    given = pd.DataFrame(rows, columns=names)
+    found = telerig.track(
+        replace(run, detections=given, source="detections"), truth_calibration()
+    ).table
+    every = np.stack(truth)[found["frame"]] - found[[*POINT]].to_numpy()[:, None]
+    error = every[np.arange(len(found)), np.linalg.norm(every, axis=2).argmin(1)]
+    covariance = np.zeros((len(found), 3, 3))
+    covariance[:, *np.triu_indices(3)] = found[[*COVARIANCE]].to_numpy()
+    covariance += np.triu(covariance, 1).mT
+    nees = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).mean()
+    assert len(found) == FRAMES * len(start)
+    assert 0.6 < nees < 4.0, "19 with the stated noise alone"
+    assert (found["left_suu_px2"] > 0.04).all()
 
 
 @pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.6, 0.0, -0.8)])

@@ -299,15 +299,14 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
         edge_mm = np.sqrt(np.linalg.eigvalsh(edge)[:, 1]) / px_per_mm
         sigma[:2] = 2 * [float(np.hypot(target.print_sigma_mm, np.median(edge_mm)))]
     nominal, scale = target.nominal_mm(ids), known_scale(target, ids)
-    if scale is not None:
-        sigma[:2] = 2 * [_beside_distance(sigma[0], nominal, *scale[1:])]
+    stretched = _stretch_factor(sigma[0], nominal, None if scale is None else scale[1:])
     return Problem(
         cameras=tuple(cameras),
         target=target,
         views=views,
         dot_ids=ids,
         nominal_mm=nominal,
-        dot_sigma_mm=np.tile(sigma, (len(ids), 1)),
+        dot_sigma_mm=np.tile(stretched * np.array(sigma), (len(ids), 1)),
         view=view[order],
         camera=camera[order],
         dot=np.searchsorted(ids, table["dot"].to_numpy(np.int64)),
@@ -380,18 +379,23 @@ def known_scale(
     return (a, b), float(target.scale_distance_mm), float(target.scale_sigma_mm)
 
 
-def _beside_distance(
-    print_sigma_mm: float, nominal_mm: Array, distance_mm: float, distance_sigma_mm: float
+def _stretch_factor(
+    print_sigma_mm: float, nominal_mm: Array, distance_mm: tuple[float, float] | None
 ) -> float:
-    """Return the standard deviation of the dots' nominal places where a distance sets the scale.
+    """Return by how much the priors on the dots' places are widened, as all may be stretched.
 
-    Errors that all dots of a print share, a printer's stretch, do not average out: the N places
-    (N, 3) may tell as much of the target's size as a single one, and less than the distance by
-    `SETS_SCALE`.
+    Errors that all dots of a print share do not average out: N places (N, 3) tell as much of the
+    target's size as a single one does, and, beside a known distance, more only while that is less
+    than the distance tells by `SETS_SCALE`. Flatness is widened alike: a smaller target has less
+    relief, which would make it seem more likely.
+
+    distance_mm : the known distance and its standard deviation; None without.
     """
-    spread = np.linalg.norm((nominal_mm - nominal_mm.mean(0))[:, :2])
-    needed_mm = SETS_SCALE * distance_sigma_mm / distance_mm * spread
-    return float(np.clip(needed_mm, print_sigma_mm, np.sqrt(len(nominal_mm)) * print_sigma_mm))
+    needed = np.inf
+    if distance_mm is not None:
+        spread_mm = float(np.linalg.norm((nominal_mm - nominal_mm.mean(0))[:, :2]))
+        needed = SETS_SCALE * distance_mm[1] / distance_mm[0] * spread_mm / print_sigma_mm
+    return float(np.clip(needed, 1.0, np.sqrt(len(nominal_mm))))
 
 
 def _check_distance(target: Target) -> None:

@@ -75,21 +75,35 @@ def test_dense_target(scene: Any) -> None:
     assert made.space_rms_um(calibration) < 1.0
 
 
-@pytest.mark.parametrize("scale_sigma_mm", [0.001, 0.01])
-def test_a_known_distance_sets_the_scale_of_a_stretched_print(
-    scale_sigma_mm: float, scene: Any
+@pytest.mark.parametrize(("scale_sigma_mm", "stretch"), [(1e-3, 5e-3), (0.01, 5e-3), (None, 1e-3)])
+def test_the_scale_of_a_stretched_print(
+    scale_sigma_mm: float | None, stretch: float, scene: Any
 ) -> None:
-    """A printer made all dots lie 0.5 % farther from each other than they should."""
+    """A printer made all dots lie farther from each other than they should.
+
+    A known distance sets the scale; without one the scale is as good as a dot's place.
+    """
     made = scene("dense", 1, views=4)
-    stated = tuple(pitch / 1.005 for pitch in made.target.pitch_mm)
-    target = replace(
-        made.target, pitch_mm=stated, print_sigma_mm=0.02, scale_sigma_mm=scale_sigma_mm
-    )
+    pitch_mm = tuple(pitch / (1 + stretch) for pitch in made.target.pitch_mm)
+    target = replace(made.target, pitch_mm=pitch_mm, print_sigma_mm=0.02)
+    if scale_sigma_mm is None:
+        target = replace(target, scale_dots=None, scale_distance_mm=None)
+    else:
+        target = replace(target, scale_sigma_mm=scale_sigma_mm)
     calibration = replace(made, target=target).calibrate("radial")
     for camera in calibration.cameras:
         truth = made.true_cameras[camera.name]["scale_px_per_mm"]
         error = camera["scale_px_per_mm"] - truth
         assert abs(error) < 3 * calibration.sd(f"{camera.name}.scale_px_per_mm")
+
+
+def test_the_relief_of_many_dots_does_not_make_the_target_smaller(scene: Any) -> None:
+    rough = replace(preset("dense").target, print_sigma_mm=0.02, flatness_sigma_mm=0.02)
+    made = scene("dense", 2, views=4, target=rough)
+    target = replace(made.target, scale_dots=None, scale_distance_mm=None)
+    calibration = replace(made, target=target).calibrate("radial")
+    size = np.prod(calibration.statistics["target_stretch"]) ** 0.5
+    assert size == pytest.approx(1.0, abs=5e-5)
 
 
 def test_one_camera_with_few_dots(scene: Any) -> None:

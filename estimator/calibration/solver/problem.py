@@ -403,10 +403,11 @@ def _check_distance(target: Target) -> None:
     assert target.scale_dots is not None and target.scale_distance_mm is not None
     ends = target.nominal_mm(np.array(target.scale_dots))
     nominal = float(np.linalg.norm(ends[1] - ends[0]))
-    tolerance = IMPOSSIBLE_SD * np.sqrt(2) * target.print_sigma_mm
+    tolerance = IMPOSSIBLE_SD * np.hypot(np.sqrt(2) * target.print_sigma_mm, target.scale_sigma_mm)
     if abs(nominal - target.scale_distance_mm) > tolerance:
         raise CalibrationError(
-            f"the distance of dots {target.scale_dots} is {target.scale_distance_mm:g} mm, but "
+            f"the distance of dots {target.scale_dots} is {target.scale_distance_mm:g} mm, good to "
+            f"{target.scale_sigma_mm:g} mm, but "
             f"their nominal places are {nominal:.4g} mm apart and good to "
             f"{target.print_sigma_mm:g} mm each",
             where="rig.toml [target]",

@@ -12,6 +12,7 @@ import pytest
 from finding_codes import codes, only
 
 from telerig.errors import CalibrationError, DetectionError, InputError
+from telerig.estimator.calibration.solver.problem import problem_from_dots
 from telerig.io.results.findings import Code
 from telerig.rig.pose import Pose
 
@@ -142,6 +143,15 @@ def test_an_impossible_scale_distance_is_refused(paper: Any) -> None:
     made = replace(paper, target=replace(paper.target, scale_distance_mm=62.6))
     with pytest.raises(CalibrationError, match=r"62\.6 mm.*nominal places are 31\.3"):
         made.calibrate("radial")
+
+
+def test_a_distance_is_not_impossible_that_was_measured_roughly(paper: Any) -> None:
+    """A precise plate and a calliper, whose reading is two standard deviations off."""
+    nominal = float(np.linalg.norm(np.diff(paper.target.nominal_mm([0, 14]), axis=0)))
+    target = replace(
+        paper.target, print_sigma_mm=1e-3, scale_sigma_mm=0.02, scale_distance_mm=nominal + 0.04
+    )
+    problem_from_dots(paper.dots, paper.cameras, target)
 
 
 def with_value(column: str, value: Any) -> Callable[[pd.DataFrame], pd.DataFrame]:

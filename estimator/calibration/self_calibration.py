@@ -114,9 +114,8 @@ def self_calibrate(
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
-    known = [*findings, *pre.findings]
-    if dots_free == "nominal":
-        known += checks.unused_distance(problem)
+    distance = checks.about_distance(problem, held=dots_free == "nominal")
+    known = [*findings, *pre.findings, *distance]
     if target.symmetry_order() > 1:
         problem, turned = symmetric_target.number_consistently(problem, nominal)
         known += turned

@@ -230,6 +230,16 @@ class Code(Enum):
         "{nominal_mm:.6g} mm apart where rig.toml states a measured distance of {stated_mm:.6g} mm",
         "Give --dots 3d or --dots plane for the measured distance to set the scale",
     )
+    DISTANCE_FAR = Kind(
+        _USABLE,
+        "scale_distance_mm, which sets the scale, is {stated_mm:.6g} mm where the nominal places "
+        "of its dots are {nominal_mm:.6g} mm apart: {deviations:.0f} standard deviations of what "
+        "rig.toml states of both",
+        "Measure the distance again, between the centres of the two dots of scale_dots; if it is "
+        "right, the print is stretched: correct pitch_mm, or raise print_sigma_mm",
+        5.0,
+        "standard deviations: chance gives as much once in two million cases",
+    )
     EXCHANGED = Kind(
         _USABLE,
         "{cameras} seem to be exchanged: their scales are {first:.3f} and {second:.3f} px/mm, "

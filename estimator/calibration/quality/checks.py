@@ -173,13 +173,22 @@ def loose_offsets(problem: Problem, state: State) -> list[Finding]:
     return [Code.OFFSET.found(cameras=problem.cameras[c].name) for c in cameras]
 
 
-def unused_distance(problem: Problem) -> list[Finding]:
-    """Return the finding that a measured distance has no effect, for dots at nominal places."""
+def about_distance(problem: Problem, *, held: bool) -> list[Finding]:
+    """Return the finding that a measured distance has no effect, or contradicts the nominal places.
+
+    held : whether the dots are held at their nominal places.
+    """
     if problem.scale is None:
         return []
-    (a, b), stated, _ = problem.scale
+    (a, b), stated, sd = problem.scale
     nominal = float(np.linalg.norm(problem.nominal_mm[a] - problem.nominal_mm[b]))
-    return [Code.DISTANCE_UNUSED.found(nominal_mm=nominal, stated_mm=stated)]
+    if held:
+        return [Code.DISTANCE_UNUSED.found(nominal_mm=nominal, stated_mm=stated)]
+    expected = np.hypot(sd, np.sqrt(2) * problem.target.print_sigma_mm)
+    deviations = abs(stated - nominal) / float(expected)
+    if deviations < Code.DISTANCE_FAR.limit:
+        return []
+    return [Code.DISTANCE_FAR.found(stated_mm=stated, nominal_mm=nominal, deviations=deviations)]
 
 
 def scales_beside_nominal(problem: Problem, state: State) -> list[Finding]:

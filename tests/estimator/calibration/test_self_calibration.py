@@ -97,6 +97,15 @@ def test_the_scale_of_a_stretched_print(
         assert abs(error) < 3 * calibration.sd(f"{camera.name}.scale_px_per_mm")
 
 
+def test_a_distance_measured_between_edges_is_no_longer_good(paper: Any) -> None:
+    stated = paper.target.scale_distance_mm
+    assert "DISTANCE_FAR" not in codes(paper.calibrate("radial"))
+    wrong = replace(paper, target=replace(paper.target, scale_distance_mm=stated + 0.3))
+    found = wrong.calibrate("radial")
+    assert only(found, Code.DISTANCE_FAR).numbers["deviations"] == pytest.approx(10.6, abs=1)
+    assert found.verdict["status"] == "USABLE, with warnings"
+
+
 def test_the_relief_of_many_dots_does_not_make_the_target_smaller(scene: Any) -> None:
     rough = replace(preset("dense").target, print_sigma_mm=0.02, flatness_sigma_mm=0.02)
     made = scene("dense", 2, views=4, target=rough)

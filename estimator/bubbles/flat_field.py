@@ -18,6 +18,8 @@ _CLIPPED_SHARE = 0.5
 _WHITE_SHARE = 0.98
 _EVERY_PX = 16
 _LIT_SHARE, _BRIGHTEST = 0.6, 0.95
+_UNLIT_SHARE = 0.05
+"""Below this share of the lit screen the background is black: no shadow shows before it."""
 BYTE_SCALE = 255.0
 """Grey level of white in an image of 8 bits."""
 SCALES_OF_16_BITS = tuple(float(2**bits - 1) for bits in (10, 12, 14, 16))
@@ -97,14 +99,19 @@ def normalised(
 ) -> tuple[Float32, bool]:
     """Return the image divided by its background, and whether the screen is clipped (saturated).
 
+    The quotient is 1 where the background is black.
     gain : brightness of the lit screen relative to the background.
     """
     screen = screen_level(image) if background is None else background
-    screen, floor = screen.astype(np.float32, copy=False), 1e-6 * float(image.max()) + 1e-12
-    if float(screen.min()) < floor:
-        screen = np.maximum(screen, np.float32(floor))
-    quotient = cv2.divide(_divisible(image), screen, scale=1.0 / gain, dtype=cv2.CV_32F)
+    screen = screen.astype(np.float32, copy=False)
+    lit = float(np.quantile(screen[::_EVERY_PX, ::_EVERY_PX], _BRIGHTEST))
+    unlit = screen < max(_UNLIT_SHARE * lit, 1e-6 * float(image.max()) + 1e-12)
+    dark = bool(unlit.any())
+    divisor = np.where(unlit, np.float32(1.0), screen) if dark else screen
+    quotient = cv2.divide(_divisible(image), divisor, scale=1.0 / gain, dtype=cv2.CV_32F)
     ratio = np.asarray(quotient, np.float32)
+    if dark:
+        ratio[unlit] = 1.0
     sample = image[::8, ::8]
     clipped = bool(
         image.dtype.kind in "ui"

@@ -556,9 +556,11 @@ class Background:
         if self.lab_factor is None or not np.all(np.isfinite(frame_shift_px)):
             return self.rig_level.copy()
         shape = self.rig_level.shape
-        return self.rig_level * crop_of_lab(
+        factor = crop_of_lab(
             self.lab_factor, self.lab_origin_px, frame_shift_px, (shape[0], shape[1]), 1.0
         )
+        # beside a sharp black edge the splines are negative
+        return np.asarray(self.rig_level * np.maximum(factor, self.lab_factor.min()), np.float32)
 
 
 def estimate_background(

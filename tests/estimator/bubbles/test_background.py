@@ -186,6 +186,14 @@ def test_the_lab_layer_is_worth_it() -> None:
     assert with_lab.std() < 0.15 * without.std()
 
 
+def test_black_things_on_the_tank_leave_the_level_positive() -> None:
+    """Splines through the edge of a black tape are negative beside it."""
+    scene = Scene()
+    scene.lab[60:110, :80] = scene.lab[250:300, :80] = 1e-3
+    background = estimated(scene)
+    assert min(background.of_frame(k).min() for k in range(0, scene.frames, 9)) > 0
+
+
 def test_missing_frames_and_unknown_shifts_are_passed_over() -> None:
     scene = Scene(frames=60)
     shift = scene.shift.copy()

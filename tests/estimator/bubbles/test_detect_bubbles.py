@@ -301,6 +301,17 @@ def test_image_without_light_says_so() -> None:
     assert found.rejected.empty
 
 
+def test_no_bubble_is_seen_before_a_black_background() -> None:
+    """Black tape on the tank's wall: 0 grey levels divided by a few are no shadow."""
+    image = draw([Drawn((80.3, 60.2, 20.0, 20.0, 0.0))], (128, 200), blur_px=1.0)
+    screen = level(image.shape)
+    screen[40:80, 140:180] = 0.01 * WHITE
+    taped = digitised(image, noise=0.005)
+    taped[40:80, 140:180] = 0
+    found = detect_bubbles(taped, background=screen)
+    assert len(found) == 1 and found["u_px"][0] == pytest.approx(80.3, abs=0.1)
+
+
 def test_background_brighter_than_white_makes_no_bubble_outside_the_field() -> None:
     image = digitised(np.ones((80, 120)), noise=0.005, white=250.0).clip(0, 255).astype(np.uint8)
     background = level(image.shape, 250.0)

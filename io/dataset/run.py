@@ -212,6 +212,8 @@ def load_run(
     t_s = _times(folder, frames, sources, positions, detections, notes)
     lost = notes if skip_unreadable else None
     stage = _table(folder / "stage.csv", read_stage_csv, lost)
+    if rig is not None and rig.stage is not None and not (folder / "stage.csv").exists():
+        notes.append("there is no stage.csv: the stage counts as standing during the run")
     sensors = list(rig.accelerometers) if rig else None
     marks = _table(
         folder / "references.csv",

@@ -146,3 +146,14 @@ def test_a_stage_record_in_milliseconds_is_noticed(
     rows = "".join(f"{t},{i}\n" for i, t in enumerate(seconds))
     (full_run / "stage.csv").write_text("t_s,position_mm\n" + rows)
     assert said in " ".join(load_run(full_run).notes)
+
+
+def test_a_stage_without_a_record_is_told(full_run: Path) -> None:
+    """A forgotten file: bubbles that the moving rig follows are then in no track."""
+    rig = full_run.parent.parent / "rig.toml"
+    assert not any("stage.csv" in note for note in load_run(full_run).notes)
+    stage = "[stage]\naxis_left = [0, -1, 0]\nup_left = [0, -1, 0]\n"
+    rig.write_text(rig.read_text() + stage)
+    assert any("there is no stage.csv" in note for note in load_run(full_run).notes)
+    (full_run / "stage.csv").write_text("t_s,position_mm\n1.9,1\n2.5,2\n")
+    assert not any("there is no stage.csv" in note for note in load_run(full_run).notes)

@@ -38,6 +38,7 @@ from telerig.estimator.calibration.solver.problem import (
     eccentricity_px,
     held_at_nominal,
     problem_from_dots,
+    with_stretch,
 )
 from telerig.estimator.calibration.solver.robust_least_squares import (
     Progress,
@@ -121,6 +122,7 @@ def self_calibrate(
         known += turned
         start_dots = problem.nominal_mm
     checks.refuse_wrong_pairs(problem)
+    problem = with_stretch(problem)
     return _solved(problem, start_dots, nominal, models, pre, known, name, progress)
 
 

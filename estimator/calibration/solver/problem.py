@@ -298,15 +298,13 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
         px_per_mm = np.array([c["scale_px_per_mm"] for c in cameras])[camera[order]]
         edge_mm = np.sqrt(np.linalg.eigvalsh(edge)[:, 1]) / px_per_mm
         sigma[:2] = 2 * [float(np.hypot(target.print_sigma_mm, np.median(edge_mm)))]
-    nominal, scale = target.nominal_mm(ids), known_scale(target, ids)
-    stretched = _stretch_factor(sigma[0], nominal, None if scale is None else scale[1:])
     return Problem(
         cameras=tuple(cameras),
         target=target,
         views=views,
         dot_ids=ids,
-        nominal_mm=nominal,
-        dot_sigma_mm=np.tile(stretched * np.array(sigma), (len(ids), 1)),
+        nominal_mm=target.nominal_mm(ids),
+        dot_sigma_mm=np.tile(sigma, (len(ids), 1)),
         view=view[order],
         camera=camera[order],
         dot=np.searchsorted(ids, table["dot"].to_numpy(np.int64)),
@@ -315,7 +313,7 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
         covariance_px2=covariance,
         weight=np.ones(len(table)),
         free=tuple(("scale_px_per_mm",) for _ in cameras),
-        scale=scale,
+        scale=known_scale(target, ids),
         plate_shift=np.zeros((len(views), len(cameras))),
     )
 
@@ -379,23 +377,21 @@ def known_scale(
     return (a, b), float(target.scale_distance_mm), float(target.scale_sigma_mm)
 
 
-def _stretch_factor(
-    print_sigma_mm: float, nominal_mm: Array, distance_mm: tuple[float, float] | None
-) -> float:
-    """Return by how much the priors on the dots' places are widened, as all may be stretched.
+def with_stretch(problem: Problem) -> Problem:
+    """Return the problem with wider priors on the dots' places, as all may be stretched together.
 
-    Errors that all dots of a print share do not average out: N places (N, 3) tell as much of the
-    target's size as a single one does, and, beside a known distance, more only while that is less
-    than the distance tells by `SETS_SCALE`. Flatness is widened alike: a smaller target has less
-    relief, which would make it seem more likely.
-
-    distance_mm : the known distance and its standard deviation; None without.
+    Errors that all dots of a print share do not average out: N places tell as much of the target's
+    size as a single one does, and, beside a known distance, more only while that is less than the
+    distance tells by `SETS_SCALE`. Flatness is widened alike: a smaller target has less relief,
+    which would make it seem more likely. Coordinates that are held stay so.
     """
-    needed = np.inf
-    if distance_mm is not None:
-        spread_mm = float(np.linalg.norm((nominal_mm - nominal_mm.mean(0))[:, :2]))
-        needed = SETS_SCALE * distance_mm[1] / distance_mm[0] * spread_mm / print_sigma_mm
-    return float(np.clip(needed, 1.0, np.sqrt(len(nominal_mm))))
+    sigma, nominal, needed = problem.dot_sigma_mm, problem.nominal_mm, np.inf
+    if problem.scale is not None:
+        _, distance_mm, sd_mm = problem.scale
+        spread_mm = float(np.linalg.norm((nominal - nominal.mean(0))[:, :2]))
+        needed = SETS_SCALE * sd_mm / distance_mm * spread_mm / sigma[0, 0]
+    factor = np.clip(needed, 1.0, np.sqrt(len(nominal)))
+    return replace(problem, dot_sigma_mm=np.where(sigma > HELD_MM, factor * sigma, sigma))
 
 
 def _check_distance(target: Target) -> None:

@@ -14,6 +14,7 @@ from turned_images import settled, turned
 
 import telerig
 from telerig.errors import CalibrationError
+from telerig.io.simulation.presets import preset
 from telerig.rig.target import Target
 
 pytestmark = pytest.mark.usefixtures("without_advice")
@@ -115,6 +116,16 @@ def test_a_known_distance_that_a_turn_moves_is_trusted_less(scene: Any) -> None:
     assert abs(error - 1) < 3 * scale_sd
     oblong = scene("symmetric", 2).calibrate("radial")
     assert "TURNED_DISTANCE" not in codes(oblong)
+
+
+def test_a_print_is_stretched_whose_distance_a_turn_moves(scene: Any) -> None:
+    made = scene("symmetric", 3, target=replace(preset("symmetric").target, scale_dots=(0, 6)))
+    pitch_mm = tuple(pitch / 1.003 for pitch in made.target.pitch_mm)
+    made = replace(made, target=replace(made.target, pitch_mm=pitch_mm))
+    calibration = made.calibrate("radial")
+    for camera in calibration.cameras:
+        error = camera["scale_px_per_mm"] - made.true_cameras[camera.name]["scale_px_per_mm"]
+        assert abs(error) < 3 * calibration.sd(f"{camera.name}.scale_px_per_mm")
 
 
 @pytest.mark.parametrize("marks", [((0, 0),), ((0, 0), (0, 5))])

@@ -187,13 +187,17 @@ def white_noise(graph: GraphLayout, most: float = np.inf) -> Array:
     return out
 
 
-def pixel_whiteners(graph: GraphLayout, covariance_px2: Array, noise: Array) -> Array:
+def pixel_whiteners(
+    graph: GraphLayout, covariance_px2: Array, noise: Array, *, marks: bool
+) -> Array:
     """Return the matrices (n, 2, 2) that whiten pixels with stated covariances (n, 2, 2).
 
     noise : (n or none, 2, 2) factor from the stated noise to that which is white. What is whitened
     times this factor is in units of the stated noise, however a camera is turned.
+    marks : whether they are those of marks.
     """
-    return whitener_of(covariance_px2) @ np.linalg.inv(noise) / graph.model.pixel_inflation
+    inflation = graph.model.mark_inflation if marks else graph.model.pixel_inflation
+    return whitener_of(covariance_px2) @ np.linalg.inv(noise) / inflation
 
 
 def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
@@ -273,7 +277,9 @@ def _seen(
         for first in range(0, len(mine), AT_ONCE):
             part = slice(first, first + AT_ONCE)
             which = mine[part]
-            found = _one_camera(graph, state, obs, c, which, at_frames, states(which))
+            moving = states(which)
+            w = pixel_whiteners(graph, obs.covariance_px2[which], moving.noise, marks=kind == MARKS)
+            found = _one_camera(graph, state, obs, c, which, at_frames, moving, w)
             residual[which] = -found.rhs
             if weight is None:
                 continue
@@ -292,11 +298,13 @@ def _seen(
 
 def _one_camera(
     graph: GraphLayout, state: State, obs: Observations, camera: int, mine: Ints,
-    at_frames: Array, moving: _Moving,
+    at_frames: Array, moving: _Moving, w: Array,
 ) -> LinearFactors:  # fmt: skip
-    """Return factors of some pixels of one camera; at_frames : (F, D) states of the shake."""
+    """Return factors of some pixels of one camera.
+
+    at_frames : (F, D) states of the shake. w : (n, 2, 2) what whitens the pixels.
+    """
     problem, layout, frame = graph.problem, graph.shake, obs.frame[mine]
-    w = pixel_whiteners(graph, obs.covariance_px2[mine], moving.noise)
     shake = at_frames[frame]
     gain = 1 / (1 + state.encoder_scale(graph))
     position = gain * (shake @ layout.position)

@@ -352,13 +352,15 @@ def adapted(solution: Solution, start: ShakeModel | None = None) -> ShakeModel |
     learned from the run keep their RMS.
     """
     model = solution.graph.model
-    inflation = _noise_factor(solution)
+    inflation, of_marks = _noise_factor(solution), _mark_noise_factor(solution)
     better = model
     wide = wider_scale_sigma(solution)
     if wide is not None:
         better = replace(better, encoder_scale_sigma=wide)
     if inflation > 1:
         better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
+    if of_marks > 1:
+        better = replace(better, mark_inflation=model.mark_inflation * of_marks)
     if model.broad_bands:
         factor = _size_of_bands(solution, (start or model).broad_bands)
         fresh = rescaled(better, factor, _dominant_hz(solution))
@@ -592,8 +594,35 @@ def _noise_factor(solution: Solution) -> float:
             if left.mean() > _LEAST_SPARE:
                 ratios.append(solution.residuals[0][mine, k] ** 2 / np.median(left))
         ratio = np.concatenate(ratios)
-        if len(ratio) >= _LEAST_PIXELS:
-            factor = float(np.sqrt(np.median(ratio)))
-            sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(len(ratio)))
-            found.append(factor if factor > sure else 1.0)
+        found.append(_sure_factor(ratio))
     return max(found)
+
+
+def _mark_noise_factor(solution: Solution) -> float:
+    """Return the factor by which the marks' stated noise is too small, at least 1.
+
+    It compares the changes of their residuals from one sighting to the next with those of draws: a
+    mark that moves, or a wrong clock, is no noise, and changes them slowly.
+    """
+    observed = solution.graph.problem.references
+    order = np.lexsort((observed.frame, observed.item, observed.camera))
+    same = np.diff(observed.item[order]) == 0
+    same &= np.diff(observed.camera[order]) == 0
+    if solution.covariances is None or not same.any():
+        return 1.0
+    kept = same & (np.minimum(*(solution.weights[1][order][i:][: len(same)] for i in (0, 1))) > 0.5)
+    left = np.diff(drawn(solution).marks[order], axis=0)[kept] ** 2
+    if not len(left) or left.mean() < _LEAST_SPARE:
+        return 1.0
+    change = np.diff(solution.residuals[1][order], axis=0)[same] ** 2
+    return _sure_factor((change / np.median(left)).ravel())
+
+
+def _sure_factor(ratio: Array) -> float:
+    """Return the root of the median of squares over those expected (n,), 1 if it is not clearly
+    more."""
+    if len(ratio) < _LEAST_PIXELS:
+        return 1.0
+    factor = float(np.sqrt(np.median(ratio)))
+    sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(len(ratio)))
+    return factor if factor > sure else 1.0

@@ -99,7 +99,8 @@ class ShakeModel:
     encoder_scale_sigma, accelerometer_scale_sigma : prior standard deviations of the relative scale
         errors; 0 if they are not estimated.
     accelerometer_delay_sigma_s : the same for the delay.
-    pixel_inflation : factor on the stated noise of pixels.
+    pixel_inflation, mark_inflation : factors on the stated noise of the bubbles' and the marks'
+        pixels.
     name : origin of the values: "given", "default" or "learned".
     learned : {hyper-parameter: standard deviation of its natural logarithm} of the learned ones.
     """
@@ -113,6 +114,7 @@ class ShakeModel:
     accelerometer_scale_sigma: float = 0.0
     accelerometer_delay_sigma_s: float = 0.0
     pixel_inflation: float = 1.0
+    mark_inflation: float = 1.0
     name: str = "given"
     learned: Mapping[str, float] = field(default_factory=dict)
 

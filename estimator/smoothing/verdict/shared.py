@@ -138,7 +138,7 @@ def _scores(
     if len(seen) < max(1, FEWEST_BUBBLES * len(np.unique(frame))):
         return
     root = np.sqrt(solution.weights[int(marks)][mine])[:, None]
-    whitener = pixel_whiteners(graph, seen.covariance_px2, noise)
+    whitener = pixel_whiteners(graph, seen.covariance_px2, noise, marks=marks)
     residual = solution.residuals[int(marks)][mine]
     predicted_px = seen.uv_px + np.linalg.solve(whitener, residual[..., None])[..., 0]
     whitener, residual = whitener * root[:, None], residual @ within * root

@@ -260,9 +260,11 @@ def residual_words(results: SmoothingResults) -> str:
         "predicts, in sigmas of what was stated for it. Where the stated noise is right these are "
         "near 1, less what the fit takes up; outliers are left out of them."
     )
-    inflation = results.part("model").get("pixel_inflation")
-    if is_number(inflation) and inflation != 1:
-        text += f" The noise stated for the bubbles' pixels was multiplied by {number(inflation)}."
+    for whose, key in (("bubbles'", "pixel_inflation"), ("marks'", "mark_inflation")):
+        inflation = results.part("model").get(key)
+        if is_number(inflation) and inflation != 1:
+            text += f" The noise stated for the {whose} pixels was multiplied by "
+            text += f"{number(inflation)}."
     return text
 
 

@@ -102,6 +102,20 @@ def test_a_centre_that_wanders_with_the_outline_is_noise_and_no_contradiction(se
     assert found_in(solve(problem, better)) == ()
 
 
+def test_marks_with_more_noise_than_is_stated_contradict_nothing() -> None:
+    """The bubbles' noise is theirs alone, and marks of another time have none."""
+    problem, rng = marked(1), np.random.default_rng(1)
+    seen = problem.references
+    noise = 2 * np.sqrt(seen.covariance_px2[:, :1, 0]) * rng.normal(size=seen.uv_px.shape)
+    noisy = replace(problem, references=replace(seen, uv_px=seen.uv_px + noise))
+    better = adapted(solve(noisy, BANDS))
+    assert better is not None and better.pixel_inflation < 1.15
+    assert better.mark_inflation == pytest.approx(np.sqrt(5), rel=0.1)
+    assert found_in(solve(noisy, better)) == ()
+    late = adapted(solve(late_marks(problem), BANDS))
+    assert late is not None and late.mark_inflation == 1
+
+
 def test_a_bias_that_no_sensor_has_is_a_contradiction() -> None:
     problem = marked(2)
     count = len(problem.t_s)

@@ -286,7 +286,7 @@ def encoder_noise_mm(stage: Stage, stated_mm: float) -> float:
     if not 0 < _step_s(stage) * CarriageModel.corner_hz < 1:
         return stated_mm
     sigma, square = (
-        max(stated_mm, 1e-5) * np.geomspace(1.0, 100.0, 60),
+        max(stated_mm, 1e-5) * np.geomspace(1.0, 1000.0, 90),
         np.geomspace(1.0, 1e12, 120),
     )
     cost, half = np.zeros((len(sigma), len(square))), _LINE_BINS // 2

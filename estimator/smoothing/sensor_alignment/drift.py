@@ -50,9 +50,15 @@ def without_drift(
     channels = images.channels(problem, group)
 
     def log_ratio(some: Sequence[Accelerometer]) -> float:
-        near = [near_frames(s, t) for s in some]
-        found = aligned_by(images, channels, near)
-        return -np.inf if found is None else found.log_ratio
+        """At the offset that fits best, which may lie between two steps of the grid."""
+        near, best = [near_frames(s, t) for s in some], -np.inf
+        for _ in range(2):
+            found = aligned_by(images, channels, near)
+            if found is None:
+                break
+            best = max(best, found.log_ratio)
+            near = [replace(s, t_s=s.t_s - found.offset_s) for s in near]
+        return best
 
     best, shared = sensors, any(s.clock == "frames" for s in sensors)
     reached = log_ratio(sensors)

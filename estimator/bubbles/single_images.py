@@ -79,9 +79,13 @@ def write_bubbles(
         image = read_image(file)
         shape = (image.shape[0], image.shape[1])
         field = described_field(shape, region_px, mask, f"--region, {file.name}")
-        bubbles = find_bubbles(
-            image, field=field, min_diameter_px=min_diameter_px, min_contrast=min_contrast
-        )
+        try:
+            bubbles = find_bubbles(
+                image, field=field, min_diameter_px=min_diameter_px, min_contrast=min_contrast
+            )
+        except InputError as error:
+            where = str(file) if error.where == "image" else error.where
+            raise InputError(error.what, where=where, todo=error.todo) from error
         _draw(image, bubbles, folder / "overlays" / f"{file.stem}.jpg")
         found.append(_found(file.stem, bubbles))
         words.append(found[-1].words)

@@ -96,8 +96,8 @@ def _miss_words(results: TrackResults) -> str:
             " The vibration of the cameras against each other "
             f"({number(results.pairs.frame_px, 2)} px from frame to frame) and the "
             f"scatter of single pairs of outlines ({number(results.pairs.scatter_px, 2)} px), "
-            "both estimated from this run, explain the difference. The covariances in tracks.csv "
-            "do not contain them."
+            "both estimated from this run, explain the difference. Of them the covariances in "
+            "tracks.csv contain the scatter alone, and only of bubbles without outlines."
         )
     return text
 

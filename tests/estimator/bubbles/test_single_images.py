@@ -171,3 +171,13 @@ def test_bubbles_of_5_px_are_found(diameter: float, noise: float, level: float) 
     near = np.linalg.norm(away, axis=2) < 0.5
     assert near.any(axis=0).mean() > 0.93 and near.any(axis=1).mean() > 0.98
     assert found["d_eq_px"].median() == pytest.approx(diameter, abs=0.1)
+
+
+def test_an_image_that_is_too_small_is_named_and_so_is_an_option(tmp_path: Path) -> None:
+    files = [tmp_path / "large.png", tmp_path / "icon.png"]
+    for file, side in zip(files, (64, 8)):
+        cv2.imwrite(str(file), np.full((side, side), 100, np.uint8))
+    with pytest.raises(InputError, match=r"icon\.png: cannot look"):
+        write_bubbles(files, tmp_path / "out")
+    with pytest.raises(InputError, match="--min-diameter"):
+        write_bubbles(files, tmp_path / "out", min_diameter_px=2.0)

@@ -89,7 +89,7 @@ def content() -> dict[str, Any]:
             "bubble": {"velocity_sigma_mm_s": 10.0, "zigzags": []}, "modes": [],
             "broad_bands": [{"rms_mm": [0.06, 0.13, 0.1], "camera": 0, "low_hz": 22.984973269}],
             "carriage": {"kind": "force", "servo": None},
-            "pixel_inflation": 0.945, "name": "default", "learned": {},
+            "pixel_inflation": 0.945, "mark_inflation": 1.72, "name": "default", "learned": {},
         },
         "unseen": {"left": "along its depth, (0, 0, 1) in rig axes",
                    "right": "along its depth, (-1, 0.00693, 0.0122) in rig axes"},

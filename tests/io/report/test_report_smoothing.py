@@ -78,7 +78,8 @@ def test_page_says_what_the_files_say(whole: Path) -> None:
         "Camera right looks along x", "bubbles 2 400 12 0.5 % 0.933 0.908",
         "arm_left bias x, mm/s² 223.80 ± 0.60", "arm_left delay, ms 1.020 ± 0.031",
         "encoder scale 1.01010 ± 0.00010", "0.0 ± 5.7 -281.0 ± 5.4 -1.4 ± 5.7",
-        "multiplied by 0.945", "Hyper-parameters: default frequencies",
+        "bubbles' pixels was multiplied by 0.945", "marks' pixels was multiplied by 1.72",
+        "Hyper-parameters: default frequencies",
         "broad bands[0]: camera left", "broad bands[0]: low, Hz 22.98",
         "The tracking beneath", "2 tracks",
     ):  # fmt: skip

@@ -291,11 +291,12 @@ def encoder_noise_mm(stage: Stage, stated_mm: float) -> float:
     )
     cost, half = np.zeros((len(sigma), len(square))), _LINE_BINS // 2
     for seen, unit in _spectra(stage):
+        if len(seen) < _LINE_BINS + _FEWEST_READINGS:
+            continue
         calm = medfilt(seen, _LINE_BINS)[half:-half] / np.log(2)
-        if len(calm) >= _FEWEST_READINGS:
-            for row, noise in zip(cost, 2 * _step_s(stage) * sigma**2):
-                density = square[:, None] * unit[half:-half] + noise
-                row += np.sum(np.log(density) + calm / density, axis=-1)
+        for row, noise in zip(cost, 2 * _step_s(stage) * sigma**2):
+            density = square[:, None] * unit[half:-half] + noise
+            row += np.sum(np.log(density) + calm / density, axis=-1)
     least = cost.min(1)
     best = int(np.argmin(least))
     return float(sigma[best]) if least[0] - least[best] > 2 * _CLEAR_NOISE else stated_mm

@@ -296,3 +296,9 @@ def test_noise_of_an_encoder_is_what_its_readings_show(kind: str) -> None:
         t = t + rng.normal(0, 1e-4, 600)
     true = {"inexact times": 0.028, "coarse counts": 0.029}.get(kind, 0.005)
     assert encoder_noise_mm(Stage(t, place), 0.005) == pytest.approx(true, rel=0.2)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_record_of_few_readings_shows_no_noise() -> None:
+    t = np.arange(12) / 500.0
+    assert encoder_noise_mm(Stage(t, 280.0 * t), 0.005) == 0.005

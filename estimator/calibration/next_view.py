@@ -19,6 +19,7 @@ import numpy as np
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.gaussian import Estimate
+from telerig.estimator.calibration.solver.print_stretch import stretch_sigma
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.thresholds import (
     ENOUGH_SHARE,
@@ -458,8 +459,8 @@ class ViewGain:
         alone causes. It scales all points by a common factor.
         """
         problem = self.problem
-        plane = (problem.nominal_mm - problem.nominal_mm.mean(0))[:, :2]
-        known = float(np.sum((plane / problem.dot_sigma_mm[:, :2]) ** 2))
+        plane = ((problem.nominal_mm - problem.middle_mm) / problem.dot_sigma_mm)[:, :2]
+        known = 1 / (1 / float((plane**2).sum()) + stretch_sigma(problem) ** 2)
         if problem.scale is not None:
             known += (problem.scale[1] / problem.scale[2]) ** 2
         spread = (self.points_mm - self.points_mm.mean(0)).std()

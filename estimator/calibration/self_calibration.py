@@ -31,6 +31,11 @@ from telerig.estimator.calibration.result_from_fit import (
     telecentricity,
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
+from telerig.estimator.calibration.solver.print_stretch import (
+    stretch_error,
+    stretched_to_distance,
+    with_print_stretch,
+)
 from telerig.estimator.calibration.solver.problem import (
     HELD_MM,
     Problem,
@@ -38,7 +43,6 @@ from telerig.estimator.calibration.solver.problem import (
     eccentricity_px,
     held_at_nominal,
     problem_from_dots,
-    with_stretch,
 )
 from telerig.estimator.calibration.solver.robust_least_squares import (
     Progress,
@@ -122,7 +126,7 @@ def self_calibrate(
         known += turned
         start_dots = problem.nominal_mm
     checks.refuse_wrong_pairs(problem)
-    problem = with_stretch(problem)
+    problem = stretched_to_distance(problem)
     return _solved(problem, start_dots, nominal, models, pre, known, name, progress)
 
 
@@ -148,7 +152,8 @@ def _solved(
     fit = _fit(problem, start, models, progress)
     if len(cameras) > 1 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
         fit, mirror = _on_the_right_side(fit, nominal)
-    final, solution = fit.robust.problem, fit.robust.solution
+    final, solution = with_print_stretch(fit.robust.problem, fit.robust.solution)
+    fit = replace(fit, robust=replace(fit.robust, problem=final, solution=solution))
     considered = considered_groups(fit.choice, len(cameras))
     added = considered_words(considered, [c.name for c in cameras])
     other_cost = mirror_ambiguity.mirrored_cost(final, solution.state, solution.cost)
@@ -161,6 +166,7 @@ def _solved(
     structure, unlike_noise = residual_tests(final, whitened, own.leverage)
     noisier, there, shared = _with_wider_noise(final, solution, own, structure["widening"])
     free, joint = considered_covariance(noisier, there, shared, fit.models, considered)
+    joint = joint.widened(stretch_error(noisier, replace(there, gaussian=joint.gaussian)))
     found = calibration_from_fit(fit, joint, free, nominal_rotvec_deg=nominal, name=name)
     halves, compared = split_half_check(final, solution.state, structure["widening"])
     advice = next_view(replace(noisier, free=free), solution.state, joint)

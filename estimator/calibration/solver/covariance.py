@@ -34,8 +34,8 @@ class JointCovariance:
     leverage : (M, 2, 2) J C J^T of each used measurement, with J its derivatives and C the
         covariance of all parameters: the share of its noise that the fit absorbs.
     gaussian : that of which this is the inverse.
-    offset : (K + 3 N,) a further error, which moves all parameters together; ``matrix`` and
-        ``dots`` contain it.
+    offset : (K + 3 N, m) further errors, each of which moves all parameters together; ``matrix``
+        and ``dots`` contain them.
     """
 
     names: tuple[str, ...]
@@ -55,7 +55,7 @@ class JointCovariance:
         if index[-1] < len(self.matrix):
             return np.asarray(self.matrix[np.ix_(index, index)])
         offset = self.offset[index]
-        return self.gaussian.marginal(index) + np.outer(offset, offset)
+        return np.asarray(self.gaussian.marginal(index) + offset @ offset.T)
 
     @property
     def effective_dof(self) -> float:
@@ -70,7 +70,7 @@ class JointCovariance:
             self,
             matrix=self.matrix + np.outer(whole, whole),
             dots=self.dots + of_dots[:, :, None] * of_dots[:, None],
-            offset=offset,
+            offset=np.column_stack([self.offset, offset]),
         )
 
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
@@ -100,7 +100,7 @@ def joint_covariance(
     names = _names(problem)[: len(matrix)]
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
     return JointCovariance(
-        names, matrix, dots, rig, leverage, gaussian, np.zeros(len(gaussian.right))
+        names, matrix, dots, rig, leverage, gaussian, np.zeros((len(gaussian.right), 0))
     )
 
 

@@ -64,8 +64,7 @@ def nonlinear_graph(problem: Problem, start: State) -> tuple[Any, Any, Keys]:
     for key, view in zip(keys.view, start.rig_from_target):
         graph.add(place_factor(key, system.place_sigma_mm))
         values.insert(key, gtsam.Pose3(view))
-    sigma = np.broadcast_to(problem.dot_sigma_mm, problem.nominal_mm.shape)
-    for key, nominal, sd, place in zip(keys.dots, problem.nominal_mm, sigma, start.dots_mm):
+    for key, nominal, sd, place in zip(keys.dots, *problem.stretched_mm, start.dots_mm):
         noise = gtsam.noiseModel.Diagonal.Sigmas(sd)
         graph.add(gtsam.PriorFactorVector(key, nominal, noise))
         values.insert(key, place)

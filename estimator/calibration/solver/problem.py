@@ -41,10 +41,6 @@ HELD_MM = 1e-6
 HELD_SCALE = 1e-7
 """Relative standard deviation of a scale that is held to fix the depth of a camera's origin."""
 
-SETS_SCALE = 10.0
-"""How much more certain of the target's size a known distance is, at least, than all nominal places
-together: a print that is stretched as a whole then moves the scale by 1 % of the stretch."""
-
 _WALL = ("wall_x_rad", "wall_y_rad")
 
 DOTS_FREE = ("3d", "plane", "nominal")
@@ -90,6 +86,8 @@ class Problem:
     hold_scales : if all lenses have perspective, whether their scales are held at nominal. Each
         camera's origin is then at the depth at which its scale is the nominal one, and not where
         the optical axes come closest.
+    stretch : by how much the nominal places are stretched about their middle
+        (`solver.print_stretch`).
     origin_camera : index of the camera whose optical axis fixes, with the first one's, the rig's
         origin (`known_target.origin_camera`).
     """
@@ -114,6 +112,18 @@ class Problem:
     outlier_sd: float = OUTLIER_SD
     hold_scales: bool = False
     origin_camera: int = 1
+    stretch: float = 0.0
+
+    @property
+    def middle_mm(self) -> Array:
+        """The mean (3,) of the nominal positions, about which they are stretched."""
+        return np.asarray(self.nominal_mm.mean(0))
+
+    @property
+    def stretched_mm(self) -> tuple[Array, Array]:
+        """The nominal positions and their standard deviations (N, 3) on the stretched target."""
+        middle, factor = self.middle_mm, 1 + self.stretch
+        return middle + factor * (self.nominal_mm - middle), factor * self.dot_sigma_mm
 
     @property
     def scales_held(self) -> bool:
@@ -375,23 +385,6 @@ def known_scale(
     _check_distance(target)
     a, b = (int(np.searchsorted(ids, d)) for d in target.scale_dots)
     return (a, b), float(target.scale_distance_mm), float(target.scale_sigma_mm)
-
-
-def with_stretch(problem: Problem) -> Problem:
-    """Return the problem with wider priors on the dots' places, as all may be stretched together.
-
-    Errors that all dots of a print share do not average out: N places tell as much of the target's
-    size as a single one does, and, beside a known distance, more only while that is less than the
-    distance tells by `SETS_SCALE`. Flatness is widened alike: a smaller target has less relief,
-    which would make it seem more likely. Coordinates that are held stay so.
-    """
-    sigma, nominal, needed = problem.dot_sigma_mm, problem.nominal_mm, np.inf
-    if problem.scale is not None:
-        _, distance_mm, sd_mm = problem.scale
-        spread_mm = float(np.linalg.norm((nominal - nominal.mean(0))[:, :2]))
-        needed = SETS_SCALE * sd_mm / distance_mm * spread_mm / sigma[0, 0]
-    factor = np.clip(needed, 1.0, np.sqrt(len(nominal)))
-    return replace(problem, dot_sigma_mm=np.where(sigma > HELD_MM, factor * sigma, sigma))
 
 
 def _check_distance(target: Target) -> None:

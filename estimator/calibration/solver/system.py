@@ -134,8 +134,8 @@ class System:
                 jacobian = whole
             cameras.append((value, jacobian))
         views = place_residual(state.rig_from_target, self.place_sigma_mm)
-        sigma = np.broadcast_to(problem.dot_sigma_mm, state.dots_mm.shape)
-        dots = (state.dots_mm - problem.nominal_mm) / sigma, 1 / sigma
+        expected, sigma = problem.stretched_mm
+        dots = (state.dots_mm - expected) / sigma, 1 / sigma
         distance = None
         if problem.scale is not None:
             (a, b), length, sd = problem.scale

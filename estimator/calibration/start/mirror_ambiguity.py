@@ -310,7 +310,7 @@ def with_tilt_signs(problem: Problem, state: State) -> State:
 def _tolerant(problem: Problem, views: Ints) -> Problem:
     """Return the problem with covariances of some views enlarged by the effect of the relief."""
     scale = np.array([c["scale_px_per_mm"] for c in problem.cameras])[problem.camera]
-    relief_px = 2 * scale * problem.target.flatness_sigma_mm * np.isin(problem.view, views)
+    relief_px = 2 * scale * problem.dot_sigma_mm[:, 2].max() * np.isin(problem.view, views)
     extra = relief_px[:, None, None] ** 2 * np.eye(2)
     return replace(problem, covariance_px2=problem.covariance_px2 + extra)
 

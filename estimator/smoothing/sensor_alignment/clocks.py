@@ -203,7 +203,7 @@ def placed_on_frames(
     if clock is not None and keeps_clock(sensor, clock):
         near_zero = abs(clock.offset_s) <= SAME_CLOCK_S
         return replace(sensor, confirmed=True, offset_sd_s=clock.sd_s if near_zero else None), []
-    if clock is not None and clock.unique:
+    if clock is not None and (clock.clear if shared else clock.unique):
         moved = replace(
             sensor, t_s=sensor.t_s - clock.offset_s, offset_s=clock.offset_s,
             offset_sd_s=clock.sd_s, confirmed=True,

@@ -568,11 +568,20 @@ def fitted_variance(
 
 
 def _dominant_hz(solution: Solution) -> float:
-    """Return the RMS of the offsets' velocity over 2 pi times that of the offsets."""
+    """Return the RMS frequency of the offsets.
+
+    It is the larger of two that are too small where frames are few: the RMS of the velocity over
+    2 pi times that of the offset (between frames at 20 Hz a velocity is hardly known, and estimated
+    as small), and the frequency of a sine that changes from frame to frame as the offset does.
+    """
     graph, place = solution.graph, solution.graph.offsets(solution.state.shake)
-    states = graph.shake_at_frames(solution.state.shake)
+    states, pace_s = graph.shake_at_frames(solution.state.shake), np.diff(graph.problem.t_s)
     speed = np.einsum("cid,fd->fci", graph.shake.offset_velocity[:-1], states)
-    return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
+    square, step_s = max(float((place**2).mean()), 1e-12), float(np.median(pace_s))
+    moving = float(np.sqrt((speed**2).mean() / square)) / (2 * np.pi)
+    change = np.diff(place, axis=0)[pace_s < 1.5 * step_s]
+    share = min(float((change**2).mean()) / (4 * square), 1.0)
+    return max(moving, float(np.arcsin(np.sqrt(share))) / (np.pi * step_s))
 
 
 def _noise_factor(solution: Solution) -> float:

@@ -10,6 +10,7 @@ from shake_cases import RISE_MM_S
 from shake_learning_data import SWING_HZ, run, with_comings_and_goings
 from shake_runs import run_of
 from shake_scene import Motions, cases, random_shake, simulate
+from sound_runs import drawn
 
 import telerig
 from telerig.estimator.smoothing.graph.solve import Options, solve
@@ -302,3 +303,13 @@ def test_noise_of_an_encoder_is_what_its_readings_show(kind: str) -> None:
 def test_a_record_of_few_readings_shows_no_noise() -> None:
     t = np.arange(12) / 500.0
     assert encoder_noise_mm(Stage(t, 280.0 * t), 0.005) == 0.005
+
+
+def test_the_frequency_of_a_shake_that_marks_show_at_20_frames_a_second() -> None:
+    """5 Hz, of which the velocities at the frames tell nothing: it was taken for 1.6 Hz."""
+    one = drawn(20559)
+    found = telerig.smooth(**one.inputs)
+    assert found.model.broad_bands[0].low_hz == pytest.approx(one.run.case.scenario.hz, rel=0.2)
+    off = found.trajectories.sort_values(["particle", "frame"])["y_mm"].to_numpy()
+    off = off - one.run.position_mm[..., 1].ravel()
+    assert 1e3 * off.std() < 25

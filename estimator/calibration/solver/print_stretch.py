@@ -18,9 +18,10 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.calibration.solver.problem import HELD_MM, Problem
+from telerig.estimator.calibration.solver.robust_least_squares import gaussian_at
 from telerig.estimator.calibration.solver.system import Solution, System
 
-_MOST_STEPS, _STOP_SD = 5, 1e-3
+_MOST_STEPS, _STOP_SD = 5, 1e-2
 """Number of steps, and the size of one, in standard deviations of the stretch, that ends them."""
 
 
@@ -44,7 +45,10 @@ def stretched_to_distance(problem: Problem) -> Problem:
 
 
 def with_print_stretch(problem: Problem, solution: Solution) -> tuple[Problem, Solution]:
-    """Return the problem with the most likely stretch of its nominal places, and its solution."""
+    """Return the problem with the most likely stretch of its nominal places, and its solution.
+
+    A step that raises the cost, as in directions that hardly anything determines, is not taken.
+    """
     for _ in range(_MOST_STEPS):
         slope, moved, information = _response(problem, solution)
         off = System(problem).priors(solution.state).dots[0]
@@ -52,12 +56,27 @@ def with_print_stretch(problem: Problem, solution: Solution) -> tuple[Problem, S
         step = pull / information
         if abs(step) < _STOP_SD / np.sqrt(information):
             break
-        problem = replace(problem, stretch=problem.stretch + step)
-        system = System(problem)
-        state = system.moved(solution.state, step * moved)
-        state = system.moved(state, system.gaussian(state).step()[0])
-        solution = replace(solution, state=state, gaussian=system.gaussian(state))
+        further = replace(problem, stretch=problem.stretch + step)
+        there = _stepped(further, solution, step * moved)
+        refined = there and _stepped(further, there, there.gaussian.step()[0])
+        best = min(filter(None, (there, refined)), key=lambda s: s.cost, default=None)
+        if best is None or not _cost(further, best) < _cost(problem, solution):
+            break
+        problem, solution = further, best
     return problem, solution
+
+
+def _stepped(problem: Problem, solution: Solution, step: Array) -> Solution | None:
+    """Return the solution after a step (D,); None where a window would hide a dot."""
+    system = System(problem)
+    state = system.moved(solution.state, step)
+    gaussian = gaussian_at(system, state)
+    return None if gaussian is None else replace(solution, state=state, gaussian=gaussian)
+
+
+def _cost(problem: Problem, solution: Solution) -> float:
+    """Return the cost with that of the stretch itself."""
+    return solution.cost + 0.5 * (problem.stretch / stretch_sigma(problem)) ** 2
 
 
 def stretch_error(problem: Problem, solution: Solution) -> Array:

@@ -51,7 +51,7 @@ def solve(
     determine all parameters.
     """
     system = System(problem)
-    point, gaussian = start, _at(system, start)
+    point, gaussian = start, gaussian_at(system, start)
     if gaussian is None:
         raise CalibrationError(
             "the start values are impossible: no ray of a camera reaches some of the dots that it "
@@ -65,7 +65,7 @@ def solve(
         if promised <= relative * cost and damping <= NEARLY_UNDAMPED:
             break
         moved = system.moved(point, step)
-        trial = _at(system, moved)
+        trial = gaussian_at(system, moved)
         if trial is not None and cost - trial.cost >= -1e-13 * cost:
             done = promised <= relative * cost and cost - trial.cost <= relative * cost
             as_promised = cost - trial.cost > LINEAR * promised
@@ -82,7 +82,7 @@ def solve(
     return Solution(point, gaussian, iteration)
 
 
-def _at(system: System, state: State) -> Gaussian | None:
+def gaussian_at(system: System, state: State) -> Gaussian | None:
     """Return the Gaussian, or None where the cost is not finite (a window hides a dot)."""
     try:
         gaussian = system.gaussian(state)

@@ -101,6 +101,8 @@ def eliminated(own: Array, following: Array, sides: Array) -> Chain:
 
 
 _DIFFERENCE = 1e-4
+_ROUNDING = 1e-14
+"""The last frame's states have their own units, in which a very still rig's pivots are rounding."""
 
 
 @dataclass(frozen=True)
@@ -218,6 +220,7 @@ class Factor:
             outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
             own[mine] += (weight[mine] @ outer).reshape(-1, *own.shape[1:])
             sides[mine] = np.swapaxes(weighted[mine], -1, -2) @ rows
+        own[-1] += _ROUNDING * np.diag(np.diag(own[-1]))
         self.chain = eliminated(own, following, sides)
         wide = data.shape[-1]
         self._fix_constants(data.reshape(-1, wide).T @ weighted.reshape(-1, wide))

@@ -15,7 +15,7 @@ from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.response import FAR_SDS, CommonGain, Response
 from telerig.estimator.smoothing.problem.problem import Accelerometer, SmoothingProblem
 from telerig.estimator.smoothing.sensor_alignment.clocks import LEAST_FRAMES, SAME_CLOCK_S
-from telerig.estimator.smoothing.sensor_alignment.images import Images, along_axis, at_frames
+from telerig.estimator.smoothing.sensor_alignment.images import Images, along_axis, read_at_frames
 from telerig.estimator.smoothing.sensor_alignment.mark_motion import LENS_SIGMA, MarkMotion
 from telerig.estimator.smoothing.sensor_alignment.stuck_encoder import stuck, unfollowed
 from telerig.rig.pose import across
@@ -100,7 +100,7 @@ def _responses(
         if (values := along_axis(problem, camera, seen)) is not None
     ]
     for sensor in sensors:
-        values, there = at_frames(images, sensor)
+        values, there = read_at_frames(images, sensor)
         shown.append((values @ sensor.axes @ problem.axis, there))
     x = encoder.values[:, 0]
     return [Response.of(y, x, known & encoder.known) for y, known in shown]

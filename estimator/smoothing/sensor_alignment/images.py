@@ -170,7 +170,7 @@ def readings_on(grid: Grid, sensor: Accelerometer) -> Accelerations:
     return of_readings(grid, used.t_s, readings, sensor.t_s)
 
 
-def at_frames(images: Images, sensor: Accelerometer) -> tuple[Array, Bools]:
+def read_at_frames(images: Images, sensor: Accelerometer) -> tuple[Array, Bools]:
     """Return a sensor's smoothed readings (F, 3) at the times of frames, and which are known."""
     values, known = images.read_by(sensor)
     return values[images.grid.at_frame], known[images.grid.at_frame]

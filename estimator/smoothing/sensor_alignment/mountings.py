@@ -13,7 +13,7 @@ from telerig.estimator.sensors.gravity import Gravity, axes_remedy
 from telerig.estimator.sensors.image_motion import directions
 from telerig.estimator.sensors.mounting import Expected, Mounting, Regression, is_clear, mounting
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, SmoothingProblem
-from telerig.estimator.smoothing.sensor_alignment.images import Images, at_frames, shared_rows
+from telerig.estimator.smoothing.sensor_alignment.images import Images, read_at_frames, shared_rows
 
 LogEvidence = Callable[[SmoothingProblem], float]
 
@@ -39,7 +39,7 @@ def mounting_findings(
         for s in problem.accelerometers
         if s.confirmed and not s.unused_axes and s.name not in without
     ]
-    read = {s.name: at_frames(images, s) for s in sensors}
+    read = {s.name: read_at_frames(images, s) for s in sensors}
     images = images.at_frames()
     exchanged = _exchanged(problem, images, sensors, read, log_evidence)
     if exchanged is not None:

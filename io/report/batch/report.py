@@ -199,9 +199,10 @@ def _failure(job: Job) -> Row:
 def _calibration(job: Job, folder: Path, names: Mapping[str, str]) -> Row:
     found = job.get("figures") or {}
     share: Any = found.get("share_kept")
+    status = str(job["status"])
     cells = (
         names[job["dataset"]],
-        ", ".join(filter(None, (verdict_and_flags(job), str(job["status"]).replace("done", "")))),
+        ", ".join(filter(None, (verdict_and_flags(job), "" if status == _DONE else status))),
         str(found.get("lens_model") or ABSENT),
         str(found.get("views") or ABSENT),
         f"{100 * share:.1f}%" if is_number(share) else ABSENT,

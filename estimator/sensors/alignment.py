@@ -146,7 +146,7 @@ def align(
     shift = round((frames.start_s - own.start_s) / frames.step_s)
     lags = np.arange(-(frames.count - 1), own.count) - shift
     most = _MOST_SENSORS if own.count > _LONG_RECORD else len(readings)
-    used = [c for c in channels if np.count_nonzero(c.known) > LEAST_SAMPLES]
+    used = [c for c in channels if c.pace * np.count_nonzero(c.known) > LEAST_SAMPLES]
     used = [c for c in used if len(c.sensors) <= most] or used
     if not used:
         return None

@@ -110,6 +110,16 @@ def test_a_vibration_beyond_half_of_the_frame_rate_does_not_shift_a_clock() -> N
         assert abs(found.offset_s - 0.2) < min(1e-4, found.sd_s)
 
 
+def test_a_clock_is_found_in_59_frames_at_100_hz() -> None:
+    grid = Grid(0.0, 0.01 / 3, 3 * 58 + 1, 6, 3)
+    t, place, acceleration = motion(np.random.default_rng(3), 3.0)
+    frames = 0.01 * np.arange(59)
+    seen = of_positions(grid, frames, np.stack([np.interp(frames, t, p) for p in place.T], -1))
+    channels = [Channel(v, seen.known & grid.at_frame, (0,), grid.pace) for v in seen.values.T]
+    found = align(grid, channels, [of_readings(grid, t, acceleration)], 0.006)
+    assert found is not None and found.at_zero and abs(found.offset_s) < 1e-3
+
+
 def test_a_record_without_a_connection_is_not_taken() -> None:
     for seed in range(5):
         rng = np.random.default_rng(100 + seed)
